@@ -511,8 +511,8 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
         (lambda: samples(sigma=["s", 1.0]), ValueError, ["sigma must have one entry for each of the 1 channels"]),
         (
             lambda: samples(values=[[1.0, 2.0]], sigma=["s", None]),
-            ValueError,
-            ["sigma of one channel cannot be left out (None)", "['s', None]"],
+            TypeError,
+            ["sigma of a channel (a number, or the name of a parameter) must be a number", "got None"],
         ),
         (lambda: samples(loss="Huber"), ValueError, ["one of linear, soft_l1, huber, cauchy; got 'Huber'"]),
         (lambda: samples(sigma=1.0, loss="huber", loss_scale=0.0), ValueError, ["loss_scale must be positive", "0.0"]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.problem.inspection import find_comparison
+from switchfit.problem.inspection import find_comparisons
 
 
 def make_problem(mode, **given):
@@ -41,8 +41,8 @@ def test_a_comparison_is_found_with_its_line(name):
     first = mode.__code__.co_firstlineno
     problem = make_problem(mode)
     lines = [f"mode 'm' compares with a at test_comparisons.py:{line}" for line in (first, first + 1)]
-    assert find_comparison(problem, 0) in lines
-    assert find_comparison(problem, 1) is None
+    assert find_comparisons(problem).get(0) in lines
+    assert find_comparisons(problem).get(1) is None
 
 
 @pytest.mark.promotes
@@ -56,7 +56,7 @@ def test_a_comparison_is_found_with_its_line(name):
     ],
 )
 def test_rounding_and_signs_are_found(mode, words):
-    assert f"mode 'm' {words} at test_comparisons.py:" in find_comparison(make_problem(mode), 0)
+    assert f"mode 'm' {words} at test_comparisons.py:" in find_comparisons(make_problem(mode)).get(0)
 
 
 NOT_FOUND = {
@@ -74,8 +74,8 @@ NOT_FOUND = {
 @pytest.mark.parametrize("name", NOT_FOUND)
 def test_nothing_is_accused_that_does_not_jump_with_the_parameter(name):
     problem = make_problem(NOT_FOUND[name])
-    assert find_comparison(problem, 0) is None
-    assert find_comparison(problem, 1) is None
+    assert find_comparisons(problem).get(0) is None
+    assert find_comparisons(problem).get(1) is None
 
 
 def test_other_functions_and_the_names_of_a_map():
@@ -87,7 +87,7 @@ def test_other_functions_and_the_names_of_a_map():
 
     problem = make_problem(mode, observe=observe, parameter_map={"own": "a"})
     line = observe.__code__.co_firstlineno + 1
-    assert find_comparison(problem, 0) == f"observe 1 compares with own at test_comparisons.py:{line}"
+    assert find_comparisons(problem).get(0) == f"observe 1 compares with own at test_comparisons.py:{line}"
 
 
 def test_a_mode_that_does_not_occur_is_not_named():
@@ -95,4 +95,4 @@ def test_a_mode_that_does_not_occur_is_not_named():
     times = np.linspace(0.1, 1.0, 5)
     run = sf.Experiment(sf.Measurements(times, times, sigma=1.0), ("m",), (), 0.0, 1.0)
     problem = sf.Problem(sf.HybridSystem(modes, [0.3]), run, {"a": 1.0}, max_transitions=1)
-    assert find_comparison(problem, 0) is None
+    assert find_comparisons(problem).get(0) is None

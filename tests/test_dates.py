@@ -317,7 +317,6 @@ MIXED = (
         (lambda: from_epoch(["2020"]), ValueError, "numbers since 1970 must be"),
         (lambda: make_origin(0, "UTC").to_dates([np.nan], "s"), ValueError, "nan s since 1970-01-01T00:00:00.00:00 is"),
         (lambda: make_origin(0, "").to_numbers(as_dates("2020-01-01T00Z", "t"), "s"), ValueError, "has a time"),
-        (lambda: Origin("2020-01-01", "UTC"), ValueError, "does not fit the time zone"),
     ],
 )
 def test_what_is_wrong_is_said(call, error, message):

@@ -59,7 +59,7 @@ def test_derivatives_of_the_change_of_variables_are_those_of_autodiff():
     theta, origin = np.array([5.0, 7.5, 0.3, 40.0]), np.array([4.0, 4.0, 0.0, 0.0])
     log = np.array([True, True, True, False])
     keep = np.array([True, True, False, False])
-    variables = Variables.of(theta, theta - 100, theta + 100, log, keep, origin)
+    variables = Variables.of(theta, np.array([theta - 100, theta + 100]), log, keep, origin)
 
     def cost(theta):
         return jnp.sin(theta[0] * theta[2]) + theta[1] ** 3 * theta[0] + jnp.exp(0.01 * theta[3] * theta[1])
@@ -81,7 +81,7 @@ def test_derivatives_of_the_change_of_variables_are_those_of_autodiff():
 
 def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
     theta, origin, log = np.array([5.0, 6.0, 0.5]), np.array([4.0, 4.5, 0.0]), np.array([True, True, True])
-    variables = Variables.of(theta, theta - 100, theta + 100, log, ~log, origin)
+    variables = Variables.of(theta, np.array([theta - 100, theta + 100]), log, ~log, origin)
     problem = sf.Problem(RAMP, [replace(ramp(0, "log").experiments[0], name=name) for name in "ab"], {"v": 2.0})
     here = Evaluator(problem).arrow(problem.initial_theta)
     assert isinstance(here.hessian, Arrow)

@@ -86,7 +86,7 @@ class Evaluator:
 
     @cached_property
     def _priors(self) -> PriorTerms | None:
-        return self.problem.unknowns.priors if self.problem.unknowns.has_priors else None
+        return self.problem.unknowns.priors if self.problem.unknowns.priors.any else None
 
     @cached_property
     def halved(self) -> Evaluator:

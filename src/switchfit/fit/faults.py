@@ -22,7 +22,7 @@ from switchfit.engine.protocol import Matrix, Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
-from switchfit.problem.inspection import find_comparison, find_undefined
+from switchfit.problem.inspection import find_comparisons, find_undefined
 from switchfit.runtime.errors import HiddenSwitchError, Issue
 
 
@@ -166,7 +166,7 @@ def refuse_hidden_switches(
     if hidden:
         shown = ", ".join(unknowns.names[i] for i in hidden)
         seen = f"the cost changes with {shown}, but its derivative is zero at all points tried"
-        comparison = next(filter(None, (find_comparison(evaluator.problem, i) for i in hidden)), None)
+        comparison = next(filter(None, map(find_comparisons(evaluator.problem).get, hidden)), None)
         if comparison is None:
             raise HiddenSwitchError(
                 f"{seen}, so that no fit can estimate it: let the model depend on it smoothly, or fix it."

@@ -20,7 +20,7 @@ from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.state import Finding
 from switchfit.optimize.threads import one_thread
 from switchfit.problem.data import FloatArray
-from switchfit.problem.inspection import find_comparison, find_unread
+from switchfit.problem.inspection import find_comparisons, find_unread
 from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import ActiveConstraint, Constraint
 from switchfit.problem.validation import as_choice, as_level
@@ -198,7 +198,7 @@ def describe_switch(problem: Problem, i: int) -> Issue | None:
     i : int
         Index of the unknown in theta.
     """
-    comparison = find_comparison(problem, i)
+    comparison = find_comparisons(problem).get(i)
     return None if comparison is None else Issue("switch", (problem.unknowns.names[i], comparison))
 
 

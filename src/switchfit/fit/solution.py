@@ -198,7 +198,7 @@ def minimize_cost(
         many = len(problem.experiments) >= MANY_RUNS and not names
         by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = problem.constraints if constraints is None else constraints
-    change = None if unknowns.are_variables else _Change.of(problem, constraints, evaluator.breakpoints())
+    change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
 

@@ -16,7 +16,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.dates import Origin, is_iso_date
+from switchfit.problem.dates import Origin, read_date_text
 from switchfit.problem.experiment import count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
@@ -236,7 +236,7 @@ def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike |
     """Return the times at which a simulation is asked for, (K,)."""
     experiment = problem.experiments[e]
     t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
-    if isinstance(times, str) and not is_iso_date(times):
+    if isinstance(times, str) and read_date_text(times) is None:
         if times != "samples":
             raise ValueError(f"times must be numbers, dates or 'samples'; got {shorten(times)}.")
         found = [item.times for item in experiment.measurements]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.problem.validation import shorten
+from switchfit.problem.validation import as_finite, as_positive, as_sequence, join_names, shorten
 
 Constant = float | str
 """A number that stays, or the name of a parameter of the problem, which may be estimated."""
@@ -41,19 +41,19 @@ def check_constants(
                 raise ValueError(f"{name} must be a number or the name of a parameter; got the name {value!r}.")
             found[name] = value
             continue
-        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        if not _is_number(value):
             raise TypeError(
                 f"{name} must be a number, or the name of a parameter to be fixed or estimated in the Problem; got "
                 f"{type(value).__name__}."
             )
-        if not np.isfinite(value):
-            raise ValueError(f"{name} must be finite; got {value}.")
-        if name in positive and not value > 0:
-            raise ValueError(f"{name} must be positive; got {value}.")
-        if name in not_negative and not value >= 0:
+        found[name] = as_positive(value, name) if name in positive else as_finite(value, name)
+        if name in not_negative and value < 0:
             raise ValueError(f"{name} must be 0 or more; got {value}.")
-        found[name] = float(value)
     return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def check_numbers(
@@ -71,7 +71,7 @@ def check_numbers(
         As `check_constants`, and for a name.
     """
     for name, value in given.items():
-        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        if not _is_number(value):
             raise TypeError(f"{name} must be a number; got {shorten(value)}.")
     found = check_constants(given, positive=positive, not_negative=not_negative)
     return {name: float(value) for name, value in found.items()}
@@ -93,13 +93,11 @@ def check_modes(modes: Any, known: Iterable[str]) -> tuple[str, ...]:
     ValueError
         For an unknown mode, one that is given twice, or an empty sequence.
     """
-    if not isinstance(modes, Iterable):
-        raise TypeError(f"modes must be a sequence of names out of {', '.join(known)}; got {shorten(modes)}.")
-    names = (modes,) if isinstance(modes, str) else tuple(modes)
-    valid = [name for name in names if isinstance(name, str) and name in tuple(known)]
-    if not names or len(set(valid)) < len(names):
-        given = ", ".join(map(str, names)) or "none"
-        raise ValueError(f"modes must be different ones of {', '.join(known)}; got {given}.")
+    form = f"a sequence of names out of {', '.join(known)}"
+    names = (modes,) if isinstance(modes, str) else as_sequence(modes, "modes", form)
+    valid = {name for name in names if isinstance(name, str)}.intersection(known)
+    if not names or len(valid) < len(names):
+        raise ValueError(f"modes must be different ones of {', '.join(known)}; got {join_names(names)}.")
     return names
 
 

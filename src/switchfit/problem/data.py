@@ -36,13 +36,11 @@ from switchfit.problem.validation import (
     as_callable,
     as_choice,
     as_finite,
+    as_labels,
     as_name,
     as_named_columns,
-    as_names,
     as_number,
     as_positive,
-    as_sequence,
-    as_text,
     find_names,
     find_units,
     require_deviation,
@@ -290,25 +288,17 @@ class Input:
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
         at_least = {"hold": 1, "linear": 2, "cubic": 4}[kind]
-        units = self.units
-        values: Any
         named = as_named_columns(self.values, "Input values", "(K,) samples")
-        if named is None:
-            times, values = _check_samples(self.times, self.values, "Input", at_least=at_least)
-            _require_finite(values, "Input values")
-            units = find_units(self.values) if units is None else units
-        else:
-            # Sorted, so that experiments whose inputs are named in different orders share one program.
-            values = {}
-            for name in sorted(named):
-                what = f"Input {shorten(name)}"
-                times, values[name] = _check_samples(self.times, named[name], what, at_least=at_least, columns=False)
-                _require_finite(values[name], f"{what} values")
-            found = find_units(self.values)
-            if units is None and found is not None:
-                units = tuple(unit for _, unit in sorted(zip(named, found, strict=True)))
-        set_fields(self, kind=kind, times=times, values=values)
-        set_fields(self, units=_check_labels(units, "units", int(np.prod(self.shape))))
+        values: dict[str, FloatArray] = {}
+        # Sorted, so that experiments whose inputs are named in different orders share one program.
+        for name in [""] if named is None else sorted(named):
+            what, given = ("Input", self.values) if named is None else (f"Input {shorten(name)}", named[name])
+            times, values[name] = _check_samples(self.times, given, what, at_least=at_least, columns=named is None)
+        units, found = self.units, find_units(self.values)
+        if units is None and found is not None:
+            units = found if named is None else tuple(unit for _, unit in sorted(zip(named, found, strict=True)))
+        set_fields(self, kind=kind, times=times, values=values[""] if named is None else values)
+        set_fields(self, units=as_labels(units, "units", "channel", int(np.prod(self.shape))))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -409,8 +399,9 @@ class ReferenceSignal:
             )
         _check_observe(self.observe)
         q = self.signal.channels
-        names, units = _check_labels(self.names, "names", q), _check_labels(self.units, "units", q)
-        set_fields(self, weights=_build_weight_matrix(self.weights, q), names=names, units=units)
+        set_fields(self, weights=_build_weight_matrix(self.weights, q))
+        for label in ("names", "units"):
+            set_fields(self, **{label: as_labels(getattr(self, label), label, "channel", q)})
 
     @classmethod
     def from_samples(
@@ -467,8 +458,6 @@ class ReferenceSignal:
         names, units = _find_labels(values, names, units)
         given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(given), -1)
-        if np.isinf(table).any():
-            raise ValueError("ReferenceSignal values must be finite, or NaN where one is missing; got infinity.")
         # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
         times = _count_seconds(given) if isinstance(given, Dates) else given
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
@@ -572,14 +561,12 @@ class Measurements:
         names, units = _find_labels(self.values, self.names, self.units)
         times, values = _check_samples(self.times, self.values, "Measurements", at_least=0, missing=True)
         values = values[:, None] if values.ndim == 1 else values
-        if np.isinf(values).any():
-            raise ValueError("Measurements values must be finite, or NaN where a sample is missing; got infinity.")
         if len(values) and np.isnan(values).all():
             raise ValueError("Measurements values are all NaN: there is nothing to fit.")
         _check_observe(self.observe)
         set_fields(self, times=times, values=values, sigma=_check_sigma(self.sigma, values))
         q = values.shape[1]
-        set_fields(self, names=_check_labels(names, "names", q), units=_check_labels(units, "units", q))
+        set_fields(self, names=as_labels(names, "names", "channel", q), units=as_labels(units, "units", "channel", q))
         self._check_loss()
         if isinstance(self.delay, str):
             delay: float | str = as_name(self.delay, "delay")
@@ -652,7 +639,7 @@ class Measurements:
         return int(np.count_nonzero(~np.isnan(self.values)))
 
 
-Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measurements
+Data = Measurements | ReferenceSignal | RunningCost | TransitionCost | TerminalCost | TerminalConstraint
 
 
 def count_from(item: T, origin: Origin, time_unit: str) -> T:
@@ -677,8 +664,8 @@ def _check_samples(
 ) -> tuple[Any, FloatArray]:
     """Return times (K,) and values (K,) or (K, q) as float64, checked against each other; dates remain dates.
 
-    With `breaks`, a time may occur twice; with `missing`, masked values become NaN; without `columns`, the shape of the
-    values must be (K,).
+    With `breaks`, a time may occur twice; with `missing`, values may be NaN, and masked ones become NaN; without
+    `columns`, the shape of the values must be (K,).
     """
     dates = as_dates(times, f"{what} times") if is_dated(times) else None
     times = as_array(times, f"{what} times", form="an array of numbers") if dates is None else _count_seconds(dates)
@@ -693,6 +680,10 @@ def _check_samples(
     if len(times) < at_least or not values.shape[-1]:
         raise ValueError(f"{what} needs {max(at_least, 1)} sample(s) or more; got {len(times)}.")
     _require_finite(times, f"{what} times")
+    if not missing:
+        _require_finite(values, f"{what} values")
+    elif np.isinf(values).any():
+        raise ValueError(f"{what} values must be finite, or NaN where a sample is missing; got infinity.")
     wrong = np.diff(times) <= 0
     if breaks:
         wrong = (np.diff(times) < 0) | np.append(times[2:] == times[:-2], False)
@@ -753,31 +744,10 @@ def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str |
     """Return names of parameters and numbers, one per channel."""
     if len(sigma) != channels:
         raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shorten(sigma)}.")
-    if any(entry is None for entry in sigma):
-        raise ValueError(
-            "sigma of one channel cannot be left out (None) if that of another is a parameter: name a parameter for "
-            f"it too; got {shorten(sigma)}."
-        )
-    entries = [
-        as_name(entry, "sigma of a channel") if isinstance(entry, str) else as_number(entry, "sigma of a channel")
-        for entry in sigma
-    ]
+    what = "sigma of a channel (a number, or the name of a parameter)"
+    entries = [as_name(entry, what) if isinstance(entry, str) else as_number(entry, what) for entry in sigma]
     require_deviation(np.array([entry for entry in entries if not isinstance(entry, str)]), "sigma")
     return tuple(entries)
-
-
-def _check_labels(given: Any, what: str, channels: int) -> tuple[str, ...] | None:
-    """Return the names or the units of channels; names must not be empty, and must differ from each other."""
-    if given is None:
-        return None
-    labels = (given,) if isinstance(given, str) else given
-    if what == "names":
-        checked = as_names(labels, what, "a sequence of strings, one for each channel")
-    else:
-        checked = tuple(as_text(unit, "each of units") for unit in as_sequence(labels, what, "a sequence of strings"))
-    if len(checked) != channels:
-        raise ValueError(f"{what} must have one entry for each of the {channels} channels; got {shorten(checked)}.")
-    return checked
 
 
 def _find_labels(

@@ -18,6 +18,7 @@ from __future__ import annotations
 import datetime
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, NoReturn
@@ -34,8 +35,7 @@ FIRST, LAST = "1678-01-01", "2262-01-01"
 LONGEST = 9.2e9
 """Largest distance from 1970 in seconds."""
 EPOCH = datetime.datetime(1970, 1, 1)
-_FRACTION = re.compile(r"([.,]\d{6})(\d{1,3})\d*")
-_OFFSET = re.compile(r"([+-])(\d{2}):(\d{2})(?::(\d{2}))?")
+_NANOSECONDS = re.compile(r"[.,]\d{6}(\d{1,3})")
 
 
 @lru_cache(maxsize=64)
@@ -47,35 +47,27 @@ def find_zone(name: str) -> datetime.tzinfo:
     ValueError
         If there is none.
     """
-    if name in ("UTC", "Z"):
-        return datetime.UTC
-    if match := _OFFSET.fullmatch(name):
-        seconds = 3600 * int(match[2]) + 60 * int(match[3]) + int(match[4] or 0)
-        if seconds < 86400:
-            return datetime.timezone(datetime.timedelta(seconds=-seconds if match[1] == "-" else seconds))
-    try:
-        return ZoneInfo(name)
-    except Exception:  # ZoneInfoNotFoundError, ValueError or OSError, by the name
+    zone: datetime.tzinfo | None = None
+    with suppress(Exception):  # ZoneInfoNotFoundError, ValueError or OSError, by the name
+        is_offset = name in ("UTC", "Z") or name.startswith(("+", "-"))
+        offset = name.removeprefix("UTC") or "Z"
+        zone = datetime.time.fromisoformat(f"00:00{offset}").tzinfo if is_offset else ZoneInfo(name)
+    if zone is None:
         raise ValueError(
             f"time_zone {shorten(name)} is not known; give a name such as 'Europe/Berlin', 'UTC', or an offset such as "
             "'+02:00'. (If none is known on this system: pip install tzdata.)"
-        ) from None
+        )
+    return zone
 
 
 def read_date_text(text: str) -> tuple[int, str] | None:
     """Return nanoseconds since 1970 and the zone, "" without, of a date in ISO 8601; None if it is none."""
-    match = _FRACTION.search(text)
-    finer = int(match[2].ljust(3, "0")) if match else 0
+    finer = _NANOSECONDS.search(text)
     try:
-        date = datetime.datetime.fromisoformat(_FRACTION.sub(r"\1", text.strip()))
+        date = datetime.datetime.fromisoformat(text.strip())  # to the microsecond
     except ValueError:
         return None
-    return _count(date) + finer, _name_zone(date)
-
-
-def is_iso_date(text: str) -> bool:
-    """Return whether a text is a date in ISO 8601."""
-    return read_date_text(text) is not None
+    return _count(date) + (int(finer[1].ljust(3, "0")) if finer else 0), _name_zone(date)
 
 
 def format_instant(instant: int, zone: str) -> str:
@@ -105,7 +97,7 @@ def read_date(value: Any, what: str, index: int | None = None) -> tuple[int, str
     elif isinstance(value, datetime.datetime) and value == value:  # NaT of pandas differs from itself
         found = _count(value) + int(getattr(value, "nanosecond", 0)), _name_zone(value)
     elif isinstance(value, datetime.date) and value == value:
-        found = _count(datetime.datetime(value.year, value.month, value.day)), ""
+        found = _count(datetime.datetime.combine(value, datetime.time())), ""
     elif value is None or value != value:
         _refuse_missing(what, index or 0)
     else:
@@ -117,27 +109,19 @@ def read_date(value: Any, what: str, index: int | None = None) -> tuple[int, str
 
 def _count(date: datetime.datetime) -> int:
     """Return nanoseconds since 1970, of the wall clock if the date has no zone."""
-    offset = date.utcoffset()
-    wall = date.replace(tzinfo=None, fold=0)
-    if type(wall) is not datetime.datetime:  # a Timestamp, which counts its nanoseconds itself
-        wall = datetime.datetime(*wall.timetuple()[:6], wall.microsecond)
-    micros = (wall - (offset or datetime.timedelta(0)) - EPOCH) // datetime.timedelta(microseconds=1)
-    return 1000 * micros
+    wall = datetime.datetime(*date.timetuple()[:6], date.microsecond)  # a Timestamp's nanoseconds are left out
+    since = wall - EPOCH - (date.utcoffset() or datetime.timedelta(0))
+    return 1000 * (since // datetime.timedelta(microseconds=1))
 
 
 def _name_zone(date: datetime.datetime) -> str:
     """Return the name of a date's zone: that of the IANA database if it has one, else its offset; "" without."""
-    if date.tzinfo is None or date.utcoffset() is None:
+    offset = date.utcoffset()
+    if offset is None:
         return ""
-    name = _name_tzinfo(date.tzinfo)
-    if name:
-        return name
-    offset = date.utcoffset() or datetime.timedelta(0)
-    if not offset:
-        return "UTC"
-    seconds = abs(int(offset.total_seconds()))
-    text = f"{'-' if offset < datetime.timedelta(0) else '+'}{seconds // 3600:02d}:{seconds // 60 % 60:02d}"
-    return f"{text}:{seconds % 60:02d}" if seconds % 60 else text
+    is_fixed = type(date.tzinfo) is datetime.timezone
+    # A zone is written as "UTC+02:00", or as "UTC".
+    return (not is_fixed and _name_tzinfo(date.tzinfo)) or str(datetime.timezone(offset))[3:] or "UTC"
 
 
 def _name_tzinfo(tz: Any) -> str:
@@ -150,28 +134,17 @@ def _name_tzinfo(tz: Any) -> str:
     return str(name)
 
 
-def as_datetime64(value: Any) -> NDArray[Any] | None:
-    """Return an array or a column of dates as datetime64, in UTC if it has a zone; None for text and objects."""
-    if is_of_library(value, "pandas"):
-        return np.asarray(value, dtype="datetime64[ns]") if getattr(value.dtype, "kind", "") == "M" else None
-    if is_of_library(value, "polars"):
-        if not str(value.dtype).startswith("Date"):
-            return None
-        bare = value.dt.convert_time_zone("UTC") if getattr(value.dtype, "time_zone", None) else value
-        return np.asarray(bare.to_numpy())
-    array = np.asarray(value) if hasattr(value, "__array__") else None
-    return array if array is not None and array.dtype.kind == "M" else None
-
-
-def find_zone_of_column(value: Any) -> str:
-    """Return the zone of a column of pandas or polars, "" if it has none."""
+def _read_column(value: Any, what: str) -> Dates | None:
+    """Return an array or a column of datetime64 as dates; None for text and objects."""
     dtype = getattr(value, "dtype", None)
-    tz = getattr(dtype, "tz", None) or getattr(dtype, "time_zone", None)
-    if tz is None:
-        return ""
-    if isinstance(tz, str):
-        return tz
-    return _name_tzinfo(tz) or "UTC"
+    tz = getattr(dtype, "tz", None) or getattr(dtype, "time_zone", None)  # of pandas, of polars
+    if is_of_library(value, "polars") and str(dtype).startswith("Date"):
+        value = (value.dt.convert_time_zone("UTC") if tz else value).to_numpy()
+    if getattr(getattr(value, "dtype", None), "kind", "") != "M":
+        return None
+    array = np.asarray(value, dtype="datetime64[ns]" if tz else None)  # in UTC if it has a zone
+    zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
+    return Dates(count_nanoseconds(array, what), zone)
 
 
 def count_nanoseconds(array: NDArray[Any], what: str) -> NDArray[np.int64]:
@@ -223,7 +196,7 @@ TIME_UNITS = {spelling: unit for unit, spellings in _SPELLINGS.items() for spell
 FAR = 2**63 - 1
 """Largest difference of two dates, in nanoseconds, that 64 bits hold: 292 years."""
 
-_DATE_TYPES = (datetime.date, np.datetime64)  # a datetime and a Timestamp of pandas are dates too
+_DATE_TYPES = (str, datetime.date, np.datetime64)  # a datetime and a Timestamp of pandas are dates too
 
 
 # --- dates as they were given -----------------------------------------------------------------------------------------
@@ -291,21 +264,13 @@ class Dates:
 
 def is_dated(value: Any) -> bool:
     """Return whether a value is to be read as dates: dates, text, and arrays, tables' columns and lists of these."""
-    if type(value) is float or (type(value) is np.ndarray and value.dtype.kind in "fiub"):
-        return False
-    if isinstance(value, (Dates, str, *_DATE_TYPES)):
+    if isinstance(value, (Dates, *_DATE_TYPES)):
         return True
-    if isinstance(value, (list, tuple)):
-        return any(issubclass(kind, (str, *_DATE_TYPES)) for kind in set(map(type, value)))
     dtype = getattr(value, "dtype", None)
-    if dtype is None or isinstance(value, type):
-        return False
-    if is_of_library(value, "polars"):
-        return str(dtype).startswith(("Date", "String"))
     kind = getattr(dtype, "kind", "")
-    if kind == "O" and getattr(value, "ndim", 1) == 1:
-        return any(issubclass(kind, (str, *_DATE_TYPES)) for kind in set(map(type, value)))
-    return kind in ("M", "U")
+    if isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1):
+        return any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))
+    return kind in ("M", "U") or (is_of_library(value, "polars") and str(dtype).startswith(("Date", "String")))
 
 
 def as_dates(value: Any, what: str) -> Dates:
@@ -327,12 +292,12 @@ def as_dates(value: Any, what: str) -> Dates:
     """
     if isinstance(value, Dates):
         return value
-    if isinstance(value, (str, *_DATE_TYPES)):
+    if isinstance(value, _DATE_TYPES):
         instant, zone = read_date(value, what)
         return Dates(np.array(instant, dtype=np.int64), zone)
-    array = as_datetime64(value)
-    if array is not None:
-        return Dates(count_nanoseconds(array, what), find_zone_of_column(value))
+    column = _read_column(value, what)
+    if column is not None:
+        return column
     entries = value.to_list() if is_of_library(value, "polars") else list(value)
     pairs = [read_date(entry, what, index) for index, entry in enumerate(entries)]
     zones = {zone for _, zone in pairs}
@@ -413,13 +378,12 @@ def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     key = TIME_UNITS.get(as_name(unit, "unit"), "")
     if not key:
         raise ValueError(f"unit must be one of {', '.join(SECONDS)}; got {shorten(unit)}.")
-    integers = np.asarray(numbers) if isinstance(numbers, np.ndarray) else numbers
     array = as_array(numbers, "numbers since 1970")
     if not (np.abs(array) * SECONDS[key] <= LONGEST).all():
         raise ValueError(
             f"numbers since 1970 in {key} must be finite, and lie between {FIRST} and {LAST}; got {shorten(numbers)}."
         )
-    given = np.asarray(integers)
+    given = np.asarray(numbers)
     if given.dtype.kind in "iu":  # doubles would round nanoseconds
         return Dates(given.astype(np.int64) * NANOSECONDS[key], "UTC")
     whole = np.floor(array)  # times a length it would be beyond 2**53, where doubles are no longer exact
@@ -444,13 +408,6 @@ class Origin:
 
     date: str
     time_zone: str
-
-    def __post_init__(self) -> None:
-        _, zone = read_date(self.date, "origin")
-        if self.time_zone:
-            find_zone(self.time_zone)
-        if bool(zone) != bool(self.time_zone):
-            raise ValueError(f"origin {self.date!r} does not fit the time zone {self.time_zone!r}")
 
     @cached_property
     def instant(self) -> int:
@@ -630,8 +587,6 @@ def normalize_time_unit(unit: str) -> str:
     ValueError
         For any other unit.
     """
-    if unit in SECONDS:
-        return unit
     if unit.lower() in TIME_UNITS:
         return TIME_UNITS[unit.lower()]
     raise ValueError(f"time_unit must be one of {', '.join(SECONDS)} where times are dates; got {shorten(unit)}.")

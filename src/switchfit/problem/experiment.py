@@ -8,24 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import (
-    Data,
-    FloatArray,
-    Input,
-    Measurements,
-    ReferenceSignal,
-    RunningCost,
-    TerminalConstraint,
-    TerminalCost,
-    TransitionCost,
-    count_from,
-)
+from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
 from switchfit.problem.dates import Dates, Given, as_date, as_dates, choose_origin, has_dates, is_dated, list_dates
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, unit_suffix
@@ -97,17 +85,15 @@ class Jump:
 
     def __post_init__(self) -> None:
         as_callable(self.map, "Jump map", "a function map(t, x, p)", arguments=3)
-        if is_dated(self.time):
-            dates = as_dates(self.time, "Jump time")
-            _check_order(dates.instants.reshape(-1).tolist(), self.time)
-            set_fields(self, time=dates)
-            return
-        times = as_array(self.time, "Jump time", form="a number or a sequence of numbers")
-        if times.ndim > 1 or not np.isfinite(times).all():
+        dates = as_dates(self.time, "Jump time") if is_dated(self.time) else None
+        form = "a number or a sequence of numbers"
+        times = as_array(self.time, "Jump time", form=form) if dates is None else dates.instants
+        if times.ndim > 1 or not times.size or not np.isfinite(times).all():
             raise ValueError(f"Jump time must be a finite number or several; got {shorten(self.time)}.")
-        listed = times.reshape(-1).tolist()
-        _check_order(listed, self.time)
-        set_fields(self, time=listed[0] if times.ndim == 0 else tuple(listed))
+        if np.any(np.diff(np.atleast_1d(times)) <= 0):
+            raise ValueError(f"The times of a Jump must increase strictly; got {shorten(self.time)}.")
+        listed = times.tolist()
+        set_fields(self, time=dates if dates is not None else tuple(listed) if isinstance(listed, list) else listed)
 
     @property
     def times(self) -> FloatArray:
@@ -115,14 +101,6 @@ class Jump:
         if isinstance(self.time, Dates):
             raise ValueError(f"the times of this Jump are dates ({self.time!r}): an Experiment makes numbers of them.")
         return np.atleast_1d(np.asarray(self.time, dtype=np.float64))
-
-
-def _check_order(times: Sequence[float], given: Any) -> None:
-    """Raise ValueError unless times increase strictly."""
-    if not times:
-        raise ValueError(f"Jump time must be a finite number or several; got {shorten(given)}.")
-    if any(later <= earlier for earlier, later in pairwise(times)):
-        raise ValueError(f"The times of a Jump must increase strictly; got {shorten(given)}.")
 
 
 TIMED = (Measurements, ReferenceSignal)
@@ -536,12 +514,10 @@ def insert_jumps(experiment: Experiment, of_times: Any, of_jumps: Any) -> Any:
     """
     if not len(experiment.jump_times):
         return of_times
-    if isinstance(of_times, np.ndarray):
-        return np.insert(of_times, experiment.passed_by_jumps, of_jumps)
-    both: list[Any] = list(of_times)
-    for place, entry in reversed(list(zip(experiment.passed_by_jumps.tolist(), of_jumps, strict=True))):
-        both.insert(place, entry)
-    return both
+    is_array = isinstance(of_times, np.ndarray)
+    entries = of_times if is_array else np.array([*of_times, None], dtype=object)[:-1]
+    both = np.insert(entries, experiment.passed_by_jumps, of_jumps)
+    return both if is_array else both.tolist()
 
 
 def drop_jumps(experiment: Experiment, of_all: Iterable[Any]) -> list[Any]:
@@ -588,6 +564,11 @@ def name_runs(experiments: Sequence[Experiment]) -> tuple[str, ...]:
     return tuple(experiment.name or f"run{e + 1}" for e, experiment in enumerate(experiments))
 
 
+def prefix_runs(experiments: Sequence[Experiment]) -> list[str]:
+    """Return with what the names of each experiment's own unknowns begin: nothing for a single experiment."""
+    return [""] if len(experiments) == 1 else [f"{name}." for name in name_runs(experiments)]
+
+
 def _check_map(given: Any) -> Mapping[str, str]:
     """Return a map of the model's names to the problem's; empty for None."""
     names = {} if given is None else given
@@ -601,10 +582,9 @@ def _check_map(given: Any) -> Mapping[str, str]:
 
 
 def _check_data(data: Any) -> tuple[Data, ...]:
-    kinds = (Measurements, ReferenceSignal, RunningCost, TransitionCost, TerminalCost, TerminalConstraint)
-    items = (data,) if isinstance(data, kinds) else tuple(data) if isinstance(data, (list, tuple)) else (data,)
+    items = tuple(data) if isinstance(data, (list, tuple)) else (data,)
     for item in items:
-        if not isinstance(item, kinds):
+        if not isinstance(item, Data):
             raise TypeError(
                 "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TransitionCost, sf.TerminalCost, "
                 f"sf.TerminalConstraint or a list of them; got {type(item).__name__}."

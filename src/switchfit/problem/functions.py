@@ -21,7 +21,6 @@ import copy
 import dis
 import functools
 import hashlib
-import inspect
 import itertools
 import threading
 import types
@@ -30,7 +29,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +37,7 @@ import numpy as np
 from jax.interpreters import partial_eval
 
 from switchfit.problem.jaxprs import find_read_entries, list_jaxprs, refuse_wrong_constants
-from switchfit.problem.validation import join_names
+from switchfit.problem.validation import find_misfit, join_names
 
 TRUSTED = frozenset(
     {"jax", "jaxlib", "numpy", "scipy", "math", "cmath", "functools", "operator", "itertools", "typing"}
@@ -110,15 +109,15 @@ def _read_array(value: Any) -> Hashable:
 
 
 def _read_function(function: types.FunctionType, depth: int) -> Hashable:
-    reads, scope = _scan(function.__code__), function.__globals__
-    if not reads.is_plain:
+    names, scope = _list_globals(function.__code__), function.__globals__
+    if names is None:
         raise NotPlain
     try:
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
     except ValueError as error:  # a cell that is still empty
         raise NotPlain from error
     found = {}
-    for name in reads.names:
+    for name in names:
         if name in scope:
             found[name] = scope[name]
         elif name in OPAQUE_BUILTINS or not hasattr(builtins, name):
@@ -147,35 +146,24 @@ def _is_library(module: str) -> bool:
     return module.partition(".")[0] in TRUSTED
 
 
-class _Reads(NamedTuple):
-    """What a code object, and those inside it, read.
-
-    Attributes
-    ----------
-    names : of globals
-    is_plain : whether nothing is read except by these names
-    """
-
-    names: tuple[str, ...]
-    is_plain: bool
-
-
 @functools.lru_cache(maxsize=1024)
-def _scan(code: types.CodeType) -> _Reads:
-    names, is_plain, pending = set[str](), True, [code]
+def _list_globals(code: types.CodeType) -> tuple[str, ...] | None:
+    """Return the globals that a code object, and those inside it, read; None if it reads anything in another way."""
+    names, pending = set[str](), [code]
     while pending:
         each = pending.pop()
         pending += [constant for constant in each.co_consts if isinstance(constant, types.CodeType)]
         for instruction in dis.get_instructions(each):
-            if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-                names.add(instruction.argval)
-            elif instruction.opname in ("STORE_DEREF", "DELETE_DEREF"):
-                is_plain = is_plain and instruction.argval not in code.co_freevars
-            elif instruction.opname == "IMPORT_NAME":
-                is_plain = is_plain and _is_library(instruction.argval)
-            elif "GLOBAL" in instruction.opname or instruction.opname == "LOAD_BUILD_CLASS":
-                is_plain = False
-    return _Reads(tuple(sorted(names)), is_plain)
+            name, argument = instruction.opname, instruction.argval
+            if name in ("LOAD_GLOBAL", "LOAD_NAME"):
+                names.add(argument)
+            elif (
+                ("GLOBAL" in name or name == "LOAD_BUILD_CLASS")
+                or (name in ("STORE_DEREF", "DELETE_DEREF") and argument in code.co_freevars)
+                or (name == "IMPORT_NAME" and not _is_library(argument))
+            ):
+                return None
+    return tuple(sorted(names))
 
 
 Array = jax.Array
@@ -208,6 +196,9 @@ class Function:
     ----------
     parameters : tuple of str
     shape : shape of its result
+    jaxpr : its operations; the last arguments are the parameters that it reads
+    consts : the constants of the jaxpr
+    structs : shapes and types of the arguments of the jaxpr
     digest : str
         Hash of the jaxpr's content, the same in every process.
     """
@@ -215,7 +206,8 @@ class Function:
     def __init__(self, closed: Any, parameters: tuple[str, ...]) -> None:
         self.parameters = parameters
         self.shape: Shape = tuple(closed.out_avals[0].shape)
-        self._closed = closed
+        self.jaxpr, self.consts = closed.jaxpr, closed.consts
+        self.structs = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in closed.in_avals]
         content = _describe_content(closed)
         self.digest = hashlib.sha256("\n".join([repr(parameters), *content.lines]).encode()).hexdigest()
         self._opaque = tuple(content.opaque)  # compared by identity, therefore kept alive
@@ -231,21 +223,6 @@ class Function:
         """Evaluate for the arguments of the jaxpr: the parameters are the last."""
         return jax.core.eval_jaxpr(self.jaxpr, self.consts, *given)[0]
 
-    @property
-    def jaxpr(self) -> Any:
-        """Its operations; the last arguments are the parameters that it reads."""
-        return self._closed.jaxpr
-
-    @property
-    def consts(self) -> Sequence[Any]:
-        """The constants of the jaxpr."""
-        return self._closed.consts
-
-    @property
-    def structs(self) -> list[Any]:
-        """Shapes and types of the arguments of the jaxpr."""
-        return [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self._closed.in_avals]
-
     @cached_property
     def read(self) -> dict[str, tuple[int, ...]]:
         """Positions of the entries of each parameter that it may read."""
@@ -255,7 +232,7 @@ class Function:
     @cached_property
     def takes_input(self) -> bool:
         """Whether it takes an input after t, the state and the parameters."""
-        return len(self._closed.in_avals) - len(self.parameters) > 2
+        return len(self.structs) - len(self.parameters) > 2
 
     def derive(self, evaluate: Callable[..., Any]) -> Function:
         """Return another function of the same arguments; `evaluate` takes those of the jaxpr."""
@@ -493,7 +470,10 @@ class _Text:
 
 def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:
     """Call a user's function while tracing; turn any exception into one sentence that names the function."""
-    _check_signature(function, arguments, what, form)
+    misfit = find_misfit(function, arguments)
+    if misfit is not None:
+        inputs = " Modes get an input u if and only if the experiment has inputs." if what.startswith("mode ") else ""
+        raise ValueError(f"{what} is called as {form}, but takes the arguments {misfit}.{inputs}")
     try:
         value = function(*arguments)
     except KeyError as error:
@@ -526,19 +506,6 @@ def _describe_missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
         return f"reads {lacks_input}."
     known = f"a parameter ({join_names(parameters)}) nor an input ({join_names(inputs[0])})"
     return f"reads {name!r}, which is neither {known}."
-
-
-def _check_signature(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> None:
-    """Raise ValueError if a function does not take as many arguments as it is called with."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # it has no signature
-        return
-    try:
-        signature.bind(*arguments)
-    except TypeError as error:
-        inputs = " Modes get an input u if and only if the experiment has inputs." if what.startswith("mode ") else ""
-        raise ValueError(f"{what} is called as {form}, but takes the arguments {signature}.{inputs}") from error
 
 
 def call_for_vector(

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import chain
 from typing import Any, NamedTuple
 
 import jax
@@ -26,43 +27,9 @@ import numpy as np
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
-from switchfit.problem.jaxprs import find_line, find_public_name
+from switchfit.problem.jaxprs import Walk, find_line, find_public_name
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure, trace_structure
-
-
-class Readers(NamedTuple):
-    """Which of the model's parameters the functions of an experiment read.
-
-    Attributes
-    ----------
-    always : set of str
-        By functions that act whatever the sequence.
-    modes : dict of mode to set of str
-    """
-
-    always: frozenset[str]
-    modes: Mapping[str, frozenset[str]]
-
-    def find(self, sequence: Iterable[str], structure: Structure | None) -> set[str]:
-        """Return what a sequence reads, with the functions at its transitions if its structure is given."""
-        found = set(self.always).union(*(self.modes[mode] for mode in sequence))
-        if structure is not None:
-            at = (*structure.reset_maps, *structure.guards, *structure.transition_costs)
-            found = found.union(*(function.parameters for function in at if function is not None))
-        return found
-
-
-def list_readers(structure: Structure) -> Readers:
-    """Return which parameters each mode of a structure reads, and which the functions read that always act."""
-    observes = [observe for observe, _ in structure.outputs]
-    jumps = [structure.reset_maps[i] for i in structure.jumps]
-    at_all_times = [*structure.running, *observes, *jumps]
-    functions = [structure.initial_state, *at_all_times, *structure.terminal, *structure.terminal_constraints]
-    always = {name for function in functions if function is not None for name in function.parameters}
-    always = always.union(*(sensor.named for sensor in structure.measurements))
-    pairs = zip(structure.mode_names, structure.modes, strict=True)
-    return Readers(frozenset(always), {name: frozenset(mode.parameters) for name, mode in pairs})
 
 
 class Unread(NamedTuple):
@@ -128,10 +95,10 @@ def find_targets(problem: Problem, structures: Iterable[Structure], *, library: 
     """
     found: set[str] = set()
     for run, structure in zip(problem.experiments, structures, strict=True):
-        readers = list_readers(structure)
-        modes = readers.modes if library else {structure.mode_names[k] for k in structure.mode_of_segment}
-        names = readers.find(modes, structure.library if library else structure)
-        found.update(run.parameter_map.get(name, name) for name in names)
+        functions = structure.library.roles if library else structure.acting
+        read = chain.from_iterable(function.parameters for function in functions.values())
+        named = chain.from_iterable(sensor.named for sensor in structure.measurements)
+        found.update(run.parameter_map.get(name, name) for name in chain(read, named))
     return found
 
 
@@ -183,30 +150,22 @@ class Comparison(NamedTuple):
     line: str
 
 
-def find_comparison(problem: Problem, i: int) -> str | None:
-    """Return which function compares with an unknown and where, "mode 'on' compares with t_on at model.py:12".
+@keep_with_problem
+def find_comparisons(problem: Problem) -> dict[int, str]:
+    """Return by which function and where an unknown is compared, such as "mode 'on' compares with t_on at model.py:12".
 
-    None for a transition time and an initial state, and if no function of the problem's sequences does.
+    By its index in theta, for all with which a function of the problem's sequences compares; transition times and
+    initial states are never among them.
 
     Parameters
     ----------
     problem : Problem
-    i : int
-        Index of the unknown in theta.
     """
-    return find_comparisons(problem).get(i)
-
-
-@keep_with_problem
-def find_comparisons(problem: Problem) -> dict[int, str]:
-    """Return what `find_comparison` says of each unknown of a problem with which a function compares."""
     found: dict[str, str] = {}
     for run, structure in zip(problem.experiments, problem.structures, strict=True):
-        idle = {f"mode {name!r}" for k, name in enumerate(structure.mode_names) if k not in structure.mode_of_segment}
-        for role, function in structure.roles.items():
+        for role, function in structure.acting.items():
             # Where a mode compares with its state, rows end, and derivatives have all of it: see `corners`.
-            own = list_comparisons(function, with_state=not role.startswith("mode ")) if role not in idle else ()
-            for parameter, verb, line in own:
+            for parameter, verb, line in list_comparisons(function, with_state=not role.startswith("mode ")):
                 name = run.parameter_map.get(parameter, parameter)
                 found.setdefault(name, f"{role} {verb} {parameter}{f' at {line}' if line else ''}")
     spans = problem.unknowns.parameters.items()
@@ -223,38 +182,34 @@ def list_comparisons(function: Function, with_state: bool = True) -> tuple[Compa
     with_state : bool
         Whether a comparison of the state, the second argument, with a parameter counts.
     """
-    found: list[Comparison] = []
     others = [NONE] * (len(function.jaxpr.invars) - len(function.parameters))
     if not with_state:
         others[1] = frozenset({STATE})
-    _follow(function.jaxpr, [*others, *(frozenset({name}) for name in function.parameters)], "", found)
-    return tuple(dict.fromkeys(found))
+    walk = _Comparing()
+    walk.run(function.jaxpr, function.consts, [*others, *(frozenset({name}) for name in function.parameters)])
+    return tuple(dict.fromkeys(walk.found))
 
 
-def _follow(jaxpr: Any, arguments: Sequence[Names], line: str, found: list[Comparison]) -> list[Names]:
-    """Add the comparisons of a jaxpr; return the parameters on which its results depend.
+class _Comparing(Walk):
+    """Finds the comparisons of a function; what it follows are the parameters on which values depend."""
 
-    `line` is that of the call, inside a function of JAX: see `find_public_name`.
-    """
-    known = dict(zip(jaxpr.invars, arguments, strict=True))
+    def __init__(self) -> None:
+        self.found: list[Comparison] = []
 
-    def depends(atom: Any) -> Names:
-        return NONE if hasattr(atom, "val") else known.get(atom, NONE)
+    def constant(self, value: Any) -> Names:
+        return NONE
 
-    for equation in jaxpr.eqns:
-        given = [depends(atom) for atom in equation.invars]
-        if _jumps(equation):
-            verb, where = VERBS[equation.primitive.name], line or find_line(equation)
-            names = NONE.union(*given)
-            found += [Comparison(name, verb, where) for name in sorted(names) if STATE not in names]
-        results = [NONE.union(*given)] * len(equation.outvars)
+    def apply(self, equation: Any, given: list[Names], origin: Any) -> list[Names]:
+        names = NONE.union(*given)
+        if _jumps(equation) and STATE not in names:
+            verb, line = VERBS[equation.primitive.name], find_line(origin)
+            self.found += [Comparison(name, verb, line) for name in sorted(names)]
+        results = [names] * len(equation.outvars)
         for inner, own in _list_calls(equation, given):
-            name = find_public_name(inner)
-            if name not in SMOOTH:
-                made = _follow(inner, own, line or (find_line(equation) if name else ""), found)
+            if find_public_name(inner) not in SMOOTH:
+                made = self.enter(equation, inner, own, origin)
                 results = made if len(made) == len(results) else results
-        known |= dict(zip(equation.outvars, results, strict=True))
-    return [depends(atom) for atom in jaxpr.outvars]
+        return results
 
 
 def _jumps(equation: Any) -> bool:
@@ -271,15 +226,15 @@ def _list_calls(equation: Any, given: list[Names]) -> Iterator[tuple[Any, list[N
     params = equation.params
     if equation.primitive.name == "while":
         first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-        yield params["cond_jaxpr"].jaxpr, given[:first] + given[second:]
-        yield params["body_jaxpr"].jaxpr, given[first:]
+        yield params["cond_jaxpr"], given[:first] + given[second:]
+        yield params["body_jaxpr"], given[first:]
     elif equation.primitive.name == "cond":
         for branch in params["branches"]:
-            yield branch.jaxpr, given[1:]
+            yield branch, given[1:]
     elif "jaxpr" in params:  # calls and loops; custom derivatives have rules of their own
         inner = getattr(params["jaxpr"], "jaxpr", params["jaxpr"])
         if len(inner.invars) == len(given):
-            yield inner, given
+            yield params["jaxpr"], given
 
 
 GROWING = frozenset(
@@ -311,14 +266,6 @@ class Undefined(NamedTuple):
     line: str
     order: int
     valued: bool
-
-
-class _Step(NamedTuple):
-    """An operation, and whether its value, first and second derivative are finite at finite operands: (3,)."""
-
-    operation: str
-    line: str
-    finite: jax.Array
 
 
 def find_undefined(
@@ -361,11 +308,11 @@ def _compile(function: Function, derivatives: bool) -> tuple[Callable[..., Any],
     checked: list[tuple[str, str]] = []
 
     def check(flat: list[Any], named: list[Any]) -> tuple[Any, Any]:
-        given, steps = [*flat, *named], list[_Step]()
+        given, walk = [*flat, *named], _Checking()
         depends = [derivatives and not (k == 0 and a.ndim == 0 and flat) for k, a in enumerate(given)]
-        _walk(function.jaxpr, function.consts, given, depends, steps, "", "", jnp.array(True))
-        checked[:] = [step[:2] for step in steps]
-        finite = jnp.stack([step.finite for step in steps]) if steps else jnp.ones((0, 3), bool)
+        walk.run(function.jaxpr, function.consts, list(zip(given, depends, strict=True)))
+        checked[:] = walk.operations
+        finite = jnp.stack(walk.finite) if walk.finite else jnp.ones((0, 3), bool)
         return _is_finite(function, given, depends), finite
 
     points = len(function.jaxpr.invars) > len(function.parameters)
@@ -384,64 +331,55 @@ def _is_finite(function: Function, given: list[Any], depends: list[bool]) -> Any
     return jnp.stack([_are_finite([call(moving)]), _are_finite(jax.tree.leaves(derivatives))])
 
 
-def _walk(
-    jaxpr: Any,
-    consts: Sequence[Any],
-    given: Sequence[Any],
-    depends: Sequence[bool],
-    steps: list[_Step],
-    caller: str,
-    line: str,
-    runs: Any,
-) -> tuple[list[Any], list[bool]]:
-    """Evaluate a jaxpr and add its operations to the steps; return its results, and which depend on what moves.
+class _Checking(Walk):
+    """Evaluates a function, and checks its operations; what it follows are values, and whether they move.
 
-    Inside a function of JAX, `caller` and `line` are its name and that of the call. `runs` is whether this branch does.
+    Attributes
+    ----------
+    operations : list of (name, line)
+    finite : list of (3,)
+        Whether the value, the first and the second derivative of each operation are finite at finite operands.
     """
-    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *given], strict=True))
-    moving = dict(zip(jaxpr.invars, depends, strict=True))
 
-    def value(atom: Any) -> Any:
-        return atom.val if hasattr(atom, "val") else values[atom]
+    def __init__(self) -> None:
+        self.operations: list[tuple[str, str]] = []
+        self.finite: list[Any] = []
+        self._runs: Any = jnp.array(True)  # whether this branch does
 
-    def moves(atom: Any) -> bool:
-        return not hasattr(atom, "val") and moving.get(atom, False)
+    def constant(self, value: Any) -> tuple[Any, bool]:
+        return value, False
 
-    for equation in jaxpr.eqns:
-        name, operands = equation.primitive.name, [value(atom) for atom in equation.invars]
-        which = [moves(atom) for atom in equation.invars]
-        results, results_move = _apply(jaxpr, equation, operands), [any(which)] * len(equation.outvars)
+    def apply(self, equation: Any, given: list[tuple[Any, bool]], origin: Any) -> list[tuple[Any, bool]]:
+        name = equation.primitive.name
+        operands, which = [value for value, _ in given], [moves for _, moves in given]
         if name in ("jit", "pjit"):
-            inner = equation.params["jaxpr"]
-            public = find_public_name(inner.jaxpr)
-            here = (caller or public or "", line or (find_line(equation) if public else ""))
-            results, results_move = _walk(inner.jaxpr, inner.consts, operands, which, steps, *here, runs)
-        elif name == "cond":
+            return self.enter(equation, equation.params["jaxpr"], given, origin)
+        results = _evaluate(equation, operands)
+        if name == "cond":
+            outside = self._runs
             for k, branch in enumerate(equation.params["branches"]):
-                taken = runs & (operands[0] == k)
-                _walk(branch.jaxpr, branch.consts, operands[1:], which[1:], steps, caller, line, taken)
+                self._runs = outside & (operands[0] == k)
+                self.enter(equation, branch, given[1:], origin)
+            self._runs = outside
         elif name not in GROWING and not (name == "integer_pow" and equation.params["y"] > 0):
-            finite = ~runs | ~_are_finite(operands) | _check_orders(jaxpr, equation, operands, which, results)
-            steps.append(_Step(caller or name, line or find_line(equation), finite))
-        values |= dict(zip(equation.outvars, results, strict=True))
-        moving |= dict(zip(equation.outvars, results_move, strict=True))
-    return [value(atom) for atom in jaxpr.outvars], [moves(atom) for atom in jaxpr.outvars]
+            caller = None if origin is equation else find_public_name(origin.params.get("jaxpr"))
+            self.operations.append((caller or name, find_line(origin)))
+            self.finite.append(~self._runs | ~_are_finite(operands) | _check_orders(equation, operands, which, results))
+        return [(result, any(which)) for result in results]
 
 
-def _apply(jaxpr: Any, equation: Any, operands: Sequence[Any]) -> list[Any]:
-    """Return the results of an operation of a jaxpr, by its own rule for derivatives if it has one."""
-    known = {atom: a for atom, a in zip(equation.invars, operands, strict=True) if not hasattr(atom, "val")}
-    debug = jaxpr.debug_info.with_unknown_names()
-    alone = jaxpr.replace(constvars=[], invars=list(known), outvars=equation.outvars, eqns=[equation], debug_info=debug)
-    return list(jax.core.eval_jaxpr(alone, [], *known.values()))
+def _evaluate(equation: Any, operands: Sequence[Any]) -> list[Any]:
+    """Return the results of an operation, by its own rule for derivatives if it has one."""
+    made = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
+    return list(made) if equation.primitive.multiple_results else [made]
 
 
-def _check_orders(jaxpr: Any, equation: Any, operands: list[Any], which: list[bool], results: list[Any]) -> Any:
+def _check_orders(equation: Any, operands: list[Any], which: list[bool], results: list[Any]) -> Any:
     """Return whether the value and the first two derivatives of an operation in some operands are finite: (3,)."""
     floats = [k for k, moves in enumerate(which) if moves and _is_float(operands[k])]
 
     def call(*moved: Any) -> list[Any]:
-        made = _apply(jaxpr, equation, [moved[floats.index(k)] if k in floats else a for k, a in enumerate(operands)])
+        made = _evaluate(equation, [moved[floats.index(k)] if k in floats else a for k, a in enumerate(operands)])
         return list(filter(_is_float, made))
 
     value = _are_finite(results)

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cache
-from itertools import count, pairwise
+from importlib import import_module
+from itertools import chain, count, pairwise
 from types import MappingProxyType
 from typing import Any
 
@@ -36,19 +36,16 @@ MOVES: dict[str, Callable[[Any, Any], Any]] = {
 """Operations that only select or move entries, none of which depends on a value."""
 
 
-def find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
-    """Return the jaxprs that an operation calls, each with its constants.
+def find_inner_jaxprs(equation: Any) -> list[Any]:
+    """Return the jaxprs that an operation calls, with their constants or without.
 
     Parameters
     ----------
     equation : operation of a jaxpr
     """
-    found = []
-    for value in equation.params.values():
-        for entry in value if isinstance(value, (tuple, list)) else (value,):
-            if hasattr(entry, "eqns"):
-                found.append((getattr(entry, "jaxpr", entry), getattr(entry, "consts", ())))
-    return found
+    values = equation.params.values()
+    every = chain.from_iterable(value if isinstance(value, (tuple, list)) else (value,) for value in values)
+    return [entry for entry in every if hasattr(entry, "eqns")]
 
 
 def list_jaxprs(jaxpr: Any) -> Iterator[Any]:
@@ -60,8 +57,41 @@ def list_jaxprs(jaxpr: Any) -> Iterator[Any]:
     """
     yield jaxpr
     for equation in jaxpr.eqns:
-        for inner, _ in find_inner_jaxprs(equation):
-            yield from list_jaxprs(inner)
+        for inner in find_inner_jaxprs(equation):
+            yield from list_jaxprs(getattr(inner, "jaxpr", inner))
+
+
+class Walk:
+    """Follows values of any kind through a jaxpr, operation by operation: `apply` says what one makes of them."""
+
+    def constant(self, value: Any) -> Any:
+        """Return what stands for a constant."""
+        return value
+
+    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
+        """Return the results of an operation; its place in the user's code is that of the operation `origin`."""
+        raise NotImplementedError
+
+    def run(self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], origin: Any = None) -> list[Any]:
+        """Return the results of a jaxpr."""
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(self.constant, consts), *given], strict=True))
+
+        def value(atom: Any) -> Any:
+            return self.constant(atom.val) if hasattr(atom, "val") else known[atom]
+
+        for equation in jaxpr.eqns:
+            results = self.apply(equation, [value(atom) for atom in equation.invars], origin or equation)
+            known |= dict(zip(equation.outvars, results, strict=True))
+        return [value(atom) for atom in jaxpr.outvars]
+
+    def enter(self, equation: Any, inner: Any, given: Sequence[Any], origin: Any) -> list[Any]:
+        """Return the results of a jaxpr that an operation calls.
+
+        JAX traces its own functions once for all callers: what is inside them has the place of the call.
+        """
+        jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+        is_of_jax = origin is not equation or find_public_name(jaxpr) is not None
+        return self.run(jaxpr, consts, given, origin if is_of_jax else None)
 
 
 def find_read_entries(jaxpr: Any, variable: Any) -> tuple[int, ...]:
@@ -101,17 +131,6 @@ def find_line(equation: Any) -> str:
         return ""
 
 
-def write_line(equation: Any) -> str:
-    """Return the location of an operation as the end of a sentence, " (file.py:12)"; empty if it is unknown.
-
-    Parameters
-    ----------
-    equation : operation of a jaxpr
-    """
-    where = find_line(equation)
-    return f" ({where})" if where else ""
-
-
 def find_public_name(jaxpr: Any) -> str | None:
     """Return the public name of a function of JAX; None for any other function.
 
@@ -122,34 +141,21 @@ def find_public_name(jaxpr: Any) -> str | None:
     ----------
     jaxpr : that of the function
     """
-    info = getattr(jaxpr, "debug_info", None)
+    info = getattr(getattr(jaxpr, "jaxpr", jaxpr), "debug_info", None)
     file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
     if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
         return None
-    for place, module in _list_modules():
-        if hasattr(module, name):
-            return f"{place}.{name}"
+    for module in PUBLIC:
+        if hasattr(import_module(module), name):
+            return f"{module.replace('jax.numpy', 'jnp')}.{name}"
     return name or "a function of JAX"
 
 
-@cache
-def _list_modules() -> list[tuple[str, Any]]:
-    import jax.scipy.linalg
-    import jax.scipy.special
-
-    numpy, scipy = jax.numpy, jax.scipy
-    return [
-        ("jnp", numpy),
-        ("jnp.linalg", numpy.linalg),
-        ("jnp.fft", numpy.fft),
-        ("jax.scipy.special", scipy.special),
-        ("jax.scipy.linalg", scipy.linalg),
-        ("jax.nn", jax.nn),
-        ("jax.random", jax.random),
-        ("jax.lax", jax.lax),
-        ("jax.lax.linalg", jax.lax.linalg),
-    ]
-
+PUBLIC = (
+    *("jax.numpy", "jax.numpy.linalg", "jax.numpy.fft", "jax.scipy.special", "jax.scipy.linalg", "jax.nn"),
+    *("jax.random", "jax.lax", "jax.lax.linalg"),
+)
+"""Modules of JAX in which the name of a function is looked for."""
 
 KEEPING = frozenset(
     {"slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "rev", "gather", "stack", "copy"}
@@ -173,21 +179,13 @@ FOLDED: Mapping[str, Callable[..., Any]] = MappingProxyType(
         "select_n": lambda which, no, yes: np.where(which, yes, no),
         "convert_element_type": lambda a, new_dtype, **_: np.asarray(a).astype(new_dtype),
         "broadcast_in_dim": lambda a, shape, broadcast_dimensions, **_: np.broadcast_to(
-            np.reshape(a, _spread(np.shape(a), shape, broadcast_dimensions)), shape
+            np.expand_dims(a, tuple(set(range(len(shape))) - set(broadcast_dimensions))), shape
         ),
         "concatenate": lambda *parts, dimension: np.concatenate(parts, axis=dimension),
         "reshape": lambda a, new_sizes, **_: np.reshape(a, new_sizes),
     }
 )
 """Operations by which JAX makes what it reads of a constant index; in NumPy, which compiles nothing."""
-
-
-def _spread(sizes: Sequence[int], shape: Sequence[int], places: Sequence[int]) -> list[int]:
-    """Return the sizes of an array with axes of size 1 where it is repeated."""
-    spread = [1] * len(shape)
-    for place, size in zip(places, sizes, strict=True):
-        spread[place] = size
-    return spread
 
 
 def refuse_wrong_constants(closed: Any, what: str) -> None:
@@ -203,53 +201,43 @@ def refuse_wrong_constants(closed: Any, what: str) -> None:
     """
     every = (equation for jaxpr in list_jaxprs(closed.jaxpr) for equation in jaxpr.eqns)
     has_short = any(_is_short(atom) for equation in every for atom in (*equation.invars, *equation.outvars))
-    _Constants(what, has_short).follow(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
+    _Constants(what, has_short).run(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
 
 
-class _Constants:
-    """Follows known numbers through a function; `has_short`: some of its numbers are of less than double precision."""
+class _Constants(Walk):
+    """Follows known numbers, and None for unknown ones; `has_short`: some are of less than double precision."""
 
     def __init__(self, what: str, has_short: bool) -> None:
         self._what, self._has_short = what, has_short
 
-    def follow(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-        """Check a jaxpr and those inside it; return its results. None stands for what is unknown."""
-        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
+    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
+        inner = find_inner_jaxprs(equation)
+        results: Sequence[Any] = [None] * len(equation.outvars)
+        for jaxpr in inner:
+            if equation.primitive.name == "jit":  # a plain call; loops and branches without known arguments
+                results = self.enter(equation, jaxpr, given, origin)
+            else:
+                self.enter(equation, jaxpr, [None] * len(getattr(jaxpr, "jaxpr", jaxpr).invars), origin)
+        if not inner and all(operand is not None for operand in given):
+            results = self._evaluate(equation, given)
+        if self._has_short:
+            self._check_precision(equation, given, results, _locate(origin))
+        self._check_indices(equation, given, origin)
+        return results
 
-        def value(atom: Any) -> Any:
-            return atom.val if hasattr(atom, "val") else known.get(atom)
-
-        for equation in jaxpr.eqns:
-            given, inner = [value(atom) for atom in equation.invars], find_inner_jaxprs(equation)
-            results: Sequence[Any] | None = None
-            for own, own_consts in inner:
-                if equation.primitive.name == "jit":  # a plain call; loops and branches without known arguments
-                    results = self.follow(own, own_consts, given)
-                else:
-                    self.follow(own, own_consts, [None] * len(own.invars))
-            if not inner and all(operand is not None for operand in given):
-                results = self._evaluate(equation, given)
-            results = [None] * len(equation.outvars) if results is None else results
-            known |= dict(zip(equation.outvars, results, strict=True))
-            if self._has_short:
-                self._check_precision(equation, given, results)
-            self._check_indices(equation, given)
-        return [value(atom) for atom in jaxpr.outvars]
-
-    def _evaluate(self, equation: Any, given: list[Any]) -> Sequence[Any] | None:
+    def _evaluate(self, equation: Any, given: list[Any]) -> Sequence[Any]:
         """Return the results of an operation of known numbers: of all if some are short, else of those of indices."""
         fold = FOLDED.get(equation.primitive.name)
         if fold is not None and getattr(equation.outvars[0].aval.dtype, "kind", "O") in "iub":
             return [fold(*given, **equation.params)]
         if not self._has_short or equation.effects:
-            return None
+            return [None] * len(equation.outvars)
         with jax.ensure_compile_time_eval():
             made = equation.primitive.bind(*given, **equation.params)
         return made if equation.primitive.multiple_results else [made]
 
-    def _check_precision(self, equation: Any, given: list[Any], results: Sequence[Any]) -> None:
+    def _check_precision(self, equation: Any, given: list[Any], results: Sequence[Any], where: str) -> None:
         """Raise ValueError if a known number of an operation lost digits, or an unknown one is cast."""
-        where = write_line(equation)
         for number in given:
             refuse_single_precision(number, f"a constant of {self._what}{where}")
         if equation.primitive.name in KEEPING:
@@ -263,7 +251,7 @@ class _Constants:
                     "so loses half of their digits: its arguments are float64, do not cast them."
                 )
 
-    def _check_indices(self, equation: Any, given: list[Any]) -> None:
+    def _check_indices(self, equation: Any, given: list[Any], origin: Any) -> None:
         """Raise ValueError for a known index of an operation that is out of range."""
         verb = "reads index" if equation.primitive.name in ("dynamic_slice", "gather") else "writes to index"
         for start, axis, size in _list_indices(equation, given):
@@ -273,8 +261,15 @@ class _Constants:
             if wrong.size:
                 index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
                 along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
-                where = write_line(equation)
-                raise ValueError(f"{self._what} {verb} {index} of {along}{where}: its indices are 0 to {n - 1}.")
+                raise ValueError(
+                    f"{self._what} {verb} {index} of {along}{_locate(origin)}: its indices are 0 to {n - 1}."
+                )
+
+
+def _locate(equation: Any) -> str:
+    """Return the location of an operation as the end of a sentence, " (file.py:12)"; empty if it is unknown."""
+    where = find_line(equation)
+    return f" ({where})" if where else ""
 
 
 def _is_short(atom: Any) -> bool:

@@ -246,9 +246,8 @@ class Parameter:
     def _has_dates(self) -> bool:
         """Return whether the value is a date; then its bounds and the mean of its prior have to be dates too."""
         is_date = is_dated(self.value)
-        others = {"lower": self.lower, "upper": self.upper}
-        if self.prior is not None:
-            others["prior: its mean"] = getattr(self.prior, "mean", None)
+        mean = np.inf if self.prior is None else getattr(self.prior, "mean", None)
+        others = {"lower": self.lower, "upper": self.upper, "prior: its mean": mean}
         for name, other in others.items():
             is_open = isinstance(other, float) and np.isinf(other)
             if not is_open and is_dated(other) != is_date:
@@ -283,8 +282,8 @@ class Parameter:
 
     def _read_dates(self) -> dict[str, Any]:
         """Return the value and the bounds as dates: an experiment makes numbers of them."""
-        found = {"value": as_dates(self.value, "Parameter value")}
-        found |= {n: as_dates(getattr(self, n), f"Parameter {n}") for n in BOUNDS if is_dated(getattr(self, n))}
+        names = [name for name in ("value", *BOUNDS) if is_dated(getattr(self, name))]
+        found = {name: as_dates(getattr(self, name), f"Parameter {name}") for name in names}
         value = found["value"]
         if value.shape != ():
             raise ValueError(f"Parameter value must be one date, that of a transition or of tf; got {value!r}.")
@@ -364,15 +363,19 @@ def unit_suffix(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
 
 
-def as_parameter(value: Any, what: str) -> Parameter:
-    """Return `value` itself if it is a `Parameter`, otherwise a free one without bounds; errors call it `what`."""
+def as_parameter(
+    value: Any, what: str, form: str = "a number, an array or an sf.Parameter", *, fixed: bool = False
+) -> Parameter:
+    """Return `value` itself if it is a `Parameter`, otherwise a free or fixed one without bounds.
+
+    Errors call it `what`, and `form` what it has to be.
+    """
     if isinstance(value, Parameter):
         refuse_dates(value, what)
         return value
-    form = "a number, an array or an sf.Parameter"
     array = as_array(value, what, form=form)
     try:
-        return Parameter(array)
+        return Parameter(array, fixed=fixed)
     except ValueError as error:
         raise ValueError(f"{what} must be {form}: {error}") from error
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize import LinearConstraints
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
-from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_of, insert_jumps, name_runs
+from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_of, insert_jumps, name_runs, prefix_runs
 from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.problem.structure import Functions, Structure, choose_common_lengths, trace_structure
 from switchfit.problem.system import HybridSystem
@@ -29,6 +29,7 @@ from switchfit.problem.validation import (
     as_number,
     as_positive,
     join_names,
+    require_known,
     set_fields,
     shorten,
 )
@@ -48,22 +49,14 @@ def check_durations(given: Any, system: HybridSystem) -> float | dict[str, float
     """Return the shortest duration of all modes, or of each mode that a mapping names."""
     if not isinstance(given, Mapping):
         return as_number(given, "min_duration")
-    for mode in given:
-        if mode not in system.modes:
-            raise ValueError(
-                f"min_duration names the unknown mode {shorten(mode)}; the modes are {join_names(system.modes)}."
-            )
+    require_known(given, "min_duration", system.modes)
     return {mode: as_number(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}
 
 
 def check_sequences(system: HybridSystem, experiments: tuple[Experiment, ...], max_transitions: int | None) -> None:
     """Check the names of modes in mode sequences, and the number of transitions against `max_transitions`."""
     for experiment in experiments:
-        for mode in experiment.mode_sequence:
-            if mode not in system.modes:
-                raise ValueError(
-                    f"mode_sequence names the unknown mode {shorten(mode)}; the modes are {join_names(system.modes)}."
-                )
+        require_known(experiment.mode_sequence, "mode_sequence", system.modes)
     if max_transitions is not None:
         longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
         if max_transitions < longest:
@@ -96,7 +89,6 @@ def check_states(system: HybridSystem, experiments: tuple[Experiment, ...]) -> N
                 f"initial_state of experiment {experiment.name or e + 1} must have "
                 f"{len(own)} entries, as the system's has; got {len(initial)}."
             )
-        system.check_labels_of(len(initial))
 
 
 def check_noise(experiments: tuple[Experiment, ...], parameters: Mapping[str, Parameter], *, has_priors: bool) -> None:
@@ -305,7 +297,7 @@ class Problem:
         set_fields(self, unknowns=list_unknowns(self.system, experiments, parameters, dwell))
         if not self.max_transitions:
             require_unknowns(self)
-        check_noise(experiments, parameters, has_priors=self.unknowns.has_priors)
+        check_noise(experiments, parameters, has_priors=self.unknowns.priors.any)
         check_delays(experiments, parameters)
         set_fields(self, structures=self._trace_structures())
         for structure in self.structures:
@@ -412,7 +404,9 @@ class Problem:
     def constraint_names(self) -> tuple[str, ...]:
         """What has to be zero: guards at transitions, then terminal constraints, experiment by experiment."""
         names = []
-        for prefix, structure, experiment in zip(self._prefixes, self.structures, self.experiments, strict=True):
+        for prefix, structure, experiment in zip(
+            prefix_runs(self.experiments), self.structures, self.experiments, strict=True
+        ):
             # of the user's transitions: those of the structure have the jumps in between
             for i in np.flatnonzero(drop_jumps(experiment, [g is not None for g in structure.guards])).tolist():
                 before, after = experiment.mode_sequence[i : i + 2]
@@ -429,12 +423,6 @@ class Problem:
     def run_names(self) -> tuple[str, ...]:
         """What each experiment is called: its name, or run1, run2, ..."""
         return name_runs(self.experiments)
-
-    @property
-    def _prefixes(self) -> list[str]:
-        if len(self.experiments) == 1:
-            return [""]
-        return [f"{name}." for name in self.run_names]
 
     @cached_property
     def constraints(self) -> LinearConstraints:

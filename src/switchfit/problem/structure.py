@@ -152,20 +152,8 @@ class Structure:
     @property
     def functions(self) -> Structure:
         """The same with one segment, for programs that work in one mode at a time."""
-        return replace(
-            self,
-            mode_of_segment=(0,),
-            reset_maps=(),
-            guards=(),
-            terminal_constraints=(),
-            transitions=0,
-            reset_library=(),
-            guard_library=(),
-            transition_costs=(),
-            transition_cost_library=(),
-            jumps=(),
-            known=0,
-        )
+        alone = replace(self, reset_library=(), guard_library=(), transition_cost_library=()).library
+        return replace(alone, mode_of_segment=(0,), terminal_constraints=(), transitions=0, known=0)
 
     @cached_property
     def library(self) -> Structure:
@@ -219,6 +207,12 @@ class Structure:
         ):
             found |= {f"{kind} {k + 1}": function for k, function in enumerate(functions) if function is not None}
         return found
+
+    @property
+    def acting(self) -> dict[str, Function]:
+        """The functions that act in its own sequence, by their roles: all but the modes that do not occur in it."""
+        idle = {f"mode {name!r}" for k, name in enumerate(self.mode_names) if k not in self.mode_of_segment}
+        return {role: function for role, function in self.roles.items() if role not in idle}
 
     @property
     def digests(self) -> dict[str, str]:

@@ -10,18 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.parameter import Parameter, refuse_dates
-from switchfit.problem.validation import (
-    as_array,
-    as_callable,
-    as_name,
-    as_names,
-    as_sequence,
-    as_text,
-    join_names,
-    set_fields,
-    shorten,
-)
+from switchfit.problem.parameter import Parameter, as_parameter, refuse_dates
+from switchfit.problem.validation import as_array, as_callable, as_labels, as_name, require_known, set_fields, shorten
 from switchfit.runtime.presentation import format_line, join_first
 
 VectorField = Callable[..., Any]
@@ -32,9 +22,6 @@ ResetMap = Callable[..., Any]
 
 Guard = Callable[..., Any]
 """``g(t, x, p) -> ()``: zero where a transition happens, of the state just before it."""
-
-InitialState = NDArray[np.float64] | tuple[Parameter, ...] | Callable[[Mapping[str, Any]], Any]
-"""An ``(n,)`` array, a `Parameter` for each of n states, or a function of the parameters that returns an array."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,12 +102,8 @@ class HybridSystem:
             set_fields(self, **{name: MappingProxyType(_check_pairs(getattr(self, name), name, self.modes))})
         if not callable(self.initial_state):
             set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
-        form = "a sequence of strings, one for each state"
-        if self.state_names is not None:
-            set_fields(self, state_names=as_names(self.state_names, "state_names", form))
-        if self.state_units is not None:
-            units = as_sequence(self.state_units, "state_units", form)
-            set_fields(self, state_units=tuple(as_text(unit, "each of state_units") for unit in units))
+        for label in ("state_names", "state_units"):
+            set_fields(self, **{label: as_labels(getattr(self, label), label, "state")})
         if not callable(self.initial_state):
             self.check_labels_of(len(self.initial_state))
 
@@ -194,7 +177,14 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
             raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {value.shape}.")
         return value.entries()
     if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
-        return tuple(_as_entry(entry, name) for entry in value)
+        form = "a number or an sf.Parameter"
+        entries = tuple(as_parameter(entry, f"each entry of {name}", form, fixed=True) for entry in value)
+        if any(entry.shape != () for entry in entries):
+            shapes = shorten([entry.shape for entry in entries])
+            raise ValueError(
+                f"each entry of {name} must be one number, or an sf.Parameter of one; got shapes {shapes}."
+            )
+        return entries
     state = as_array(value, name, form="an array of numbers, one for each state")
     if state.ndim != 1 or state.size == 0:
         raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
@@ -202,24 +192,6 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
         raise ValueError(f"{name} must be finite; got {shorten(state)}.")
     state.flags.writeable = False
     return state
-
-
-def _as_entry(entry: Any, name: str) -> Parameter:
-    """Return one entry of an initial state with unknown entries as a `Parameter`; a number is a fixed one."""
-    if isinstance(entry, Parameter):
-        refuse_dates(entry, f"each entry of {name}")
-        parameter = entry
-    else:
-        array = as_array(entry, f"each entry of {name}", form="a number or an sf.Parameter")
-        if not np.all(np.isfinite(array)) or array.size == 0:
-            raise ValueError(f"{name} must have a number or an sf.Parameter for each state; got {shorten(entry)}.")
-        parameter = Parameter(array, fixed=True)
-    if parameter.shape != ():
-        raise ValueError(
-            f"{name} must have one number or one sf.Parameter of one number for each state; got an entry of shape "
-            f"{parameter.shape}."
-        )
-    return parameter
 
 
 def _check_pairs(
@@ -232,9 +204,7 @@ def _check_pairs(
     for key, function in checked.items():
         if not (isinstance(key, tuple) and len(key) == 2):
             raise ValueError(f"{name} must have keys (mode before, mode after); got {shorten(key)}.")
-        for mode in key:
-            if mode not in modes:
-                raise ValueError(f"{name} names the unknown mode {shorten(mode)}; the modes are {join_names(modes)}.")
+        require_known(key, name, modes)
         what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
         as_callable(function, f"{what} {shorten(key)}", f"a function {form}")
     return checked

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import Experiment, initial_state_of, name_runs
+from switchfit.problem.experiment import Experiment, initial_state_of, name_runs, prefix_runs
 from switchfit.problem.parameter import Parameter, PriorTerms, unit_suffix
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import join_names
@@ -97,9 +97,6 @@ class ActiveConstraint(Constraint):
 
     multiplier: float = 0.0
 
-    def __str__(self) -> str:
-        return format_text(self)
-
 
 ORDINARY = (1e-3, 1e3)
 """Range of sizes in which an unknown is not scaled; the tolerance on the gradient is then that of theta itself."""
@@ -114,27 +111,20 @@ class Variables(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        theta: FloatArray,
-        lower: FloatArray,
-        upper: FloatArray,
-        log: NDArray[np.bool_],
-        keep: NDArray[np.bool_],
-        origin: FloatArray,
+        cls, theta: FloatArray, bounds: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_], origin: FloatArray
     ) -> Variables:
         """Return variables scaled by the first guess, or by the bounds if it is 0.
 
         Parameters
         ----------
-        theta, lower, upper : (d,)
+        theta : (d,)
+        bounds : (2, d), lower and upper
         log : (d,) of bool
         keep : (d,) of bool, unknowns that are not scaled
         origin : (d,)
         """
-        bounds = np.maximum(
-            np.where(np.isfinite(lower), np.abs(lower), 0), np.where(np.isfinite(upper), np.abs(upper), 0)
-        )
-        typical = np.where(theta != 0.0, np.abs(theta), bounds)
+        largest = np.where(np.isfinite(bounds), np.abs(bounds), 0.0).max(axis=0)
+        typical = np.where(theta != 0.0, np.abs(theta), largest)
         outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
         # A power of 2, so that scaling causes no rounding.
         return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log, origin)
@@ -231,17 +221,8 @@ class Unknowns:
     @cached_property
     def variables(self) -> Variables:
         """What the optimiser works with: logarithms, transition times as they are, other unknowns scaled."""
-        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time, origin=self.origin)
-
-    @cached_property
-    def has_priors(self) -> bool:
-        """Whether any unknown has a prior."""
-        return self.priors.any
-
-    @cached_property
-    def are_variables(self) -> bool:
-        """Whether the optimiser works with the unknowns themselves."""
-        return self.variables.identity
+        bounds = np.array([self.lower, self.upper])
+        return Variables.of(self.initial, bounds, self.log, keep=self.is_time, origin=self.origin)
 
     @cached_property
     def log_times(self) -> NDArray[np.bool_]:
@@ -273,34 +254,33 @@ def list_unknowns(
     names: list[str] = []
     units: list[str] = []
     pieces: list[Parameter] = []
+
+    def add(name: str, unit: str, parameter: Parameter) -> slice:
+        first = len(names)
+        names.extend(f"{name}{_index(k)}" for k in np.ndindex(parameter.shape))
+        units.extend([unit] * parameter.value.size)
+        pieces.append(parameter)
+        return slice(first, len(names))
+
     where: list[NDArray[np.intp]] = []
-    prefixes = [""] if len(experiments) == 1 else [f"{name}." for name in name_runs(experiments)]
+    prefixes = prefix_runs(experiments)
     for prefix, experiment in zip(prefixes, experiments, strict=True):
         positions = np.full(len(experiment.times), -1, dtype=np.intp)
         for i, tau in enumerate(experiment.times):
             if not tau.fixed:
-                positions[i] = len(names)
-                names.append(f"{prefix}{f'tau_{i + 1}' if i < len(experiment.transition_times) else 'tf'}")
-                units.append(experiment.time_unit)
-                pieces.append(tau)
+                name = f"tau_{i + 1}" if i < len(experiment.transition_times) else "tf"
+                positions[i] = add(f"{prefix}{name}", experiment.time_unit, tau).start
         where.append(positions)
-    spans: dict[str, slice] = {}
-    for name, parameter in parameters.items():
-        if not parameter.fixed:
-            spans[name] = slice(len(names), len(names) + parameter.value.size)
-            names += [f"{name}{_index(k)}" for k in np.ndindex(parameter.shape)]
-            units += [parameter.unit] * parameter.value.size
-            pieces.append(parameter)
+    spans = {name: add(name, q.unit, q) for name, q in parameters.items() if not q.fixed}
     states: list[NDArray[np.intp]] = []
     for prefix, experiment in zip(prefixes, experiments, strict=True):
         initial = initial_state_of(system, experiment)
         positions = np.full(0 if callable(initial) else len(initial), -1, dtype=np.intp)
         for k in range(len(positions)):
             if isinstance(initial[k], Parameter) and not initial[k].fixed:
-                positions[k] = len(names)
-                names.append(f"{prefix}{system.state_names[k] if system.state_names else f'x{k + 1}'}(t0)")
-                units.append(initial[k].unit or (system.state_units[k] if system.state_units else ""))
-                pieces.append(initial[k])
+                name = system.state_names[k] if system.state_names else f"x{k + 1}"
+                unit = initial[k].unit or (system.state_units[k] if system.state_units else "")
+                positions[k] = add(f"{prefix}{name}(t0)", unit, initial[k]).start
         states.append(positions)
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -352,7 +332,7 @@ def _build_ordering(
         units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
         require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
-        run = "" if len(experiments) == 1 else f" of {labels[e]}"
+        run = "" if len(experiments) == 1 else labels[e]
         knots = experiment.ends_of_modes(experiment.initial_times)
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
         unit = unit_suffix(experiment.time_unit)
@@ -360,8 +340,8 @@ def _build_ordering(
             length, dwell = knots[i + 1] - knots[i], get_min_duration(durations, mode)
             if length < dwell * (1 - 1e-12):
                 raise ValueError(
-                    f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run} only "
-                    f"{length:.6g}{unit}."
+                    f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run and f' of {run}'} "
+                    f"only {length:.6g}{unit}."
                 )
             if ends[i] < 0 and ends[i + 1] < 0:
                 continue
@@ -373,15 +353,8 @@ def _build_ordering(
                     bound -= sign * knot
             rows.append(row)
             bounds.append(bound)
-            constraints.append(
-                Constraint(
-                    kind="collapsed" if dwell == 0 else "minimum duration",
-                    value=dwell,
-                    mode=mode,
-                    position=i,
-                    run="" if len(experiments) == 1 else labels[e],
-                )
-            )
+            kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
+            constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))
     return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(constraints)
 
 

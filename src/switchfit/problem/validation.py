@@ -70,15 +70,7 @@ def find_names(value: Any) -> tuple[str, ...] | None:
 
     An array of xarray with labels along its second dimension has these for names.
     """
-    columns = list_columns(value)
-    if columns is not None:
-        names: tuple[Any, ...] = tuple(name for name, _ in columns)
-    elif not is_of_library(value, *LIBRARIES):
-        return None
-    elif getattr(value, "ndim", 1) == 2:
-        names = tuple(_list_labels(value))
-    else:
-        names = (getattr(value, "name", None),)
+    names = [name for name, _ in _list_channels(value)]
     proper = all(isinstance(name, str) and name.strip() for name in names) and len(set(names)) == len(names)
     return tuple(map(str, names)) if names and proper else None
 
@@ -88,13 +80,7 @@ def find_units(value: Any) -> tuple[str, ...] | None:
 
     ``attrs["units"]`` is a string, or a mapping from names to units.
     """
-    if not is_of_library(value, *LIBRARIES):
-        return None
-    columns = list_columns(value)
-    if columns is None:
-        names = [getattr(value, "name", None)] if getattr(value, "ndim", 1) == 1 else _list_labels(value)
-        columns = [(name, value) for name in names]
-    units = tuple(_find_unit(column, name) or _find_unit(value, name) for name, column in columns)
+    units = tuple(_find_unit(column, name) or _find_unit(value, name) for name, column in _list_channels(value))
     return units if any(units) else None
 
 
@@ -105,12 +91,17 @@ def _find_unit(value: Any, name: Any) -> str:
     return unit if isinstance(unit, str) else ""
 
 
-def _list_labels(value: Any) -> list[Any]:
-    """Return the labels along the second dimension of an array of xarray; none if it has no labels."""
-    dimensions: tuple[Any, ...] = getattr(value, "dims", ())
-    coordinates = getattr(value, "coords", {})
-    labels = coordinates[dimensions[1]] if len(dimensions) == 2 and dimensions[1] in coordinates else ()
-    return [label.item() for label in labels] if isinstance(labels, Iterable) else []
+def _list_channels(value: Any) -> list[tuple[Any, Any]]:
+    """Return the name of each channel, and its column; none for what is no table, column or labelled array."""
+    columns = list_columns(value)
+    if columns is not None:
+        return columns
+    if not is_of_library(value, *LIBRARIES):
+        return []
+    if getattr(value, "ndim", 1) != 2:
+        return [(getattr(value, "name", None), value)]
+    labels = value.coords.get(value.dims[1], ()) if hasattr(value, "dims") else ()
+    return [(label.item(), value) for label in labels]
 
 
 FloatArray = NDArray[np.float64]
@@ -125,12 +116,14 @@ LONGEST = 120
 """Largest number of characters of a value that a message shows."""
 MOST_LISTED = 10
 """Largest number of names that a message lists."""
-BLOCK = 4096
-"""Single-precision numbers whose texts are compared at once: a log with lost digits is refused in the first block."""
 
 _INTEGERS = (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64)
 _EXACT: frozenset[type] = frozenset({int, float, np.float64, *_INTEGERS})
 """Types that `numpy.array(..., dtype=float64)` reads without change."""
+NO_DATES = (
+    ": dates and time differences are not supported. Give numbers in one unit, such as the seconds since the start: "
+    "(dates - dates[0]) / np.timedelta64(1, 's')"
+)
 _TEXT = (str, bytes, bytearray)
 _DATES = (datetime.date, datetime.time, datetime.timedelta)
 
@@ -159,9 +152,7 @@ class _Short(reprlib.Repr):
 
     def repr_instance(self, x: Any, level: int) -> str:
         """Return only the type of a dataclass: a problem contains all its data."""
-        return (
-            f"<{type(x).__name__}>" if is_dataclass(x) and not isinstance(x, type) else super().repr_instance(x, level)
-        )
+        return f"<{type(x).__name__}>" if is_dataclass(type(x)) else super().repr_instance(x, level)
 
     def repr_Dates(self, x: Any, level: int) -> str:  # reprlib calls repr_<name of the type>
         return repr(x)
@@ -184,9 +175,8 @@ def shorten(value: Any) -> str:
 def join_names(names: Iterable[Any]) -> str:
     """Return names with commas between them, the first ten if there are more; 'none' for no names."""
     every = list(names)
-    texts = [f"{name!s:.40}" for name in every[:MOST_LISTED]]
-    more = [f"... ({len(every)} in all)"] if len(every) > MOST_LISTED else []
-    return ", ".join(texts + more) or "none"
+    texts = ", ".join(f"{name!s:.40}" for name in every[:MOST_LISTED]) or "none"
+    return f"{texts}, ... ({len(every)} in all)" if len(every) > MOST_LISTED else texts
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------
@@ -352,22 +342,21 @@ def _read_exactly(value: Any, argument: _Argument, depth: int) -> Any:
         except Exception:
             argument.refuse(value)
     if isinstance(value, _DATES):
-        _refuse_dates(value, argument)
-    if isinstance(value, _TEXT):
-        argument.refuse(value, ValueError)
-    argument.refuse(value, why=": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else "")
+        argument.refuse(value, why=NO_DATES)
+    is_wrong_value = isinstance(value, _TEXT)
+    why = ": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else ""
+    argument.refuse(value, ValueError if is_wrong_value else TypeError, why)
 
 
 def _read_array_exactly(value: Any, argument: _Argument, depth: int) -> Any:
     """Return an array, or another object with a dtype, as an array of integers or doubles."""
     try:
-        array = (
-            _read_pandas(value) if is_of_library(value, "pandas") else np.asarray(np.ma.getdata(np.asanyarray(value)))
-        )
+        is_pandas = is_of_library(value, "pandas")
+        array = _read_pandas(value) if is_pandas else np.asarray(np.ma.getdata(np.asanyarray(value)))
     except Exception as error:
         argument.refuse(value, why=f", which NumPy cannot read ({type(error).__name__})")
     if array.dtype.kind in "Mm":
-        _refuse_dates(value, argument)
+        argument.refuse(value, why=NO_DATES)
     if array.dtype.kind == "O":
         array = _read_exactly(array.tolist(), argument, depth + 1)
     elif is_low_precision(array.dtype):
@@ -376,14 +365,12 @@ def _read_array_exactly(value: Any, argument: _Argument, depth: int) -> Any:
     elif array.dtype.kind not in "iuf":
         argument.refuse(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
     mask = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else np.False_
-    if np.any(mask):
-        if not argument.missing:
-            raise ValueError(
-                f"{argument.what} must be {argument.form}; got a masked array with {int(np.sum(mask))} masked entries. "
-                "Leave them out, or fill them in."
-            )
-        array = np.where(mask, np.nan, array)
-    return array
+    if np.any(mask) and not argument.missing:
+        raise ValueError(
+            f"{argument.what} must be {argument.form}; got a masked array with {int(np.sum(mask))} masked entries. "
+            "Leave them out, or fill them in."
+        )
+    return np.where(mask, np.nan, array) if np.any(mask) else array
 
 
 def _read_pandas(value: Any) -> NDArray[Any]:
@@ -396,14 +383,6 @@ def _read_pandas(value: Any) -> NDArray[Any]:
         return np.asarray(value)
     gaps = bool(value.isna().any())
     return np.asarray(value.to_numpy(dtype=np.float64 if gaps and kind.kind != "f" else kind, na_value=np.nan))
-
-
-def _refuse_dates(value: Any, argument: _Argument) -> NoReturn:
-    argument.refuse(
-        value,
-        why=": dates and time differences are not supported. Give numbers in one unit, such as the seconds since the "
-        "start: (dates - dates[0]) / np.timedelta64(1, 's')",
-    )
 
 
 # --- single precision -------------------------------------------------------------------------------------------------
@@ -456,32 +435,19 @@ def refuse_single_precision(value: Any, what: str) -> None:
             whole = (wide == np.rint(wide)) & (np.abs(wide) <= 2**24)
         doubtful &= ~(short | whole)
     places = np.flatnonzero(doubtful)
-    for first in range(0, len(places), BLOCK):
-        here = places[first : first + BLOCK]
-        meant = _find_shortest_decimals(given[here])
-        if np.any(changed := meant != wide[here]):
-            k = int(np.argmax(changed))
-            advice = (
-                "By default JAX makes arrays of 32 bits: write a list or a NumPy array in place of the jnp array."
-                if _is_of_jax(value)
-                else "Give doubles (float64); if the numbers really have that precision, as those of a log may, "
-                "write np.asarray(values, dtype=np.float64)."
-            )
-            raise ValueError(
-                f"{what} must be in double precision: {float(meant[k])!r} became {float(wide[here[k]])!r} "
-                f"({given.dtype.name}). {advice}"
-            )
-
-
-def _find_shortest_decimals(values: NDArray[Any]) -> FloatArray:
-    """Return the doubles with the shortest decimal texts of finite low-precision numbers (K,)."""
-    if values.dtype in (np.float16, np.float32):
-        return values.astype(str).astype(np.float64)
-    kind, found = values.dtype.type, []  # bfloat16 and similar types, for which NumPy has no shortest texts
-    for value in values:
-        texts = (float(f"{float(value):.{digits}e}") for digits in range(17))
-        found.append(next(decimal for decimal in texts if kind(decimal) == value))
-    return np.array(found)
+    meant = np.array([float(str(number)) for number in given[places]])  # the shortest decimals
+    changed = np.flatnonzero(meant != wide[places])
+    if not changed.size:
+        return
+    advice = "Give doubles (float64); if the numbers really have that precision, as those of a log may, "
+    advice += "write np.asarray(values, dtype=np.float64)."
+    if _is_of_jax(value):
+        advice = "By default JAX makes arrays of 32 bits: write a list or a NumPy array in place of the jnp array."
+    first = changed[0]
+    raise ValueError(
+        f"{what} must be in double precision: {float(meant[first])!r} became {float(wide[places[first]])!r} "
+        f"({given.dtype.name}). {advice}"
+    )
 
 
 # --- everything else --------------------------------------------------------------------------------------------------
@@ -504,9 +470,8 @@ def as_choice(value: Any, what: str, choices: Sequence[str]) -> Any:
     """Return one of the strings `choices`."""
     if isinstance(value, str) and value in choices:
         return choices[choices.index(value)]
-    quoted = [repr(choice) for choice in choices]
-    few = f"{', '.join(quoted[:-1])} or {quoted[-1]}"
-    wanted = few if len(choices) <= 3 else f"one of {', '.join(choices)}"
+    *others, last = map(repr, choices)
+    wanted = f"{', '.join(others)} or {last}" if len(choices) <= 3 else f"one of {', '.join(choices)}"
     error = ValueError if isinstance(value, str) else TypeError
     raise error(f"{what} must be {wanted}; got {shorten(value)}.")
 
@@ -536,6 +501,39 @@ def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
     return names
 
 
+def require_known(names: Iterable[Any], what: str, known: Iterable[str]) -> None:
+    """Raise ValueError if one of several names is not that of a mode."""
+    for name in names:
+        if name not in known:
+            raise ValueError(f"{what} names the unknown mode {shorten(name)}; the modes are {join_names(known)}.")
+
+
+def as_labels(value: Any, what: str, each: str, count: int | None = None) -> tuple[str, ...] | None:
+    """Return the names or the units of something, a string for each; None for None.
+
+    Parameters
+    ----------
+    value : sequence of str, or a string for one
+    what : str
+        Strings that are called "names" must not be empty, and must differ from each other.
+    each : str
+        Such as "channel".
+    count : int, optional
+        How many there have to be.
+    """
+    if value is None:
+        return None
+    form = f"a sequence of strings, one for each {each}"
+    labels = (value,) if isinstance(value, str) and count is not None else as_sequence(value, what, form)
+    if what.endswith("names"):
+        checked = as_names(labels, what, form)
+    else:
+        checked = tuple(as_text(unit, f"each of {what}") for unit in labels)
+    if count is not None and len(checked) != count:
+        raise ValueError(f"{what} must have one entry for each of the {count} {each}s; got {shorten(checked)}.")
+    return checked
+
+
 def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
     """Return the entries of a mapping, or of a table whose columns are all named by strings; else None.
 
@@ -547,16 +545,14 @@ def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
         If a mapping is empty, a key is empty, or two columns of a table share a name.
     """
     table = list_columns(value)
-    if table is not None:
-        names = [name for name, _ in table]
-        if names and all(isinstance(name, str) for name in names):
-            return dict(zip(as_names(names, f"columns of {what}", "strings"), (c for _, c in table), strict=True))
+    if table and all(isinstance(name, str) for name, _ in table):
+        as_names([name for name, _ in table], f"columns of {what}", "strings")
+        return dict(table)
+    if table is not None or not isinstance(value, Mapping):
         return None
-    if isinstance(value, Mapping):
-        if not value:
-            raise ValueError(f"{what} must have a name for each entry of u, with its {form}; got an empty dict.")
-        return {as_name(name, f"names in {what}", "strings"): entry for name, entry in value.items()}
-    return None
+    if not value:
+        raise ValueError(f"{what} must have a name for each entry of u, with its {form}; got an empty dict.")
+    return {as_name(name, f"names in {what}", "strings"): entry for name, entry in value.items()}
 
 
 def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
@@ -601,19 +597,26 @@ def as_callable(value: Any, what: str, form: str, *, arguments: int | None = Non
     if not callable(value) or isinstance(value, type):
         given = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
         raise TypeError(f"{what} must be {form}; got {given}.")
-    if arguments is not None:
-        try:
-            signature = inspect.signature(value)
-        except Exception:  # functions written in C have none
-            return value
-        try:
-            signature.bind(*range(arguments))
-        except TypeError:
-            raise TypeError(
-                f"{what} must be {form}; got one that cannot be called with {arguments} argument(s): "
-                f"it takes {str(signature)[:LONGEST]}."
-            ) from None
+    misfit = None if arguments is None else find_misfit(value, range(arguments))
+    if misfit is not None:
+        raise TypeError(
+            f"{what} must be {form}; got one that cannot be called with {arguments} argument(s): "
+            f"it takes {str(misfit)[:LONGEST]}."
+        )
     return value
+
+
+def find_misfit(function: Callable[..., Any], arguments: Iterable[Any]) -> inspect.Signature | None:
+    """Return the signature of a function that cannot be called with some arguments; None if it can."""
+    try:
+        signature = inspect.signature(function)
+    except Exception:  # functions written in C have none
+        return None
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        return signature
+    return None
 
 
 def as_path(value: Any, what: str) -> Path:
