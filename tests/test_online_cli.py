@@ -1,11 +1,16 @@
-"""`switchfit online`: samples from logs and from stdin, states and journals, Ctrl-C and kill."""
+"""`switchfit online`: samples from logs and from stdin, states and journals, Ctrl-C, kill, and the live page."""
 
 import json
+import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +22,8 @@ import switchfit as sf
 from switchfit import cli
 from switchfit.io.command_line import read_sample
 from switchfit.io.problem_file import load_problem
+from switchfit.report.html.live import KEPT, LivePage
+from switchfit.runtime.errors import InputError
 
 VALUES = simulate(TIMES, (2.5, 5.5))
 LINES = [json.dumps({"t": t, "y": [value]}) for t, value in zip(TIMES.tolist(), VALUES.tolist(), strict=True)]
@@ -274,6 +281,7 @@ def test_the_threshold_for_a_rate_of_false_alarms_is_named(folder, monkeypatch):
         ),
         (("--stdin",), "there were no samples."),
         (("--window", -1), "window must be positive; got -1.0."),
+        (("--live", 99999), "the page cannot be served on port 99999: "),
         (("--replay", "missing.csv"), "missing.csv"),
         (("--drift", "a"), "--drift must be PARAMETER=NUMBER,PARAMETER=NUMBER; got a."),
         (("--drift", "a=x"), "--drift must be PARAMETER=NUMBER,PARAMETER=NUMBER; got a=x."),
@@ -365,9 +373,13 @@ def test_kill_9_loses_nothing_that_was_answered(folder, replayed, tmp_path, quic
 
 
 def test_ctrl_c_while_it_waits_keeps_what_there_is(folder, tmp_path, quick_processes):
+    """The live page is served until then."""
     out, state = tmp_path / "out", tmp_path / "state"
-    with start(folder, "--out", out, "--state", state) as process:
-        write_and_read(process, LINES[:12])
+    with start(folder, "--out", out, "--state", state, "--live", 0) as process:
+        address = process.stderr.readline().removeprefix("live at ").strip()
+        said = write_and_read(process, LINES[:12])
+        with urllib.request.urlopen(f"{address}/now.json") as answer:
+            assert json.load(answer)["lines"] == said
         time.sleep(0.2)  # it waits for the next line
         process.send_signal(signal.SIGINT)
         rest = process.stderr.read()
@@ -379,15 +391,25 @@ def test_ctrl_c_while_it_waits_keeps_what_there_is(folder, tmp_path, quick_proce
 
 
 def test_ctrl_c_before_the_first_sample(folder, quick_processes):
-    with start(folder) as process:
-        process.stdin.write("no sample\n")
-        process.stdin.flush()
-        assert "line 1: " in process.stderr.readline()
-        time.sleep(0.2)  # it waits for the next line
+    with start(folder, "--live", 0) as process:
+        process.stderr.readline()
+        time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         rest = process.stderr.read()
         assert process.wait(timeout=60) == 2
     assert "there were no samples" in rest
+
+
+def test_the_page_stays_when_the_samples_have_ended(folder, quick_processes):
+    with start(folder, "--live", 0) as process:
+        address = process.stderr.readline().removeprefix("live at ").strip()
+        write_and_read(process, LINES[:3])
+        process.stdin.close()
+        assert process.stderr.readline() == "the samples have ended; Ctrl-C ends the page\n"
+        with urllib.request.urlopen(address) as answer:
+            assert answer.status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
 
 
 def test_a_reader_that_is_gone_ends_nothing(folder, tmp_path, quick_processes):
@@ -400,3 +422,105 @@ def test_a_reader_that_is_gone_ends_nothing(folder, tmp_path, quick_processes):
         assert process.wait(timeout=60) == 0
         assert "Traceback" not in process.stderr.read()
     assert "20 updates" in (tmp_path / "online.txt").read_text()
+
+
+# --- the live page ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(folder):
+    with LivePage("problem.toml", load_problem(folder / "problem.toml", searched=True).problem, 0) as page:
+        yield page
+
+
+def get(page, path, **headers):
+    with urllib.request.urlopen(urllib.request.Request(page.address + path, headers=headers)) as answer:
+        return answer.headers, answer.read().decode()
+
+
+def test_the_page_is_one_file_that_asks_this_machine_only(page):
+    headers, text = get(page, "/")
+    assert headers["Content-Type"] == "text/html; charset=utf-8"
+    assert "connect-src 'self'" in headers["Content-Security-Policy"]
+    assert "--good:" in text, "the colours of the report"
+    assert "https://" not in text
+    assert page.address.startswith("http://127.0.0.1:")
+
+
+def test_readers_get_what_is_new(page):
+    for k in range(5):
+        page.show(json.dumps({"k": k}))
+    _, text = get(page, "/now.json")
+    found = json.loads(text)
+    assert found["head"]["units"] == {"a": "1/s", "b": "", "c": ""}
+    assert list(found["head"]["colours"]) == ["rise", "fall", "drift"]
+    assert (found["count"], [line["k"] for line in found["lines"]]) == (5, [0, 1, 2, 3, 4])
+    for after, expected in {
+        "3": [3, 4],
+        "5": [],
+        "99": [0, 1, 2, 3, 4],
+        "x": [0, 1, 2, 3, 4],
+        "9" * 5000: None,
+    }.items():
+        lines = json.loads(get(page, f"/now.json?after={after}")[1])["lines"]
+        assert expected is None or [line["k"] for line in lines] == expected
+    for k in range(5, KEPT + 100):
+        page.show(json.dumps({"k": k}))
+    found = json.loads(get(page, "/now.json?after=10")[1])
+    assert (found["count"], found["lines"][0]["k"], len(found["lines"])) == (KEPT + 100, 100, KEPT)
+
+
+@pytest.mark.parametrize(("path", "host", "code"), [("/etc/passwd", "127.0.0.1", 404), ("/", "evil.example:80", 403)])
+def test_other_requests_are_refused(page, path, host, code):
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        get(page, path, Host=host)
+    with caught.value as answer:
+        assert answer.code == code
+
+
+def test_a_port_that_is_taken(page, folder):
+    port = int(page.address.rpartition(":")[2])
+    with pytest.raises(InputError, match=f"the page cannot be served on port {port}: .*; name another with --live"):
+        LivePage("problem.toml", load_problem(folder / "problem.toml", searched=True).problem, port)
+    with pytest.raises(ConnectionRefusedError), socket.create_connection((own_address(), port), timeout=5):
+        pass
+
+
+def own_address():
+    """An address of this machine that is not that of the page; the whole net 127.0.0.0/8 is this machine."""
+    return "127.0.0.2"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_the_page_in_a_browser(page, replayed, tmp_path, dark):
+    """It draws what has come, without an error, and asks nothing of any other machine."""
+    from browser import Browser, find_browser
+
+    if find_browser() is None:
+        pytest.skip("no Chromium on this machine")
+    lines = replayed.stdout.splitlines()
+    for line in lines[:30]:
+        page.show(line)
+    browser = Browser(tmp_path)
+    try:
+        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        browser.call("Emulation.setEmulatedMedia", features=scheme)
+        browser.call("Page.navigate", url=page.address)
+        browser.wait("document.getElementById('mode')?.textContent === 'fall'")
+        for line in lines[30:]:
+            page.show(line)
+        browser.wait("document.getElementById('mode').textContent === 'rise'")
+        assert browser.evaluate("document.querySelectorAll('.chart').length") == 6, "mode, statistic, a, b, c, time"
+        assert browser.evaluate("document.getElementById('parameters').textContent").startswith("a0.694")
+        assert browser.evaluate("document.querySelectorAll('.alarm').length") == 2
+        assert "since 5.48" in browser.evaluate("document.getElementById('since').textContent")
+        assert browser.errors == []
+        assert {url.removeprefix(page.address)[:9] for url in browser.requests if url.startswith("http")} <= {
+            "/",
+            "/now.json",
+        }
+        if os.environ.get("PICTURES"):
+            browser.screenshot(Path(os.environ["PICTURES"]) / f"live-{dark}.png", whole=True)
+    finally:
+        browser.close()

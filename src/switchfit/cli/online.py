@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from switchfit.online.log import OnlineLog
     from switchfit.online.state import Now
     from switchfit.problem.experiment import Experiment
+    from switchfit.report.html.live import LivePage
 
 LEAST_ROOM = 4096
 """Times for which there is room, if the log has not more."""
@@ -79,6 +80,10 @@ JournalFile = Annotated[
     Path | None,
     option("--journal", metavar="FILE", help="Write each sample to this file first, so that a crash loses none."),
 ]
+Live = Annotated[
+    int | None,
+    option("--live", metavar="PORT", help="Show a page at http://127.0.0.1:PORT until Ctrl-C; 0 takes a free port."),
+]
 
 
 def online(
@@ -94,6 +99,7 @@ def online(
     drift: Drift = None,
     state: StateFile = None,
     journal: JournalFile = None,
+    live: Live = None,
     out: Annotated[Path | None, output_folder("online.txt and online.png")] = None,
     figures: FigureFormat = "png",
     quiet: Quiet = False,
@@ -134,13 +140,18 @@ def online(
         settings = loaded.contents.online.model_dump(exclude_none=True) | given
         settings |= {"max_switches": max_switches, "budget": budget, "capacity": room} | _read_library(loaded)
         estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
-        course = _run(loaded, estimator, stdin=stdin, records=out is not None)
-        if estimator.now is None:
-            terminal.fail("there were no samples.")
-        if state is not None:
-            estimator.save(state)
-        if out is not None and course.log is not None:
-            _write(course.log, out, figures)
+        with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
+            course = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
+            if estimator.now is None:
+                terminal.fail("there were no samples.")
+            if state is not None:
+                estimator.save(state)
+            if out is not None and course.log is not None:
+                _write(course.log, out, figures)
+            if page is not None and not course.interrupted:
+                with contextlib.suppress(terminal.CtrlC):
+                    terminal.print_note("the samples have ended; Ctrl-C ends the page")
+                    page.wait()
         fail_for_refused(loaded.issues)
         if course.refused:
             terminal.fail(f"{format_count(len(course.refused), 'line')} of stdin could not be used.")
@@ -202,13 +213,18 @@ class Course(NamedTuple):
         What was said, if it was recorded and there was any.
     refused : list of int
         Numbers of the lines that could not be used.
+    interrupted : bool
+        By Ctrl-C.
     """
 
     log: OnlineLog | None
     refused: list[int]
+    interrupted: bool
 
 
-def _run(loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, records: bool) -> Course:
+def _run(
+    loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, page: LivePage | None, records: bool
+) -> Course:
     """Feed all samples, until Ctrl-C, and print what the estimator says."""
     from switchfit.io.command_line import summarize_now
     from switchfit.online.log import Recorder
@@ -219,12 +235,15 @@ def _run(loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, record
         stopped = partial(report, None)
         said = _replay_lines(run, estimator, stopped, refused) if stdin else _replay_log(run, estimator)
         for now in said:
-            terminal.print_json(summarize_now(now, run))
+            line = summarize_now(now, run)
+            if page is not None:
+                page.show(terminal.format_json(line))
+            terminal.print_json(line)
             if records:
                 recorder.said.append(now)
             if stopped():
                 break
-    return Course(recorder.build() if recorder.said else None, refused)
+    return Course(recorder.build() if recorder.said else None, refused, stopped())
 
 
 def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
@@ -269,6 +288,14 @@ def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:
         if not line:
             return
         yield line
+
+
+def _serve(loaded: ProblemFile, port: int) -> LivePage:
+    from switchfit.report.html.live import LivePage
+
+    page = LivePage(loaded.path.name, loaded.problem, port)
+    terminal.print_note(f"live at {page.address}")
+    return page
 
 
 def _write(log: OnlineLog, folder: Path, figures: str) -> None:
