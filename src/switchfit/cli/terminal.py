@@ -274,18 +274,6 @@ T = TypeVar("T")
 DOTS = 150
 """Dots per inch of a figure."""
 
-app = typer.Typer(
-    name="switchfit",
-    help="""When did it switch, and what were the parameters? Fits switched models to logs.
-
-    Begin with `switchfit init NAME --from LOG`, or with one of `switchfit examples`.
-    """,
-    no_args_is_help=True,
-    add_completion=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-
 
 def option(*names: str, help: str, metavar: str | None = None) -> Any:
     """Return an option; its help says what holds without it."""
@@ -315,23 +303,6 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, an
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
-
-
-def _print_version(asked: bool) -> None:
-    if asked:
-        from importlib.metadata import version
-
-        print_text(f"switchfit {version('switchfit')}")
-        raise typer.Exit
-
-
-@app.callback()
-def _collect_options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
-) -> None:
-    pass
 
 
 def load(problem: Path) -> ProblemFile:

@@ -3,10 +3,11 @@
 The text below a field describes it in error messages and in the tables of ``docs/problem-file.md``.
 """
 
-from __future__ import annotations
-
+import ast
 import datetime
+import inspect
 import math
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -22,9 +23,26 @@ HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss
 class Table(pydantic.BaseModel):
     """A table of a problem file, without other keys than its fields."""
 
-    model_config = pydantic.ConfigDict(
-        extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True, defer_build=True
-    )
+    model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True, defer_build=True)
+
+
+def describe_keys(kind: type[Table]) -> dict[str, str]:
+    """Return the text below each key of a table, in one line.
+
+    It is read from the source when it is needed. pydantic would read it for all tables when they are defined
+    (`use_attribute_docstrings`), which takes a tenth of the time until an unknown key is named.
+
+    Parameters
+    ----------
+    kind : type
+    """
+    found: dict[str, str] = {}
+    for each in reversed(kind.__mro__[: kind.__mro__.index(Table)]):
+        (definition,) = ast.parse(inspect.getsource(each)).body
+        for key, text in pairwise(ast.iter_child_nodes(definition)):
+            if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
+                found[ast.unparse(key.target)] = " ".join(ast.literal_eval(text.value).split())
+    return found
 
 
 def is_date(given: Any) -> bool:
@@ -188,7 +206,7 @@ class LogTable(Table):
     """subtracted from the time column; 'first': the time of the first row"""
     time_scale: Positive | None = None
     """then multiplied: 1e-3 turns ms into s; left out, 1"""
-    repair: NameOrNames = Field(default_factory=list)
+    repair: NameOrNames = []
     """what may be changed: 'sort', 'drop-duplicates', 'drop-missing-times', 'drop-broken-lines', 'unwrap:CHANNEL'"""
 
 
@@ -235,7 +253,7 @@ class ModelTable(Table):
 
     name: str
     """a built-in model, or 'file.py:object' with a HybridSystem or a function making one"""
-    arguments: dict[str, Any] = Field(default_factory=dict)
+    arguments: dict[str, Any] = {}
     """arguments of the function"""
 
 
@@ -273,11 +291,11 @@ class ExperimentTable(Table):
     is to be estimated"""
     initial_state: list[Annotated[StateTable, BeforeValidator(_wrap_known)]] | None = None
     """state at t0, instead of the model's: a number, or a table if it is to be estimated"""
-    parameter_map: dict[str, str] = Field(default_factory=dict)
+    parameter_map: dict[str, str] = {}
     """the model's name of a parameter = the name under [parameters] that this run uses for it"""
     inputs: InputTable | None = None
     """a known input"""
-    jumps: Annotated[list[JumpTable], ENTRY] = Field(default_factory=list)
+    jumps: Annotated[list[JumpTable], ENTRY] = []
     """tables with time and map: changes of the state at known times, such as doses"""
     name: str | None = None
     """used in the report if there are several experiments"""
@@ -372,15 +390,15 @@ class Contents(Table):
     """a built-in model, or 'file.py:object', or a table with name and arguments"""
     problem: str | None = None
     """'file.py:object' with an sf.Problem or a function making one, instead of all the rest"""
-    parameters: dict[str, Annotated[ParameterTable, BeforeValidator(_wrap_value)]] = Field(default_factory=dict)
+    parameters: dict[str, Annotated[ParameterTable, BeforeValidator(_wrap_value)]] = {}
     """the model's parameters"""
-    experiments: Annotated[list[ExperimentTable], ENTRY] = Field(default_factory=list)
+    experiments: Annotated[list[ExperimentTable], ENTRY] = []
     """the runs"""
     library: LibraryTable | None = None
     """the mode sequences among which switchfit modes searches; empty, all"""
-    online: OnlineTable = Field(default_factory=OnlineTable)
+    online: OnlineTable = Field(default_factory=OnlineTable.model_construct)
     """how switchfit online follows the samples"""
     design: DesignTable | None = None
     """what switchfit design may choose"""
-    options: OptionsTable = Field(default_factory=OptionsTable)
+    options: OptionsTable = Field(default_factory=OptionsTable.model_construct)
     """how to solve"""
