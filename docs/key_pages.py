@@ -37,7 +37,11 @@ def build_table(name: str) -> str:
     if name == "inputs":
         fields = {key: field for key, field in fields.items() if key not in tables.LogTable.model_fields}
     defaults = find_defaults() if name == "options" else {}
-    rows = [f"| `{key}` | {describe(field, defaults.get(key, field.default))} |" for key, field in fields.items()]
+    texts = tables.describe_keys(SECTIONS[name])
+    rows = [
+        f"| `{key}` | {describe(texts[key], field, defaults.get(key, field.default))} |"
+        for key, field in fields.items()
+    ]
     return "\n".join(["| key | meaning |", "|---|---|", *rows, ""])
 
 
@@ -47,9 +51,9 @@ def find_defaults() -> dict[str, Any]:
     return {name: item.default for signature in signatures for name, item in signature.parameters.items()}
 
 
-def describe(field: Any, default: Any) -> str:
+def describe(text: str, field: Any, default: Any) -> str:
     """Return the description of a field, the values among which one chooses, and what it is if left out."""
-    parts = [re.sub(r"(?<!\w)'([^']+)'(?!\w)", r'`"\1"`', " ".join(field.description.split()))]
+    parts = [re.sub(r"(?<!\w)'([^']+)'(?!\w)", r'`"\1"`', text)]
     values = [f'`"{value}"`' for value in list_values(field.annotation)]
     if not all(value in parts[0] for value in values):
         parts.append(f"one of {', '.join(values)}")

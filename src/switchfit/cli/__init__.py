@@ -7,26 +7,76 @@ parts are imported when a command needs them, so that ``--help`` is fast.
 
 import gc
 import os
+import sys
+from collections.abc import Iterable
+from importlib import import_module
+from typing import Annotated
 
-from switchfit.cli.checking import check, design, simulate
-from switchfit.cli.comparison import compare, paper, rerun, validate
-from switchfit.cli.fitting import fit
-from switchfit.cli.modes import modes
-from switchfit.cli.online import online
-from switchfit.cli.starting import examples, init
-from switchfit.cli.terminal import app
+import typer
 
-__all__ = ["app", "main"]
+__all__ = ["build_app", "main"]
 
 YOUNG_OBJECTS = 200_000
 """New objects after which Python looks for garbage. With its own threshold of 700, a tenth of the processor time of a
 cold fit goes into searching imported modules and traces, none of which is garbage."""
 
-COMMANDS = (init, fit, modes, online, design, check, simulate, validate, compare, rerun, examples, paper)
-"""In the order of --help."""
+COMMANDS = {
+    "init": "starting",
+    "fit": "fitting",
+    "modes": "modes",
+    "online": "online",
+    "design": "checking",
+    "check": "checking",
+    "simulate": "checking",
+    "validate": "comparison",
+    "compare": "comparison",
+    "rerun": "comparison",
+    "examples": "starting",
+    "paper": "comparison",
+}
+"""Commands, in the order of --help, and the modules that have them."""
 
-for _command in COMMANDS:
-    app.command()(_command)
+
+def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
+    """Return the command line with some commands, whose modules are imported.
+
+    Parameters
+    ----------
+    names : iterable of str
+    """
+    app = typer.Typer(
+        name="switchfit",
+        help="""When did it switch, and what were the parameters? Fits switched models to logs.
+
+        Begin with `switchfit init NAME --from LOG`, or with one of `switchfit examples`.
+        """,
+        no_args_is_help=True,
+        add_completion=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    app.callback()(_collect_options)
+    for name in names:
+        app.command()(getattr(import_module(f"switchfit.cli.{COMMANDS[name]}"), name))
+    return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        from switchfit.cli.terminal import print_text
+
+        print_text(f"switchfit {version('switchfit')}")
+        raise typer.Exit
+
+
+def _collect_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass
 
 
 def main() -> None:
@@ -34,4 +84,16 @@ def main() -> None:
     gc.set_threshold(YOUNG_OBJECTS, 20, 100)
     # pydantic would look for plugins in the metadata of every installed package, which takes 10 to 20 ms.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    app(prog_name="switchfit")
+    asked = [name for name in sys.argv[1:2] if name in COMMANDS]
+    app = build_app(asked or COMMANDS)
+    try:
+        app(prog_name="switchfit")
+    finally:
+        gc.freeze()  # else Python searches all that is imported for garbage when it exits: 20 to 80 ms
+
+
+def __getattr__(name: str) -> object:
+    """Return the whole command line as ``app``, built when it is first used (PEP 562)."""
+    if name != "app":
+        raise AttributeError(f"module 'switchfit.cli' has no attribute {name!r}", name=name)
+    return globals().setdefault(name, build_app())

@@ -48,11 +48,22 @@ def list_unknowns(fit: Fit) -> list[dict[str, Any]]:
         "high": correct_intervals(fit)[:, 1],
         "first_guess": fit.initial_theta,
     }
-    rows = [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
+    rows = zip_rows(columns)
     ends = {"date": "value", "date_low": "low", "date_high": "high"}
     for row, run in zip(rows, list_dated(fit), strict=True):
         row |= {} if run is None else {date: format_iso(row[end], run) or None for date, end in ends.items()}
     return rows
+
+
+def zip_rows(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
+    """Return the rows of a table, each a dict, from its columns.
+
+    Parameters
+    ----------
+    columns : mapping of str to iterable
+        All of one length.
+    """
+    return [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
 
 
 HEADERS = {
@@ -344,15 +355,10 @@ class ResultTable:
 
     def _write_parquet(self, columns: Sequence[str]) -> bytes:
         """Return Parquet; an empty cell is null, and the fields of unknowns have their units as metadata."""
-        import pyarrow
         import pyarrow.parquet
 
-        arrays, fields = [], []
-        for name in columns:
-            array = pyarrow.array([row.get(name) for row in self.rows])
-            unit = self.unknowns.get(name.removesuffix(ERROR.format("")), "")
-            arrays.append(array)
-            fields.append(pyarrow.field(name, array.type, metadata={"unit": unit} if unit else None))
-        file = io.BytesIO()
-        pyarrow.parquet.write_table(pyarrow.table(arrays, schema=pyarrow.schema(fields)), file)
+        table, file = pyarrow.table({name: [row.get(name) for row in self.rows] for name in columns}), io.BytesIO()
+        units = [self.unknowns.get(name.removesuffix(ERROR.format("")), "") for name in columns]
+        fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
+        pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
         return file.getvalue()

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 import pydantic
 
 from switchfit.io.logs import ENDINGS, find_logs, name_files
-from switchfit.io.problem_file.tables import OPTIONS, Contents, ExperimentTable, OptionsTable, Table
+from switchfit.io.problem_file.tables import OPTIONS, Contents, ExperimentTable, OptionsTable, Table, describe_keys
 from switchfit.io.user_files import build_at, find_object
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -109,25 +109,26 @@ def _describe_error(error: pydantic.ValidationError, kind: type[Table]) -> str:
     """Return the first error in a table as a sentence."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
-    table, steps, description = _follow_location(kind, first["loc"])
+    table, field, steps = _follow_location(kind, first["loc"])
     key = _join_steps(steps)
     if first["type"] == "extra_forbidden":
         known = list(table.model_fields)
-        close = difflib.get_close_matches(str(steps[-1]), known, n=1)
+        close = difflib.get_close_matches(field, known, n=1)
         remedy = f"did you mean {close[0]!r}?" if close else f"known here are {', '.join(known)}."
         sentence = f"unknown key {key}; {remedy}"
-    elif first["type"] == "missing":
-        sentence = f"the key {key} is missing: {description}."
     else:
+        description = describe_keys(table)[field]
         sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({description})."
-    different = {_join_steps(_follow_location(kind, e["loc"])[1]) for e in errors} - {key}
+        if first["type"] == "missing":
+            sentence = f"the key {key} is missing: {description}."
+    different = {_join_steps(_follow_location(kind, e["loc"])[2]) for e in errors} - {key}
     return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
 
 
-def _follow_location(holder: type[Table], location: Sequence[str | int]) -> tuple[type[Table], list[str | int], str]:
-    """Return the table of the key at a location, its steps without pydantic's names for unions, and its description."""
+def _follow_location(holder: type[Table], location: Sequence[str | int]) -> tuple[type[Table], str, list[str | int]]:
+    """Return the table of the key at a location, the key, and the steps to it without pydantic's names for unions."""
     inner: type[Table] | None = holder
-    description = ""
+    key = ""
     steps: list[str | int] = []
     is_chosen = False  # by the user, as the names of parameters are
     for step in location:
@@ -136,12 +137,11 @@ def _follow_location(holder: type[Table], location: Sequence[str | int]) -> tupl
             is_chosen = False
         elif inner is not None and (step in inner.model_fields or step == location[-1]):
             steps.append(step)
-            holder = inner
-            field = holder.model_fields.get(step)
+            holder, key = inner, step
+            field = holder.model_fields.get(key)
             annotation = field.annotation if field else None
-            description = " ".join(field.description.split()) if field and field.description else ""
             inner, is_chosen = _find_table(annotation), get_origin(annotation) is dict
-    return holder, steps, description
+    return holder, key, steps
 
 
 def _find_table(annotation: Any) -> type[Table] | None:

@@ -3,11 +3,12 @@
 The text below a field describes it in error messages and in the tables of ``docs/problem-file.md``.
 """
 
-from __future__ import annotations
-
+import ast
 import datetime
+import inspect
 import math
-from typing import Annotated, Any, Literal
+from itertools import pairwise
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 from pydantic import BeforeValidator, Field, Tag
@@ -22,9 +23,26 @@ HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss
 class Table(pydantic.BaseModel):
     """A table of a problem file, without other keys than its fields."""
 
-    model_config = pydantic.ConfigDict(
-        extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True, defer_build=True
-    )
+    model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True, defer_build=True)
+
+
+def describe_keys(kind: type[Table]) -> dict[str, str]:
+    """Return the text below each key of a table, in one line.
+
+    It is read from the source when it is needed. pydantic would read it for all tables when they are defined
+    (`use_attribute_docstrings`), which takes a tenth of the time until an unknown key is named.
+
+    Parameters
+    ----------
+    kind : type
+    """
+    found: dict[str, str] = {}
+    for each in reversed(kind.__mro__[: kind.__mro__.index(Table)]):
+        (definition,) = ast.parse(inspect.getsource(each)).body
+        for key, text in pairwise(ast.iter_child_nodes(definition)):
+            if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
+                found[ast.unparse(key.target)] = " ".join(ast.literal_eval(text.value).split())
+    return found
 
 
 def is_date(given: Any) -> bool:
@@ -36,7 +54,9 @@ def is_date(given: Any) -> bool:
     """
     if not isinstance(given, (str, datetime.date)):
         return False
-    from switchfit.problem.dates import as_dates  # here, since NumPy takes half of the time until a mistake is named
+    if isinstance(given, datetime.date) and 1678 < given.year < 2261:  # for which int64 has nanoseconds
+        return True
+    from switchfit.problem.dates import as_dates  # here, since NumPy takes a third of the time until a mistake is named
 
     try:
         as_dates(given, "the time")
@@ -94,8 +114,13 @@ def _drop_first(given: Any) -> Any:
 
 ENTRY = BeforeValidator(_wrap_entry)
 
-TABLE_OR_NOT = pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "other")
-"""Errors are then about what is given, and not about either."""
+Other = TypeVar("Other")
+Entries = TypeVar("Entries")
+OrTable = Annotated[
+    Annotated[Other, Tag("other")] | Annotated[dict[str, Entries], Tag("table")],
+    pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "other"),
+]
+"""Something, or a table with entries; errors are about what is given, and not about either."""
 
 Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
 """A number in the experiment's time unit, or a date."""
@@ -106,10 +131,7 @@ Duration = Annotated[float, Field(ge=0)]
 Names = Annotated[list[str], Field(min_length=1)]
 NameOrNames = Annotated[list[str], ENTRY]
 
-MinDuration = Annotated[
-    Annotated[Duration, Tag("other")] | Annotated[dict[str, Duration], Tag("table")],
-    TABLE_OR_NOT,
-]
+MinDuration = OrTable[Duration, Duration]
 """One for all modes, or one for each; 0 for those that are left out."""
 
 
@@ -188,7 +210,7 @@ class LogTable(Table):
     """subtracted from the time column; 'first': the time of the first row"""
     time_scale: Positive | None = None
     """then multiplied: 1e-3 turns ms into s; left out, 1"""
-    repair: NameOrNames = Field(default_factory=list)
+    repair: NameOrNames = []
     """what may be changed: 'sort', 'drop-duplicates', 'drop-missing-times', 'drop-broken-lines', 'unwrap:CHANNEL'"""
 
 
@@ -221,10 +243,7 @@ class DataTable(LogTable):
 class InputTable(LogTable):
     """A known input u(t); the modes are then functions f(t, x, p, u)."""
 
-    columns: Annotated[
-        Annotated[Names, Tag("other")] | Annotated[dict[str, str], Field(min_length=1), Tag("table")],
-        TABLE_OR_NOT,
-    ]
+    columns: Annotated[OrTable[Names, str], Field(min_length=1)]
     """names of the columns with the values, or { name in the model = column }, with which u is a dict"""
     kind: Literal["hold", "linear", "cubic"] = "hold"
     """interpolation between samples"""
@@ -235,7 +254,7 @@ class ModelTable(Table):
 
     name: str
     """a built-in model, or 'file.py:object' with a HybridSystem or a function making one"""
-    arguments: dict[str, Any] = Field(default_factory=dict)
+    arguments: dict[str, Any] = {}
     """arguments of the function"""
 
 
@@ -273,11 +292,11 @@ class ExperimentTable(Table):
     is to be estimated"""
     initial_state: list[Annotated[StateTable, BeforeValidator(_wrap_known)]] | None = None
     """state at t0, instead of the model's: a number, or a table if it is to be estimated"""
-    parameter_map: dict[str, str] = Field(default_factory=dict)
+    parameter_map: dict[str, str] = {}
     """the model's name of a parameter = the name under [parameters] that this run uses for it"""
     inputs: InputTable | None = None
     """a known input"""
-    jumps: Annotated[list[JumpTable], ENTRY] = Field(default_factory=list)
+    jumps: Annotated[list[JumpTable], ENTRY] = []
     """tables with time and map: changes of the state at known times, such as doses"""
     name: str | None = None
     """used in the report if there are several experiments"""
@@ -322,18 +341,11 @@ class DesignTable(Table):
     without names is u, or u[0], u[1], ..."""
     criterion: Literal["D", "A", "E"] | None = None
     """'D': determinant of the covariance, the default; 'A': its trace; 'E': its largest eigenvalue"""
-    names: (
-        Annotated[Annotated[NameOrNames, Tag("other")] | Annotated[dict[str, Positive], Tag("table")], TABLE_OR_NOT]
-        | None
-    ) = None
+    names: OrTable[NameOrNames, Positive] | None = None
     """unknowns that count, or a table with the scale of each; left out, all"""
-    samples: Annotated[Annotated[int, Tag("other")] | Annotated[dict[str, int], Tag("table")], TABLE_OR_NOT] | None = (
-        None
-    )
+    samples: OrTable[int, int] | None = None
     """most sample times of each sensor, or a table with a number for each; left out, all"""
-    sensors: (
-        Annotated[Annotated[int, Tag("other")] | Annotated[dict[str, Positive], Tag("table")], TABLE_OR_NOT] | None
-    ) = None
+    sensors: OrTable[int, Positive] | None = None
     """most sensors, or a table with the cost of each, which is called by its channels, such as 'X, Y'; left out, all"""
     budget: Positive | None = None
     """most that the sensors may cost together"""
@@ -372,15 +384,15 @@ class Contents(Table):
     """a built-in model, or 'file.py:object', or a table with name and arguments"""
     problem: str | None = None
     """'file.py:object' with an sf.Problem or a function making one, instead of all the rest"""
-    parameters: dict[str, Annotated[ParameterTable, BeforeValidator(_wrap_value)]] = Field(default_factory=dict)
+    parameters: dict[str, Annotated[ParameterTable, BeforeValidator(_wrap_value)]] = {}
     """the model's parameters"""
-    experiments: Annotated[list[ExperimentTable], ENTRY] = Field(default_factory=list)
+    experiments: Annotated[list[ExperimentTable], ENTRY] = []
     """the runs"""
     library: LibraryTable | None = None
     """the mode sequences among which switchfit modes searches; empty, all"""
-    online: OnlineTable = Field(default_factory=OnlineTable)
+    online: OnlineTable = Field(default_factory=OnlineTable.model_construct)
     """how switchfit online follows the samples"""
     design: DesignTable | None = None
     """what switchfit design may choose"""
-    options: OptionsTable = Field(default_factory=OptionsTable)
+    options: OptionsTable = Field(default_factory=OptionsTable.model_construct)
     """how to solve"""
