@@ -115,20 +115,20 @@ def test_quadratic_programmes(seed):
     slack = wide * rng.random(4) * (rng.random(4) > 0.3)
     normals, offsets = np.vstack([ORDERED, np.eye(11), -np.eye(11)]), np.concatenate([-slack, lower, -upper])
     expected = solve_qp(gradient, full, normals, offsets)
-    room = Room(ORDERED, np.append(lower, -slack), np.append(upper, np.full(4, np.inf)))
-    step, pull = solve_arrow_qp(gradient, arrow_of(full), room)
+    room = Room(normals[:15], offsets[:15], np.append(np.full(4, np.inf), upper))
+    step, pull = solve_arrow_qp(gradient, arrow_of(full), room, np.ones(11, dtype=bool))
     size = np.max(np.abs(expected.step))
     np.testing.assert_allclose(step, expected.step, atol=1e-8 * size)
-    np.testing.assert_allclose(full @ step + gradient, pull[:11] + ORDERED.T @ pull[11:], atol=1e-8)
-    assert np.all(pull[room.products(step) > room.lower + 1e-8 * size] <= 0.0)
-    assert np.all(pull[room.products(step) < room.upper - 1e-8 * size] >= 0.0)
+    np.testing.assert_allclose(full @ step + gradient, room.normals.T @ pull, atol=1e-8)
+    assert np.all(pull[room.normals @ step > room.lower + 1e-8 * size] <= 0.0)
+    assert np.all(pull[room.normals @ step < room.upper - 1e-8 * size] >= 0.0)
     assert np.all(normals @ step - offsets >= -1e-11 * size)
 
 
 def test_a_programme_that_is_not_convex_is_refused():
-    box = Room(np.zeros((0, 11)), -np.ones(11), np.ones(11))
+    box, full = Room(np.eye(11), -np.ones(11), np.ones(11)), random_matrix(np.random.default_rng(0), -1.0)
     with pytest.raises(ValueError, match="the quadratic programme is not positive definite; convexify it first"):
-        solve_arrow_qp(np.ones(11), arrow_of(random_matrix(np.random.default_rng(0), -1.0)), box)
+        solve_arrow_qp(np.ones(11), arrow_of(full), box, np.ones(11, dtype=bool))
 
 
 NONE, NO_FLOOR = np.zeros((0, 11)), np.zeros(11)

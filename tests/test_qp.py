@@ -247,9 +247,9 @@ def test_bounds_and_rows_of_ill_conditioned_programmes(d, log_condition):
         normals = np.vstack([rows, np.eye(d), -np.eye(d)])
         if np.all(normals @ newton >= offsets):
             continue
-        room = Room(rows, np.concatenate([-low, offsets[:1]]), np.append(high, np.inf))
+        room = Room(normals[: 1 + d], offsets[: 1 + d], np.append(np.inf, high))
         step, pull = solve_programme(g, B, CholeskyFactor.of(B), room)
-        multipliers = np.concatenate([pull[d:], np.maximum(pull[:d], 0.0), np.maximum(-pull[:d], 0.0)])
+        multipliers = np.concatenate([pull[:1], np.maximum(pull[1:], 0.0), np.maximum(-pull[1:], 0.0)])
         assert_kkt(g, B, normals, offsets, QPSolution(step, multipliers))
         at = multipliers[1:] > 0.0
         np.testing.assert_array_equal((normals[1:] @ step)[at], offsets[1:][at])

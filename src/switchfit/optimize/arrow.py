@@ -202,10 +202,9 @@ class Arrow(SymmetricMatrix):
         # Held unknowns stay in the arrays, decoupled and with curvature 1: blocks of all runs keep one shape.
         kept = self.held(free)
         convex = convexify_arrow(kept, pressed[np.any(pressed != 0.0, axis=1)], floor)
-        step, pull = solve_arrow_qp(gradient * free, convex, Room(room.rows * free, room.lower, room.upper))
-        step = np.where(free, step, 0.0)
+        step, pull = solve_arrow_qp(gradient * free, convex, room, free)
         # The product of held unknowns is with H: the force that a kink has to hold.
-        return ModelStep(step, np.where(free, convex @ step, self @ step), pull[d:], convex is kept)
+        return ModelStep(step, np.where(free, convex @ step, self @ step), pull, convex is kept)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the curvature in the null space of normals (k, d), as `Dense.curvature`.
@@ -285,22 +284,22 @@ class ArrowFactor:
         return self.layout.join(own, shared) / self.scaling
 
 
-def solve_arrow_qp(gradient: FloatArray, matrix: Arrow, room: Room) -> tuple[FloatArray, FloatArray]:
+def solve_arrow_qp(gradient: FloatArray, matrix: Arrow, room: Room, free: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Minimize ``gᵀd + ½ dᵀBd`` inside a room; result as of `switchfit.optimize.qp.solve_programme`.
 
     The programme is solved with the constraints that the step before has violated, until it violates no other: since it
-    is strictly convex, that is the solution with all of them.
+    is strictly convex, that is the solution with all of them. Unknowns that are not `free` (d,) are decoupled in B, and
+    stay where they are.
     """
     factor = ArrowFactor.of(matrix)
     if factor is None:
         raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
     step = newton = newton_step(gradient, matrix, factor)
-    d, pull = len(step), np.zeros(len(room.lower))
-    size = np.concatenate([np.ones(d), np.linalg.norm(room.rows, axis=1)])
+    pull, size = np.zeros(len(room.lower)), np.sqrt((room.normals**2).sum(1))
     working = np.zeros(0, dtype=np.intp)
     # Thousands of rows for many runs, few of which matter: the working set only grows, so that the loop ends.
     for _ in range(MAX_ROUNDS):
-        products = room.products(step)
+        products = room.normals @ step
         # From the second round on rounding may violate a row.
         rounding = 1e-13 * size * np.max(np.abs(step), initial=0.0) if working.size else 0.0
         violated = (products < room.lower - rounding) | (products > room.upper + rounding)
@@ -308,19 +307,16 @@ def solve_arrow_qp(gradient: FloatArray, matrix: Arrow, room: Room) -> tuple[Flo
         if not violated.any():
             break
         working = np.union1d(working, np.flatnonzero(violated))
-        rows = np.zeros((working.size, d))
-        bounds = working < d
-        rows[bounds, working[bounds]] = 1.0
-        rows[~bounds] = room.rows[working[~bounds] - d]
+        rows = room.normals[working] * free
         # The step is a combination of Newton's and of B⁻¹ C', C being the working set: as many unknowns as that has.
         spanning = np.array([newton, *(factor.solve(row) for row in rows)]) * factor.scaling
         own = np.linalg.qr(spanning.T)[0].T / factor.scaling
         reduced = np.array([matrix @ direction for direction in own]) @ own.T
-        free = np.full(len(own), np.inf)
-        lower, upper = np.append(-free, room.lower[working]), np.append(free, room.upper[working])
-        inside = Room(rows @ own.T, lower, upper)
+        wide = np.full(len(own), np.inf)
+        lower, upper = np.append(room.lower[working], -wide), np.append(room.upper[working], wide)
+        inside = Room(np.concatenate([rows @ own.T, np.eye(len(own))]), lower, upper)
         found, forces = solve_programme(own @ gradient, reduced, CholeskyFactor.of(reduced), inside)
-        pull[working] = forces[len(own) :]
+        pull[working] = forces[: working.size]
         step = found @ own
     return room.press(step, pull), pull
 

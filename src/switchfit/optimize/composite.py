@@ -164,12 +164,13 @@ def solve_composite(
     radius : float
         No unknown moves by more than ``radius * reach``.
     """
-    if not gradient.size:
-        return Composite(gradient, np.zeros(len(room.rows)), np.zeros(len(equalities.values)), True)
+    d = gradient.size
+    if not d:
+        return Composite(gradient, np.zeros(len(room.normals)), np.zeros(len(equalities.values)), True)
     # Units of `reach`: the trust region is the cube |d_i| <= radius, and unlike unknowns have comparable lengths.
     slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
     scaled, room = Equalities(equalities.values, equalities.jacobian * reach), _scale_room(room, reach)
-    rows, d = Rows.of(scaled.jacobian), len(reach)
+    rows = Rows.of(scaled.jacobian)
     # v, within NORMAL_PART of the region; then t in the null space of A, from the slope g + H v of the model at its
     # end.
     step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
@@ -181,20 +182,20 @@ def solve_composite(
         force = slope + bending.dot(step)
     # What the inequalities exert is taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the
     # least-squares sense.
-    force = force - pull[:d] - room.rows.T.dot(pull[d:])
-    return Composite(step * reach, pull[d:], rows.multipliers(force), definite)
+    multipliers = rows.multipliers(force - room.normals.T.dot(pull))
+    return Composite(step * reach, pull[:-d], multipliers, definite)
 
 
 def _scale_room(room: Room, reach: FloatArray) -> Room:
     """Return a room in units of `reach` (d,)."""
-    unit = np.concatenate([reach, np.ones(len(room.rows))])
-    return Room(room.rows * reach, room.lower / unit, room.upper / unit)
+    unit = np.concatenate([np.ones(len(room.normals) - reach.size), reach])
+    return Room(room.normals * (reach / unit[:, None]), room.lower / unit, room.upper / unit)
 
 
 def _add_tangential_step(
     slope: FloatArray, bending: FloatArray, null: FloatArray, least: float, normal: FloatArray, cube: Room
 ) -> tuple[FloatArray, FloatArray, bool]:
-    """Return the sum of normal and tangential step (d,), and what presses as of `solve_programme`, (d + m,).
+    """Return the sum of normal and tangential step (d,), and what presses as of `solve_programme`, (m + d,).
 
     The third result is `Composite.definite`. Everything is in units in which the trust region is a cube; `slope` is
     that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
@@ -206,12 +207,12 @@ def _add_tangential_step(
     if cube.holds(step):
         return step, np.zeros(len(cube.lower)), definite
     # What bounds v + Z w bounds w by rows alone.
-    products, free = cube.products(normal), np.full(slope.size, np.inf)
-    lower = np.concatenate([-free, np.minimum(cube.lower - products, 0.0)])
-    upper = np.concatenate([free, np.maximum(cube.upper - products, 0.0)])
-    inside = Room(np.concatenate([null, cube.rows.dot(null)]), lower, upper)
+    products, free = cube.normals.dot(normal), np.full(slope.size, np.inf)
+    lower = np.concatenate([np.minimum(cube.lower - products, 0.0), -free])
+    upper = np.concatenate([np.maximum(cube.upper - products, 0.0), free])
+    inside = Room(np.concatenate([cube.normals.dot(null), np.eye(slope.size)]), lower, upper)
     found, pull = solve_programme(slope, matrix, factor, inside)
-    pull = pull[slope.size :]
+    pull = pull[: -slope.size]
     return cube.press(normal + null.dot(found), pull), pull, definite
 
 

@@ -127,7 +127,9 @@ def _solve_on_sides(
     found = matrix.minimize_model(Programme(gradient, room, free, pressed, floor, box))
     regular = found.definite and matrix is hessian and free is None and point.is_interior
     slope = float(gradient.dot(found.step))
-    force = constraints.A.T.dot(found.forces) - found.product
+    force = -found.product
+    if found.pull is not None:
+        force += constraints.A.T.dot(found.pull[: constraints.b.size])
     radius = np.inf if box is None else box.radius_for(found.definite)
     reduction = -(slope + 0.5 * float(found.step.dot(found.product)))
     return Direction(found.step, slope, reduction, regular, radius, _descends(problem, hessian, free)), force
@@ -160,19 +162,20 @@ def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) 
     The second result are the unknowns that may move at all, (d,) of bool; None if all may.
     """
     point, constraints = state.point, problem.constraints
-    m, d = constraints.A.shape
     room = Room.around(constraints, point.slack)
+    lower, upper = room.bounds
     # Rows that hold up to rounding hold exactly in the programme.
-    room.lower[d + point.active[point.active < m]] = 0.0
+    if point.active.size:
+        room.lower[point.active[point.active < constraints.b.size]] = 0.0
     if piece is not None:
-        room.lower[:d] = np.minimum(piece[0] - point.theta, 0.0)
-        room.upper[:d] = np.maximum(piece[1] - point.theta, 0.0)
+        lower[:] = np.minimum(piece[0] - point.theta, 0.0)
+        upper[:] = np.maximum(piece[1] - point.theta, 0.0)
     if point.kink is None and point.idle is None and constraints.all_movable:
         return room, None
     free = constraints.movable if point.idle is None else constraints.movable & ~point.idle
     if point.kink is not None:
-        room.lower[:d][point.kink & (sides > 0)] = 0.0
-        room.upper[:d][point.kink & (sides < 0)] = 0.0
+        lower[point.kink & (sides > 0)] = 0.0
+        upper[point.kink & (sides < 0)] = 0.0
         free = ~(point.kink & (sides == 0)) & free
     return room, None if free.all() else free
 

@@ -101,15 +101,15 @@ class ModelStep(NamedTuple):
     step : array, shape (d,)
     product : array, shape (d,)
         B d, with the rows of H for unknowns that are not free.
-    forces : array, shape (m,)
-        Multipliers of the rows.
+    pull : array, shape (m + d,), or None
+        As of `solve_programme`, without the bounds of unknowns that are not free; None where nothing presses.
     definite : bool
         Whether H was positive definite as it is on the free unknowns: B is H there.
     """
 
     step: FloatArray
     product: FloatArray
-    forces: FloatArray
+    pull: FloatArray | None
     definite: bool
 
 
@@ -317,7 +317,7 @@ class Dense(SymmetricMatrix):
         part = np.flatnonzero(free)
         step = np.zeros(len(self.array))
         if part.size == 0:
-            return ModelStep(step, step, np.zeros(len(room.rows)), True)
+            return ModelStep(step, step, None, True)
         # What is held is left out of the programme.
         own = Programme(
             gradient[part],
@@ -332,7 +332,7 @@ class Dense(SymmetricMatrix):
         # The product of what is held is with H: the force that holds it at its kink.
         product = self.array[:, part] @ found.step
         product[part] = found.product
-        return ModelStep(step, product, found.forces, found.definite)
+        return ModelStep(step, product, found.pull, found.definite)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
@@ -372,11 +372,10 @@ def _minimize(hessian: FloatArray, programme: Programme) -> ModelStep:
     convex, factor = convexify_and_factor(hessian, pressed, floor, None if box is None else box.reach)
     if box is not None:
         room = box.narrow(room, convex is hessian)
-    step, forces = newton_step(gradient, convex, factor), np.zeros(len(room.rows))
+    step, pull = newton_step(gradient, convex, factor), None
     if not room.holds(step):
         step, pull = solve_programme(gradient, convex, factor, room)
-        forces = pull[step.size :]
-    return ModelStep(step, convex.dot(step), forces, convex is hessian)
+    return ModelStep(step, convex.dot(step), pull, convex is hessian)
 
 
 def null_space(normals: FloatArray) -> FloatArray:

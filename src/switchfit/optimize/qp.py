@@ -124,6 +124,11 @@ class LinearConstraints:
         identity = np.eye(self.size)
         return np.vstack([self.A, identity, -identity])
 
+    @cached_property
+    def open(self) -> FloatArray:
+        """Upper bounds of the rows, which have none: (m,)."""
+        return np.full(self.b.size, np.inf)
+
     def exact_rows(self, index: IntArray) -> list[tuple[int, int, float]]:
         """Of the given rows of A those that can hold with equality in floating point.
 
@@ -211,6 +216,9 @@ PARALLEL = 1e-14
 A matrix of the condition 1e12 brings rows to within 1e-6 of one another.
 """
 
+SHORT = 0.01
+"""Part of Newton's step, in the metric of the matrix, below which a step is refined: it has the other's rounding."""
+
 SOLVED, EQUALITY = 1, 5
 """What daqp calls a programme that it has solved, and a row that holds with equality."""
 
@@ -265,15 +273,16 @@ def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> Float
 
 
 class Room(NamedTuple):
-    """Where a step d may go: ``lower <= (d, rows d) <= upper``; d = 0 may.
+    """Where a step d may go: ``lower <= N d <= upper``; d = 0 may.
 
     Attributes
     ----------
-    rows : array, shape (m, d)
-    lower, upper : arrays, shape (d + m,)
+    normals : array, shape (m + d, d)
+        Rows, and the identity.
+    lower, upper : arrays, shape (m + d,)
     """
 
-    rows: FloatArray
+    normals: FloatArray
     lower: FloatArray
     upper: FloatArray
 
@@ -282,35 +291,37 @@ class Room(NamedTuple):
         """Return the room around a feasible point with the given slack (m + 2 d,)."""
         m, d = constraints.A.shape
         slack = np.maximum(slack, 0.0)
-        lower = np.concatenate([-slack[m : m + d], -slack[:m]])
-        return cls(constraints.A, lower, np.concatenate([slack[m + d :], np.full(m, np.inf)]))
+        upper = np.concatenate([constraints.open, slack[m + d :]])
+        return cls(constraints.normals[: m + d], -slack[: m + d], upper)
 
-    def products(self, step: FloatArray) -> FloatArray:
-        """Return what is bounded of a step (d,): (d + m,)."""
-        return np.concatenate([step, self.rows.dot(step)])
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the step: (d,), (d,)."""
+        d = self.normals.shape[1]
+        return self.lower[-d:], self.upper[-d:]
 
     def holds(self, step: FloatArray) -> bool:
         """Return whether a step (d,) is inside."""
-        products = self.products(step)
+        products = self.normals.dot(step)
         return np.count_nonzero((self.lower <= products) & (products <= self.upper)) == products.size
 
     def narrow(self, reach: FloatArray) -> Room:
         """Return the part of the room in which no unknown moves by more than its `reach` (d,)."""
-        lower, upper, d = self.lower.copy(), self.upper.copy(), reach.size
-        lower[:d] = np.maximum(lower[:d], -reach)
-        upper[:d] = np.minimum(upper[:d], reach)
-        return Room(self.rows, lower, upper)
+        narrowed = Room(self.normals, self.lower.copy(), self.upper.copy())
+        lower, upper = narrowed.bounds
+        np.maximum(lower, -reach, out=lower)
+        np.minimum(upper, reach, out=upper)
+        return narrowed
 
     def of(self, part: IntArray) -> Room:
         """Return the room of some of the unknowns, the others being held."""
-        m, d = self.rows.shape
-        kept = np.concatenate([part, np.arange(d, d + m)])
-        return Room(self.rows[:, part], self.lower[kept], self.upper[kept])
+        m = len(self.normals) - self.normals.shape[1]
+        kept = np.concatenate([np.arange(m), m + part])
+        return Room(self.normals[kept][:, part], self.lower[kept], self.upper[kept])
 
     def press(self, step: FloatArray, pull: FloatArray) -> FloatArray:
-        """Return a step (d,) exactly on each of its bounds that pulls (d + m,): kinks depend on it."""
-        d = step.size
-        lower, upper, own = self.lower[:d], self.upper[:d], pull[:d]
+        """Return a step (d,) exactly on each of its bounds that pulls (m + d,): kinks depend on it."""
+        (lower, upper), own = self.bounds, pull[-step.size :]
         return np.minimum(np.maximum(np.where(own > 0.0, lower, np.where(own < 0.0, upper, step)), lower), upper)
 
 
@@ -356,12 +367,13 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
     factor = CholeskyFactor.of(matrix)
     step = newton_step(gradient, matrix, factor)
     free = np.full(gradient.size, np.inf)
-    room = Room(normals, np.concatenate([-free, offsets]), np.concatenate([free, np.full(offsets.size, np.inf)]))
+    upper = np.full(offsets.size + gradient.size, np.inf)
+    room = Room(np.concatenate([normals, np.eye(gradient.size)]), np.concatenate([offsets, -free]), upper)
     # The unconstrained minimum, if it is feasible, is the solution.
     if room.holds(step):
         return QPSolution(step, multipliers)
     step, pull = solve_programme(gradient, matrix, factor, room)
-    return QPSolution(step, pull[gradient.size :])
+    return QPSolution(step, pull[: offsets.size])
 
 
 def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
@@ -378,28 +390,28 @@ def solve_programme(
 
     Returns
     -------
-    step, pull : arrays, shape (d,), (d + m,)
-        ``B d + g = (I, rows)ᵀ pull``, positive where a lower bound presses and negative where an upper one does.
+    step, pull : arrays, shape (d,), (m + d,)
+        ``B d + g = Nᵀ pull``, positive where a lower bound presses and negative where an upper one does.
     """
-    d = gradient.size
     # In white variables, d = length D⁻¹ L⁻ᵀ e, nothing has a scale any more.
     target = factor.whiten(gradient)
     length = norm(target)
-    rows, lengths = algebra.unit_rows(factor.whiten(np.concatenate([np.eye(d), room.rows])))
+    rows, lengths = algebra.unit_rows(factor.whiten(room.normals))
     lower, upper = room.lower / (length * lengths), room.upper / (length * lengths)
     found = find_least_distance(target / length, rows, lower, upper)
     if found is None:  # the zero step is feasible; a search along it ends at once
-        return np.zeros(d), np.zeros(lower.size)
+        return np.zeros(gradient.size), np.zeros(lower.size)
     e, pull = found
-    # One step of refinement, with a residual that is computed with B itself: the same programme for the error, with
-    # what is active now. It counts where the step is far shorter than Newton's.
-    active = pull != 0.0
-    missing = np.where(pull > 0.0, lower, upper) - rows.dot(e)
-    residual = factor.whiten(gradient + matrix.dot(length * factor.unwhiten(e))) / length - rows.T.dot(pull)
-    lower, upper = np.where(active, missing, -np.inf), np.where(active, missing, np.inf)
-    refined = find_least_distance(residual, rows, lower, upper, active)
-    if refined is not None:
-        e, pull = e + refined[0], np.where(active, pull + refined[1], 0.0)
+    if norm(e) < SHORT:
+        # One step of refinement, with a residual that is computed with B itself: the same programme for the error, with
+        # what is active now.
+        active = pull != 0.0
+        missing = np.where(pull > 0.0, lower, upper) - rows.dot(e)
+        residual = factor.whiten(gradient + matrix.dot(length * factor.unwhiten(e))) / length - rows.T.dot(pull)
+        lower, upper = np.where(active, missing, -np.inf), np.where(active, missing, np.inf)
+        refined = find_least_distance(residual, rows, lower, upper, active)
+        if refined is not None:
+            e, pull = e + refined[0], np.where(active, pull + refined[1], 0.0)
     pull = length * pull / lengths
     return room.press(length * factor.unwhiten(e), pull), pull
 
