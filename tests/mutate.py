@@ -20,7 +20,7 @@ SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS, IMPLICIT_ROWS = "paper_adjoint.py", "discretization/rows.py", "discretization/implicit_rows.py"
 ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
-DIRECTION, POINT, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "state"))
+DIRECTION, POINT, QP, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "qp", "state"))
 MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
 BEAM, HYPOTHESES, HYPOTHESIS_LOOPS = (
     "strategy/beam.py",
@@ -261,8 +261,8 @@ IN_SQP: dict[str, tuple[str, Replacements]] = {
     ),
     "the size in what is active": (ALGEBRA, [("16 * EPS * (abs_b + abs_A @ size)", "0.0 * (abs_b + abs_A @ size)")]),
     "bounds that press are reached exactly": (
-        ALGEBRA,
-        [("xp.where(at_low, low, xp.where(at_high, high, step))", "xp.where(at_low, 0.999 * low, step)")],
+        QP,
+        [("np.where(own > 0.0, lower, np.where(own < 0.0, upper, step))", "np.where(own > 0.0, 0.999 * lower, step)")],
     ),
 }
 
@@ -289,7 +289,7 @@ IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
     "the constraints in the Hessian of the Lagrangian": (POINT, [("self.multipliers / units)", "0.0 * units)")]),
     "bounds of the normal step": (
         COMPOSITE,
-        [("if largest(np.abs(shortest)) <= radius and satisfies(normals, shortest, offsets):", "if True:")],
+        [("if cube.holds(shortest):", "if True:")],
     ),
     "dependent rows": (COMPOSITE, [("self.triangular[:k] if self.rank == k else None", "self.triangular[:k]")]),
     "curvature along the constraints alone": (

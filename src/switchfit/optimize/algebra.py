@@ -107,17 +107,6 @@ def project_on_row(theta: Array, normal: Array, bound: Array, movable: Array, xp
     return violation, theta + movable * ((violation + margin) / xp.where(square > 0.0, square, 1.0))
 
 
-def press_on_bounds(step: Array, low: Array, high: Array, multipliers: Array, xp: Any = np) -> Array:
-    """Return the step (d,) of a programme, exactly on each of its bounds (d,) that has a multiplier (m + 2 d,).
-
-    Kinks depend on it, whatever rounding did to the step.
-    """
-    d = step.shape[0]
-    m = multipliers.shape[0] - 2 * d
-    at_low, at_high = multipliers[m : m + d] > 0.0, multipliers[m + d :] > 0.0
-    return xp.minimum(xp.maximum(xp.where(at_low, low, xp.where(at_high, high, step)), low), high)
-
-
 def unit_rows(rows: Array, xp: Any = np) -> tuple[Array, Array]:
     """Return rows (k, d) of unit length, and their lengths (k,); a row of zeros stays one, with the length 1."""
     lengths = xp.sqrt((rows * rows).sum(1))

@@ -30,7 +30,6 @@ from switchfit.optimize.algebra import (
     IntArray,
     is_finite,
     positive_eigenvalues,
-    press_on_bounds,
 )
 from switchfit.optimize.matrix import (
     Curvature,
@@ -43,7 +42,7 @@ from switchfit.optimize.matrix import (
     diagonal_scaling,
     split_space,
 )
-from switchfit.optimize.qp import LinearConstraints, QPSolution, newton_step, solve_whitened
+from switchfit.optimize.qp import CholeskyFactor, Room, newton_step, solve_programme
 
 #: Rounds of adding violated constraints to the quadratic programme; each adds one or more, a few are enough.
 MAX_ROUNDS = 1000
@@ -195,23 +194,17 @@ class Arrow(SymmetricMatrix):
 
         What is held keeps its place, with a step of zero.
         """
-        gradient, room, pressed, floor, _ = programme
+        gradient, room, free, pressed, floor, _ = programme
         d = self.layout.size
-        free = np.ones(d, dtype=bool) if room.free is None else room.free
+        free = np.ones(d, dtype=bool) if free is None else free
         pressed = pressed * free
         floor = np.zeros(d) if floor is None else floor * free
         # Held unknowns stay in the arrays, decoupled and with curvature 1: blocks of all runs keep one shape.
         kept = self.held(free)
         convex = convexify_arrow(kept, pressed[np.any(pressed != 0.0, axis=1)], floor)
-        lower, upper = room.bounds
-        offsets = room.offsets.copy()
-        # Their bounds cannot press on a step of zero.
-        offsets[-2 * d :][~np.concatenate([free, free])] = -np.inf
-        solution = solve_arrow_qp(gradient * free, convex, room.constraints, offsets)
-        multipliers = solution.multipliers
-        step = np.where(free, press_on_bounds(solution.step, lower, upper, multipliers), 0.0)
+        step, pull = solve_arrow_qp(gradient * free, convex, room, free)
         # The product of held unknowns is with H: the force that a kink has to hold.
-        return ModelStep(step, np.where(free, convex @ step, self @ step), multipliers, convex is kept)
+        return ModelStep(step, np.where(free, convex @ step, self @ step), pull, convex is kept)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the curvature in the null space of normals (k, d), as `Dense.curvature`.
@@ -279,68 +272,53 @@ class ArrowFactor:
         """L_e⁻¹ and L_s⁻¹: each is used a few times, and NumPy has no triangular solve of many small systems."""
         return np.asarray(np.linalg.inv(self.own), float), np.asarray(np.linalg.inv(self.shared), float)
 
-    def whiten(self, vectors: FloatArray) -> FloatArray:
-        """Return L⁻¹ D⁻¹ v for a vector (d,) or each of the rows (r, d)."""
-        if vectors.ndim == 2:
-            return np.array([self.whiten(row) for row in vectors]).reshape(len(vectors), -1)
-        of_own, of_shared = self._inverses
-        # Forward substitution: y_e = L_e^-1 v_e, then L_s^-1 (v_s - sum_e W_e' y_e).
-        own, shared = self.layout.split(vectors / self.scaling)
-        y = (of_own @ own[..., None])[..., 0]
-        return np.concatenate([y.ravel(), of_shared @ (shared - np.einsum("eks,ek->s", self.border, y))])
-
-    def unwhiten(self, vector: FloatArray) -> FloatArray:
-        """Return D⁻¹ L⁻ᵀ v."""
-        of_own, of_shared = self._inverses
-        R, k, _ = self.border.shape
-        # Backward substitution: the shared ones first, then L_e^-T (v_e - W_e x_s).
-        shared = of_shared.T @ vector[R * k :]
-        own = vector[: R * k].reshape(R, k) - self.border @ shared
-        return self.layout.join((np.swapaxes(of_own, 1, 2) @ own[..., None])[..., 0], shared) / self.scaling
-
     def solve(self, vector: FloatArray) -> FloatArray:
         """Return B⁻¹ v."""
-        return self.unwhiten(self.whiten(vector))
+        of_own, of_shared = self._inverses
+        # Forward substitution: y_e = L_e^-1 v_e, then L_s^-1 (v_s - sum_e W_e' y_e); backward: the shared ones first,
+        # then L_e^-T (y_e - W_e x_s).
+        own, shared = self.layout.split(vector / self.scaling)
+        own = (of_own @ own[..., None])[..., 0]
+        shared = of_shared.T @ (of_shared @ (shared - np.einsum("eks,ek->s", self.border, own)))
+        own = (np.swapaxes(of_own, 1, 2) @ (own - self.border @ shared)[..., None])[..., 0]
+        return self.layout.join(own, shared) / self.scaling
 
 
-def solve_arrow_qp(
-    gradient: FloatArray, matrix: Arrow, constraints: LinearConstraints, offsets: FloatArray
-) -> QPSolution:
-    """Minimize ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
+def solve_arrow_qp(gradient: FloatArray, matrix: Arrow, room: Room, free: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Minimize ``gᵀd + ½ dᵀBd`` inside a room; result as of `switchfit.optimize.qp.solve_programme`.
 
-    As `switchfit.optimize.qp.solve_qp`; C are the rows and bounds of `constraints`. The programme is solved with the
-    constraints that the step before has violated, until it violates no other: since it is strictly convex, that is the
-    solution with all of them.
-
-    Parameters
-    ----------
-    gradient : (d,)
-    matrix : Arrow
-    constraints : LinearConstraints
-    offsets : (m + 2 d,)
-        c, not positive; minus infinity where a row does not constrain.
+    The programme is solved with the constraints that the step before has violated, until it violates no other: since it
+    is strictly convex, that is the solution with all of them. Unknowns that are not `free` (d,) are decoupled in B, and
+    stay where they are.
     """
     factor = ArrowFactor.of(matrix)
     if factor is None:
         raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
-    # Thousands of rows for many runs, few of which matter: the working set only grows, so that the loop ends.
-    multipliers = np.zeros(offsets.size)
-    step = newton_step(gradient, matrix, factor)
+    step = newton = newton_step(gradient, matrix, factor)
+    pull, size = np.zeros(len(room.lower)), np.sqrt((room.normals**2).sum(1))
     working = np.zeros(0, dtype=np.intp)
+    # Thousands of rows for many runs, few of which matter: the working set only grows, so that the loop ends.
     for _ in range(MAX_ROUNDS):
-        gap = constraints.slopes(step) - offsets
-        violated = np.setdiff1d(np.flatnonzero(gap < 0.0), working)
-        if working.size:  # from then on rounding may violate a row
-            length = constraints.row_norms[violated] * float(np.max(np.abs(step), initial=0.0))
-            violated = violated[gap[violated] < -1e-13 * length]
-        if violated.size == 0:
+        products = room.normals @ step
+        # From the second round on rounding may violate a row.
+        rounding = 1e-13 * size * np.max(np.abs(step), initial=0.0) if working.size else 0.0
+        violated = (products < room.lower - rounding) | (products > room.upper + rounding)
+        violated[working] = False
+        if not violated.any():
             break
-        working = np.union1d(working, violated)
-        # White rows have R k + s entries; those of the working set alone are made.
-        step, found = solve_whitened(gradient, matrix, factor, constraints.rows(working), offsets[working])
-        multipliers[:] = 0.0
-        multipliers[working] = found
-    return QPSolution(step, multipliers)
+        working = np.union1d(working, np.flatnonzero(violated))
+        rows = room.normals[working] * free
+        # The step is a combination of Newton's and of B⁻¹ C', C being the working set: as many unknowns as that has.
+        spanning = np.array([newton, *(factor.solve(row) for row in rows)]) * factor.scaling
+        own = np.linalg.qr(spanning.T)[0].T / factor.scaling
+        reduced = np.array([matrix @ direction for direction in own]) @ own.T
+        wide = np.full(len(own), np.inf)
+        lower, upper = np.append(room.lower[working], -wide), np.append(room.upper[working], wide)
+        inside = Room(np.concatenate([rows @ own.T, np.eye(len(own))]), lower, upper)
+        found, forces = solve_programme(own @ gradient, reduced, CholeskyFactor.of(reduced), inside)
+        pull[working] = forces[: working.size]
+        step = found @ own
+    return room.press(step, pull), pull
 
 
 def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> Arrow:

@@ -27,8 +27,8 @@ import numpy as np
 
 from switchfit.optimize import lapack
 from switchfit.optimize.algebra import FloatArray, IntArray, largest, norm
-from switchfit.optimize.matrix import factorize_rows, shift_to_positive, solve_in_bounds
-from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_whitened
+from switchfit.optimize.matrix import factorize_rows, shift_to_positive
+from switchfit.optimize.qp import CholeskyFactor, Room, newton_step, solve_programme
 
 NORMAL_PART = 0.95
 """Part of the trust region in which the normal step has to stay; the rest is left for the tangential step."""
@@ -127,53 +127,26 @@ class Composite(NamedTuple):
     Attributes
     ----------
     step : array, shape (d,)
-    inequalities : array, shape (m,)
-        Multipliers of the inequalities; the trust region's are left out.
+    forces : array, shape (m,)
+        Multipliers of the rows of the inequalities.
     multipliers : array, shape (k,)
-        Of the equality constraints: ``g + H d + Aᵀ lam = Nᵀ inequalities``, as nearly as that can be had.
+        Of the equality constraints: ``g + H d + Aᵀ lam`` is what the inequalities exert, as nearly as that can be had.
     definite : bool
         Whether H was positive definite as it is along the constraints.
     """
 
     step: FloatArray
-    inequalities: FloatArray
+    forces: FloatArray
     multipliers: FloatArray
     definite: bool
-
-
-class Region(NamedTuple):
-    """What does not change from point to point: the trust region at radius 1, and inequalities N in its units.
-
-    Attributes
-    ----------
-    reach : array, shape (d,)
-        Half-widths of the trust region.
-    weight : array, shape (d, d)
-        Their products, which take a Hessian to these units.
-    normals : array, shape (m, d)
-        N times `reach`.
-    extents : array, shape (m,)
-        How far the region extends along each of them.
-    """
-
-    reach: FloatArray
-    weight: FloatArray
-    normals: FloatArray
-    extents: FloatArray
-
-    @classmethod
-    def of(cls, normals: FloatArray, reach: FloatArray) -> Region:
-        """Return the region of inequalities N (m, d) and half-widths (d,)."""
-        scaled = normals * reach
-        return cls(reach, reach[:, None] * reach, scaled, np.abs(scaled).sum(1))
 
 
 def solve_composite(
     gradient: FloatArray,
     hessian: FloatArray,
     equalities: Equalities,
-    region: Region,
-    offsets: FloatArray,
+    room: Room,
+    reach: FloatArray,
     radius: float,
 ) -> Composite:
     """Return the composite step.
@@ -185,101 +158,78 @@ def solve_composite(
     hessian : array, shape (d, d)
         Of the Lagrangian ``J + lam . c``.
     equalities : Equalities
-    region : Region
-    offsets : array, shape (m,)
-        ``N d >= offsets``, offsets not positive.
+    room : Room
+        The inequalities.
+    reach : array, shape (d,)
     radius : float
         No unknown moves by more than ``radius * reach``.
     """
-    if not gradient.size:
-        return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)), True)
-    reach = region.reach
+    d = gradient.size
+    if not d:
+        return Composite(gradient, np.zeros(len(room.normals)), np.zeros(len(equalities.values)), True)
     # Units of `reach`: the trust region is the cube |d_i| <= radius, and unlike unknowns have comparable lengths.
-    slope, bending = gradient * reach, hessian * region.weight
-    scaled = Equalities(equalities.values, equalities.jacobian * reach)
+    slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
+    scaled, room = Equalities(equalities.values, equalities.jacobian * reach), _scale_room(room, reach)
     rows = Rows.of(scaled.jacobian)
-    # A row of the inequalities that the whole trust region satisfies is left out.
-    kept = (region.extents * radius > -offsets).nonzero()[0]
-    within, room = region.normals[kept], offsets[kept]
     # v, within NORMAL_PART of the region; then t in the null space of A, from the slope g + H v of the model at its
     # end.
-    step = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
-    pressing, definite, force = None, True, slope + bending.dot(step)
-    if rows.rank < step.size:
+    step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
+    pull, definite, force = np.zeros(len(room.lower)), True, slope + bending.dot(step)
+    if rows.rank < d:
         least = FLAT * largest(np.abs(slope)) + TINY
-        along, pressing, definite = _find_tangential_step(force, bending, rows.null, least, step, within, room, radius)
-        step = step + along
+        cube = room.narrow(np.full(d, radius))
+        step, pull, definite = _add_tangential_step(force, bending, rows.null, least, step, cube)
         force = slope + bending.dot(step)
-    inequalities = np.zeros(len(offsets))
-    # Multipliers come in the order: inequalities, lower faces of the cube, upper faces. What all of these exert is
-    # taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the least-squares sense.
-    if pressing is not None:
-        count, d = len(room), step.size
-        force -= within.T.dot(pressing[:count]) + pressing[count : count + d] - pressing[count + d :]
-        inequalities[kept] = pressing[:count]
-    return Composite(step * reach, inequalities, rows.multipliers(force), definite)
+    # What the inequalities exert is taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the
+    # least-squares sense.
+    multipliers = rows.multipliers(force - room.normals.T.dot(pull))
+    return Composite(step * reach, pull[:-d], multipliers, definite)
 
 
-def _find_tangential_step(
-    slope: FloatArray,
-    bending: FloatArray,
-    null: FloatArray,
-    least: float,
-    normal: FloatArray,
-    within: FloatArray,
-    room: FloatArray,
-    radius: float,
-) -> tuple[FloatArray, FloatArray | None, bool]:
-    """Return the tangential step (d,), and the multipliers of the inequalities and the trust region, (m + 2 d,).
+def _scale_room(room: Room, reach: FloatArray) -> Room:
+    """Return a room in units of `reach` (d,)."""
+    unit = np.concatenate([np.ones(len(room.normals) - reach.size), reach])
+    return Room(room.normals * (reach / unit[:, None]), room.lower / unit, room.upper / unit)
 
-    These are None where none of them presses. The third result is `Composite.definite`. Everything is in units in which
-    the trust region is a cube; `slope` is that of the model at the end of the normal step, `null` a basis of the null
-    space, `least` the least curvature.
+
+def _add_tangential_step(
+    slope: FloatArray, bending: FloatArray, null: FloatArray, least: float, normal: FloatArray, cube: Room
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Return the sum of normal and tangential step (d,), and what presses as of `solve_programme`, (m + d,).
+
+    The third result is `Composite.definite`. Everything is in units in which the trust region is a cube; `slope` is
+    that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
     """
     # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
     (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
     factor = CholeskyFactor.of(matrix)
-    newton = newton_step(slope, matrix, factor)
-    step = null.dot(newton)
-    left = np.minimum(room - within.dot(normal), 0.0)
-    if largest(np.abs(normal + step)) <= radius and satisfies(within, step, left):
-        return step, None, definite
-    # N Z w >= offsets - N v, and -radius <= v + Z w <= radius.
-    inside = np.concatenate([within.dot(null), null, -null])
-    left = np.concatenate([left, -radius - normal, normal - radius])
-    found, multipliers = solve_whitened(slope, matrix, factor, inside, np.minimum(left, 0.0))
-    return null.dot(found), multipliers, definite
+    step = normal + null.dot(newton_step(slope, matrix, factor))
+    if cube.holds(step):
+        return step, np.zeros(len(cube.lower)), definite
+    # What bounds v + Z w bounds w by rows alone.
+    products, free = cube.normals.dot(normal), np.full(slope.size, np.inf)
+    lower = np.concatenate([np.minimum(cube.lower - products, 0.0), -free])
+    upper = np.concatenate([np.maximum(cube.upper - products, 0.0), free])
+    inside = Room(np.concatenate([cube.normals.dot(null), np.eye(slope.size)]), lower, upper)
+    found, pull = solve_programme(slope, matrix, factor, inside)
+    pull = pull[: -slope.size]
+    return cube.press(normal + null.dot(found), pull), pull, definite
 
 
-def find_normal_step(equalities: Equalities, region: Region, offsets: FloatArray, radius: float) -> FloatArray:
+def find_normal_step(equalities: Equalities, room: Room, reach: FloatArray, radius: float) -> FloatArray:
     """Return the v (d,) that minimizes ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
-    scaled = Equalities(equalities.values, equalities.jacobian * region.reach)
-    kept = (offsets > -np.inf).nonzero()[0]
-    rows = Rows.of(scaled.jacobian)
-    return _find_normal_step(scaled, rows, region.normals[kept], offsets[kept], radius) * region.reach
+    scaled = Equalities(equalities.values, equalities.jacobian * reach)
+    return _find_normal_step(scaled, Rows.of(scaled.jacobian), _scale_room(room, reach), radius) * reach
 
 
-def _find_normal_step(
-    equalities: Equalities, rows: Rows, normals: FloatArray, offsets: FloatArray, radius: float
-) -> FloatArray:
+def _find_normal_step(equalities: Equalities, rows: Rows, room: Room, radius: float) -> FloatArray:
     """Return the v of `find_normal_step` in units in which the trust region is a cube."""
-    shortest = rows.solve(equalities.values)
-    if largest(np.abs(shortest)) <= radius and satisfies(normals, shortest, offsets):
+    shortest, d = rows.solve(equalities.values), equalities.jacobian.shape[1]
+    cube = room.narrow(np.full(d, radius))
+    if cube.holds(shortest):
         return shortest
-    A, d = equalities.jacobian, shortest.size
     # The minimum of ||c + A v||^2 / 2 in the region: A'A is singular wherever constraints are fewer than unknowns.
+    A = equalities.jacobian
     matrix = A.T.dot(A)
     matrix.reshape(-1)[:: d + 1] += RIDGE * max(float(matrix.trace()) / d, TINY)
-    slope = A.T.dot(equalities.values)
-    inside, left = normals, np.minimum(offsets, 0.0)
-    if radius < np.inf:
-        left = np.concatenate([left, np.full(2 * d, -radius)])
-        # Where the rows cut off the nearest step in the cube, more than the cube presses: of 340 such programmes of the
-        # pendulum that bounds alone were to solve, 2 have been.
-        if satisfies(normals, np.minimum(np.maximum(shortest, -radius), radius), offsets):
-            found = solve_in_bounds(slope, matrix, shortest, normals, left)
-            if found is not None:
-                return found[0]
-        identity = np.eye(d)
-        inside = np.concatenate([normals, identity, -identity])
-    return solve_whitened(slope, matrix, CholeskyFactor.of(matrix), inside, left)[0]
+    return solve_programme(A.T.dot(equalities.values), matrix, CholeskyFactor.of(matrix), cube)[0]

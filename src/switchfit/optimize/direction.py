@@ -26,12 +26,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, largest, measure_forces, press_on_bounds
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, largest, measure_forces
 from switchfit.optimize.arrow import Hessian
-from switchfit.optimize.composite import Equalities, Region, find_normal_step, solve_composite
-from switchfit.optimize.matrix import Box, Dense, Programme, Room
+from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
+from switchfit.optimize.matrix import Box, Dense, Programme
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
+from switchfit.optimize.qp import Room
 from switchfit.optimize.state import State
 
 FIRST_RADIUS = 1.0
@@ -87,8 +88,8 @@ def find_direction(problem: Problem, state: State, piece: Piece | None = None) -
     if best.left > max(HALF * point.violation, MET):
         # The equality constraints cannot be met while these coordinates are held, or kept to one side: they are
         # released to where the normal step takes them.
-        room = _room(problem, state, np.where(point.kink, 0, sides), piece)
-        normal = find_normal_step(point.equalities(sides), problem.region, room.offsets, np.inf)
+        room, _ = _room(problem, state, np.where(point.kink, 0, sides), piece)
+        normal = find_normal_step(point.equalities(sides), room, problem.reach, np.inf)
         sides = np.where(point.kink, np.where(normal > 0.0, 1, -1), sides)
         best, force = _solve_on_sides(problem, state, sides, piece)
     # One coordinate at a time, the one that gains most J, as long as the model falls further with it released.
@@ -116,75 +117,67 @@ def _solve_on_sides(
     """
     point, constraints = state.point, problem.constraints
     gradient, hessian = point.derivatives(sides)
-    room = _room(problem, state, sides, piece)
+    room, free = _room(problem, state, sides, piece)
     if problem.equalities:
-        return _solve_constrained(problem, state, sides, room, gradient, hessian)
-    matrix, floor = _model(problem, state, hessian, room.free)
+        return _solve_constrained(problem, state, sides, room, free)
+    matrix, floor = _model(problem, state, hessian, free)
     # Expected to be active: those with a multiplier at this point.
     pressed = constraints.normals[point.multipliers > 0.0 if point.active.size else slice(0)]
     box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
-    found = matrix.minimize_model(Programme(gradient, room, pressed, floor, box))
-    regular = found.definite and matrix is hessian and room.free is None and point.is_interior
+    found = matrix.minimize_model(Programme(gradient, room, free, pressed, floor, box))
+    regular = found.definite and matrix is hessian and free is None and point.is_interior
     slope = float(gradient.dot(found.step))
     force = -found.product
-    if found.multipliers is not None:
-        force += constraints.A.T.dot(found.multipliers[: constraints.b.size])
+    if found.pull is not None:
+        force += constraints.A.T.dot(found.pull[: constraints.b.size])
     radius = np.inf if box is None else box.radius_for(found.definite)
     reduction = -(slope + 0.5 * float(found.step.dot(found.product)))
-    return Direction(found.step, slope, reduction, regular, radius, _descends(problem, hessian, room.free)), force
+    return Direction(found.step, slope, reduction, regular, radius, _descends(problem, hessian, free)), force
 
 
 def _solve_constrained(
-    problem: Problem, state: State, sides: IntArray, room: Room, gradient: FloatArray, hessian: Hessian
+    problem: Problem, state: State, sides: IntArray, room: Room, free: BoolArray | None
 ) -> tuple[Direction, FloatArray]:
     """Do the work of `_solve_on_sides` where there are equality constraints."""
-    equalities = state.point.equalities(sides)
+    equalities, (gradient, hessian) = state.point.equalities(sides), state.point.derivatives(sides)
     radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
     full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
-    offsets = room.offsets
-    part: slice | IntArray = slice(None)
-    region = problem.region
-    if room.free is not None:
-        part = np.flatnonzero(room.free)
-        region = Region.of(problem.constraints.normals[:, part], problem.reach[part])
+    part = np.arange(gradient.size) if free is None else np.flatnonzero(free)
     own = Equalities(equalities.values, equalities.jacobian[:, part])
-    found = solve_composite(gradient[part], full[part][:, part], own, region, offsets, radius)
+    found = solve_composite(gradient[part], full[np.ix_(part, part)], own, room.of(part), problem.reach[part], radius)
     step = np.zeros(gradient.size)
     step[part] = found.step
-    pressing = np.count_nonzero(found.inequalities)
-    if pressing:
-        step = press_on_bounds(step, *room.bounds, found.inequalities)
     product = full.dot(step)
     slope = float(gradient.dot(step))
-    force = -product - equalities.jacobian.T.dot(found.multipliers)
-    if pressing:
-        force += problem.constraints.A.T.dot(found.inequalities[: problem.constraints.b.size])
+    force = problem.constraints.A.T.dot(found.forces) - product - equalities.jacobian.T.dot(found.multipliers)
     reduction = -(slope + 0.5 * float(step.dot(product)))
     left = equalities.predict(step)
-    regular = found.definite and room.free is None and state.point.is_interior and not state.careful
+    regular = found.definite and free is None and state.point.is_interior and not state.careful
     return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
 
 
-def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> Room:
-    """Return where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
+def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> tuple[Room, BoolArray | None]:
+    """Return where the step may go, inside the constraints and the piece and to the given sides of kinks.
+
+    The second result are the unknowns that may move at all, (d,) of bool; None if all may.
+    """
     point, constraints = state.point, problem.constraints
-    m, d = constraints.b.size, constraints.size
-    offsets = -point.slack
-    # Rows that hold up to rounding hold exactly in the programme: else the zero step might not be feasible.
+    room = Room.around(constraints, point.slack)
+    lower, upper = room.bounds
+    # Rows that hold up to rounding hold exactly in the programme.
     if point.active.size:
-        offsets = np.minimum(offsets, 0.0)
-        offsets[point.active[point.active < m]] = 0.0
+        room.lower[point.active[point.active < constraints.b.size]] = 0.0
     if piece is not None:
-        offsets[m : m + d] = np.minimum(piece[0] - point.theta, 0.0)
-        offsets[m + d :] = np.minimum(point.theta - piece[1], 0.0)
+        lower[:] = np.minimum(piece[0] - point.theta, 0.0)
+        upper[:] = np.maximum(piece[1] - point.theta, 0.0)
     if point.kink is None and point.idle is None and constraints.all_movable:
-        return Room(constraints, offsets, None)
+        return room, None
     free = constraints.movable if point.idle is None else constraints.movable & ~point.idle
     if point.kink is not None:
-        offsets[m : m + d][point.kink & (sides > 0)] = 0.0
-        offsets[m + d :][point.kink & (sides < 0)] = 0.0
+        lower[point.kink & (sides > 0)] = 0.0
+        upper[point.kink & (sides < 0)] = 0.0
         free = ~(point.kink & (sides == 0)) & free
-    return Room(constraints, offsets, None if free.all() else free)
+    return room, None if free.all() else free
 
 
 def _model(

@@ -49,6 +49,7 @@ from switchfit.optimize.direction import (
 )
 from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import Trial, move
+from switchfit.optimize.qp import Room
 from switchfit.optimize.state import Accepted, Finding, State, curvature_at, find_reason, measure_noise, wrong_slope
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
@@ -265,10 +266,10 @@ def is_stuck(oracle: Oracle, state: State) -> bool:
     if point.violation <= MET or state.stagnant < STAGNANT:
         return False
     equalities = point.equalities(point.reported_sides)
-    room = -np.maximum(point.slack, 0.0)
+    room = Room.around(problem.constraints, point.slack)
     radius = max(state.radius, FIRST_CONSTRAINED_RADIUS)
     # Not even the linearized constraints leave a way down: a local minimum of the violation.
-    normal = find_normal_step(equalities, problem.region, room, radius)
+    normal = find_normal_step(equalities, room, problem.reach, radius)
     return equalities.predict(normal) > FALL * point.violation
 
 
@@ -277,8 +278,8 @@ def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, rad
     problem = oracle.problem
     if sample.equalities is None:
         return None
-    room = -np.maximum(trial.slack, 0.0)
-    step = find_normal_step(sample.equalities, problem.region, room, radius)
+    room = Room.around(problem.constraints, trial.slack)
+    step = find_normal_step(sample.equalities, room, problem.reach, radius)
     moved = move(problem, trial.theta, step, scale)
     return None if moved.is_at(trial.theta) else moved
 

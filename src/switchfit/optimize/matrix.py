@@ -32,34 +32,10 @@ from switchfit.optimize.algebra import (
     jacobi_scaling,
     norm,
     positive_eigenvalues,
-    press_on_bounds,
     smallest,
     unit_rows,
 )
-from switchfit.optimize.qp import CholeskyFactor, LinearConstraints, is_definite, newton_step, satisfies, solve_whitened
-
-
-class Room(NamedTuple):
-    """Bounds on a step d from a point.
-
-    Attributes
-    ----------
-    constraints : LinearConstraints
-    offsets : array, shape (m + 2 d,)
-        Of ``N d >= offsets``, N being the normals of rows, lower and upper bounds; not positive.
-    free : array of bool, shape (d,), or None
-        Unknowns that may move at all; None if all may.
-    """
-
-    constraints: LinearConstraints
-    offsets: FloatArray
-    free: BoolArray | None
-
-    @property
-    def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bounds of the step: (d,) each."""
-        d = self.constraints.size
-        return self.offsets[-2 * d : -d], -self.offsets[-d:]
+from switchfit.optimize.qp import CholeskyFactor, Room, is_definite, newton_step, solve_programme
 
 
 class Box(NamedTuple):
@@ -82,16 +58,10 @@ class Box(NamedTuple):
         """Return the radius for a Hessian that is positive definite, or is not."""
         return self.first if self.radius == np.inf and not definite else self.radius
 
-    def narrow(self, offsets: FloatArray, definite: bool) -> FloatArray:
-        """Return the offsets of a `Room`, (m + 2 d,), with its bounds narrowed to the box."""
+    def narrow(self, room: Room, definite: bool) -> Room:
+        """Return the room narrowed to the box."""
         radius = self.radius_for(definite)
-        if radius == np.inf:
-            return offsets
-        narrowed = offsets.copy()
-        d = len(self.reach)
-        narrowed[-2 * d : -d] = np.maximum(narrowed[-2 * d : -d], -radius * self.reach)
-        narrowed[-d:] = np.maximum(narrowed[-d:], -radius * self.reach)
-        return narrowed
+        return room if radius == np.inf else room.narrow(radius * self.reach)
 
     def of(self, part: IntArray) -> Box:
         """Return the box of some of the unknowns."""
@@ -105,6 +75,8 @@ class Programme(NamedTuple):
     ----------
     gradient : array, shape (d,)
     room : Room
+    free : array of bool, shape (d,), or None
+        Unknowns that may move at all; None if all may.
     pressed : array, shape (k, d)
         Normals of the constraints expected to be active: on their face B is H wherever it can be.
     floor : array, shape (d,), or None
@@ -115,6 +87,7 @@ class Programme(NamedTuple):
 
     gradient: FloatArray
     room: Room
+    free: BoolArray | None
     pressed: FloatArray
     floor: FloatArray | None
     box: Box | None
@@ -128,15 +101,15 @@ class ModelStep(NamedTuple):
     step : array, shape (d,)
     product : array, shape (d,)
         B d, with the rows of H for unknowns that are not free.
-    multipliers : array, shape (m + 2 d,), or None
-        Of rows, lower and upper bounds; None where none of them presses.
+    pull : array, shape (m + d,), or None
+        As of `solve_programme`, without the bounds of unknowns that are not free; None where nothing presses.
     definite : bool
         Whether H was positive definite as it is on the free unknowns: B is H there.
     """
 
     step: FloatArray
     product: FloatArray
-    multipliers: FloatArray | None
+    pull: FloatArray | None
     definite: bool
 
 
@@ -269,9 +242,6 @@ def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -
     return scaling
 
 
-ACTIVE_SET_ROUNDS = 10
-"""Rounds in which the active bounds of a programme have to settle."""
-
 RAISED = 2.0
 """Multiple of the smallest eigenvalue by which an indefinite matrix is shifted inside a trust region."""
 
@@ -341,35 +311,28 @@ class Dense(SymmetricMatrix):
 
     def minimize_model(self, programme: Programme) -> ModelStep:
         """Minimize ``gᵀd + ½ dᵀBd`` inside the room, where B is H made positive definite on the free unknowns."""
-        gradient, room, pressed, floor, box = programme
-        normals = room.constraints.normals
-        if room.free is None:
-            return _minimize(self.array, normals, programme)
-        part = np.flatnonzero(room.free)
-        d, m = len(self.array), room.constraints.b.size
-        step = np.zeros(d)
+        gradient, room, free, pressed, floor, box = programme
+        if free is None:
+            return _minimize(self.array, programme)
+        part = np.flatnonzero(free)
+        step = np.zeros(len(self.array))
         if part.size == 0:
-            return ModelStep(step, np.zeros(d), None, True)
+            return ModelStep(step, step, None, True)
         # What is held is left out of the programme.
-        # Rows stay, with the columns of what is free; bounds of what is held have no meaning.
-        kept = np.concatenate([np.arange(m), m + part, m + d + part])
         own = Programme(
             gradient[part],
-            Room(room.constraints, room.offsets[kept], None),
+            room.of(part),
+            None,
             pressed[:, part],
             None if floor is None else floor[part],
             None if box is None else box.of(part),
         )
-        # `product` of what is held is with H: the force that holds it at its kink.
-        found = _minimize(self.array[np.ix_(part, part)], normals[kept][:, part], own)
+        found = _minimize(self.array[np.ix_(part, part)], own)
         step[part] = found.step
+        # The product of what is held is with H: the force that holds it at its kink.
         product = self.array[:, part] @ found.step
         product[part] = found.product
-        if found.multipliers is None:
-            return ModelStep(step, product, None, found.definite)
-        multipliers = np.zeros(m + 2 * d)
-        multipliers[kept] = found.multipliers
-        return ModelStep(step, product, multipliers, found.definite)
+        return ModelStep(step, product, found.pull, found.definite)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
@@ -403,70 +366,16 @@ def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals:
     return Spectrum(values, lowest / norm(lowest))
 
 
-def _minimize(hessian: FloatArray, normals: FloatArray, programme: Programme) -> ModelStep:
+def _minimize(hessian: FloatArray, programme: Programme) -> ModelStep:
     """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
-    gradient, room, pressed, floor, box = programme
-    offsets = room.offsets
+    gradient, room, _, pressed, floor, box = programme
     convex, factor = convexify_and_factor(hessian, pressed, floor, None if box is None else box.reach)
     if box is not None:
-        offsets = box.narrow(offsets, convex is hessian)
-    step = newton_step(gradient, convex, factor)
-    # Stages of `qp`: Newton's step, then bounds alone, then everything.
-    if satisfies(normals, step, offsets):
-        return ModelStep(step, convex.dot(step), None, convex is hessian)
-    d = gradient.size
-    if box is not None:
-        inside = solve_in_bounds(gradient, convex, step, normals, offsets)
-        if inside is not None:
-            return ModelStep(inside[0], convex.dot(inside[0]), inside[1], convex is hessian)
-    step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
-    step = press_on_bounds(step, offsets[-2 * d : -d], -offsets[-d:], multipliers)
-    return ModelStep(step, convex.dot(step), multipliers, convex is hessian)
-
-
-def solve_in_bounds(
-    gradient: FloatArray, convex: FloatArray, newton: FloatArray, normals: FloatArray, offsets: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return the step (d,) and the multipliers (m + 2 d,) of a programme in which nothing but bounds is active.
-
-    By the primal-dual active set method ([1]_): a trust region is mostly such a programme, and this takes a fifth of
-    the time of the general method. None where a row is violated, or the active bounds do not settle.
-
-    References
-    ----------
-    .. [1] M. Hintermueller, K. Ito, K. Kunisch, The primal-dual active set strategy as a semismooth Newton method, SIAM
-       J. Optim. 13 (2002) 865-888.
-    """
-    d = gradient.size
-    m = len(offsets) - 2 * d
-    low, high = offsets[m : m + d], -offsets[m + d :]
-    inside = np.minimum(np.maximum(newton, low), high)
-    at = np.sign(newton - inside)  # the bound that each unknown is at: -1, 0 for none, +1
-    # Unknowns at a bound stay there, and the free ones solve B_FF d_F = -(g_F + B_FA d_A). Then each is assigned anew:
-    # a free one that has passed a bound is put on it, one on a bound is released if the force B d + g pulls it inside.
-    for _ in range(ACTIVE_SET_ROUNDS):
-        step, free = inside, (at == 0.0).nonzero()[0]
-        if free.size:
-            rows = convex.take(free, 0)  # an index in brackets takes four times longer on a small matrix
-            _, _, step_back, singular = lapack.dgesv(rows.take(free, 1), gradient.take(free) + rows.dot(step))
-            if singular:
-                return None
-            step[free] -= step_back
-        force = convex.dot(step) + gradient
-        inside = np.minimum(np.maximum(step, low), high)
-        # What is at a bound is exactly there: it leaves it where the force pulls it away.
-        following = np.where(at * force < 0.0, at, np.sign(step - inside))
-        if following.tolist() == at.tolist():
-            break
-        at = following
-    else:
-        return None
-    if not satisfies(normals[:m], step, offsets[:m]):
-        return None
-    multipliers = np.zeros(len(offsets))
-    multipliers[m : m + d] = np.where(at < 0.0, force, 0.0)
-    multipliers[m + d :] = np.where(at > 0.0, -force, 0.0)
-    return step, multipliers
+        room = box.narrow(room, convex is hessian)
+    step, pull = newton_step(gradient, convex, factor), None
+    if not room.holds(step):
+        step, pull = solve_programme(gradient, convex, factor, room)
+    return ModelStep(step, convex.dot(step), pull, convex is hessian)
 
 
 def null_space(normals: FloatArray) -> FloatArray:

@@ -12,10 +12,6 @@ feasible direction moves it. The multipliers of the quadratic programme say when
 because others move.
 
 A side is +1 or -1 for a coordinate that moves, or may move, to the right or left, and 0 for one that is held.
-
-References
-----------
-.. [1] C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, SIAM 1995, chapter 23.
 """
 
 from __future__ import annotations
@@ -34,7 +30,7 @@ from switchfit.optimize.arrow import Arrow, Hessian
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.matrix import Curvature, Dense, mix_sides
 from switchfit.optimize.problem import Problem, Trial
-from switchfit.optimize.qp import NONE
+from switchfit.optimize.qp import NONE, find_least_distance
 
 
 def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
@@ -60,47 +56,16 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
     size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
     if size == 0.0:
         return 0.0, np.zeros(normals.shape[0])
-    # Unit rows and a gradient of size 1: the tolerances of the two projections are absolute.
+    # The steepest descent v = N' lam - g minimizes g v + v² / 2 subject to N v >= 0. At kinks, where g v is
+    # max(low v, high v), it has two parts, v = v₊ - v₋: of both being positive the cost is larger than of one.
     unit, lengths = unit_rows(normals)
-    wide = np.flatnonzero(high > low)
-    gradient, width = low / size, (high - low)[wide] / size
-    multipliers = _cone_projection(unit, gradient) if wide.size == 0 else None
-    if multipliers is None:
-        multipliers, gradient[wide] = _box_projection(unit, gradient, width, wide)
-    residual = size * float(np.linalg.norm(gradient - unit.T @ multipliers))
-    return residual, size * multipliers / lengths
-
-
-def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray | None:
-    """Return the argument of min over lam >= 0 of ‖g − Nᵀ lam‖; None where it is not found.
-
-    SciPy's nnls is fast, but from version 1.15 on its answer may be wrong for dependent rows, and its residual with it
-    (https://github.com/scipy/scipy/issues/25389), so that the answer is checked.
-    """
-    from scipy.optimize import nnls  # here, since importing it takes longer than most fits, which need none
-
-    try:
-        multipliers = np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
-    except RuntimeError:
-        return None
-    pull = unit @ (gradient - unit.T @ multipliers)
-    wrong = np.where(multipliers > 0.0, np.abs(pull), pull)
-    return multipliers if np.all(wrong <= 1e-12 * (1.0 + np.max(multipliers))) else None
-
-
-def _box_projection(
-    unit: FloatArray, low: FloatArray, width: FloatArray, wide: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the arguments of min over lam >= 0 and low <= g <= low + width of ‖g − Nᵀ lam‖: lam, and g at `wide`."""
-    from scipy.optimize import lsq_linear
-
-    k, d = unit.shape
-    # Unknowns (lam, s): g = low + s at the kinks, so that N' lam - s is to be near to low, 0 <= s <= width.
-    columns = np.zeros((d, wide.size))
-    columns[wide, np.arange(wide.size)] = -1.0
-    upper = np.concatenate([np.full(k, np.inf), width])
-    solution = lsq_linear(np.hstack([unit.T, columns]), low, bounds=(np.zeros(k + wide.size), upper), method="bvls").x
-    return np.maximum(solution[:k], 0.0), low[wide] + np.clip(solution[k:], 0.0, width)
+    low, high, slope, rows = low / size, high / size, high / size, unit
+    if (low < high).any():
+        slope, rows = np.concatenate([high, -low]), np.vstack([np.hstack([unit, -unit]), np.eye(2 * low.size)])
+    found = find_least_distance(slope, rows, np.zeros(len(rows)), np.full(len(rows), np.inf))
+    multipliers = np.zeros(len(unit)) if found is None else np.maximum(found[1][: len(unit)], 0.0)
+    pull = unit.T @ multipliers
+    return size * norm(np.clip(pull, low, high) - pull), size * multipliers / lengths
 
 
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, is_finite, largest, project_on_row
-from switchfit.optimize.composite import Region
 from switchfit.optimize.qp import LinearConstraints
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
@@ -99,11 +98,6 @@ class Problem:
             raise ValueError(
                 f"tolerance {self.tolerance} and max_iterations {self.max_iterations} must not be negative"
             )
-
-    @cached_property
-    def region(self) -> Region:
-        """The trust region of the steps with equality constraints."""
-        return Region.of(self.constraints.normals, self.reach)
 
     @cached_property
     def row_size(self) -> FloatArray:

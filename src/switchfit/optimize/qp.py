@@ -4,19 +4,17 @@ Every quadratic programme here is strictly convex with a feasible zero step,
 
     minimize  gᵀd + ½ dᵀBd   subject to   C d >= c,   c <= 0,
 
-and is solved in stages. Newton's step −B⁻¹g, if it is feasible, is the solution. Otherwise:
+and is solved in stages. Newton's step −B⁻¹g, if it is feasible, is the solution. Otherwise, with B = D L Lᵀ D (D the
+root of the diagonal) and e = Lᵀ D d, it becomes a least-distance problem,
 
-1. *whitening*: with B = D L Lᵀ D (D the root of the diagonal) and e = Lᵀ D d it becomes a least-distance problem,
-   minimize ½‖e + q‖² subject to G e >= c, with unit rows of G and ‖q‖ = 1, so that nothing has a scale any more;
-2. *identification*: the least-distance problem is a nonnegative least-squares problem (Lawson & Hanson, chapter 23);
-3. *polish*: on the active set so found the solution follows from one QR factorization and one step of refinement.
+    minimize  ½‖e + q‖²   subject to   G e >= c,   ‖q‖ = 1,
 
-If the second stage fails or its active set is not optimal, a primal active-set method started at d = 0 takes over.
+in which nothing has a scale any more, and which a dual active-set method ([1]_, daqp) solves.
 
 References
 ----------
-.. [1] C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, SIAM 1995, chapter 23.
-.. [2] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 3, 12 and 16.
+.. [1] D. Arnström, A. Bemporad, D. Axehill, A dual active-set solver for embedded quadratic programming using recursive
+   LDLᵀ updates, IEEE Trans. Autom. Control 67 (2022) 4362-4369.
 """
 
 from __future__ import annotations
@@ -26,11 +24,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.optimize import algebra, lapack
-from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, is_finite, norm, smallest
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, norm, smallest
 from switchfit.optimize.threads import one_thread
 
 NONE = np.zeros(0, dtype=np.intp)
@@ -125,6 +124,11 @@ class LinearConstraints:
         identity = np.eye(self.size)
         return np.vstack([self.A, identity, -identity])
 
+    @cached_property
+    def open(self) -> FloatArray:
+        """Upper bounds of the rows, which have none: (m,)."""
+        return np.full(self.b.size, np.inf)
+
     def exact_rows(self, index: IntArray) -> list[tuple[int, int, float]]:
         """Of the given rows of A those that can hold with equality in floating point.
 
@@ -203,32 +207,122 @@ class LinearConstraints:
         return np.asarray(algebra.is_active(slack, size, *self.sizes).nonzero()[0])
 
 
-#: Feasibility and sign tolerance of the whitened problem, whose quantities are all of order one.
-_WHITE_TOLERANCE = 1e-12
+TOLERANCES = 1e-12, 1e-10, 1e-8, 1e-6
+"""By which daqp may violate a row of length one, in turn: rows that are nearly parallel need more than others."""
+
+PARALLEL = 1e-14
+"""Square of the sine of the angle from which on daqp takes rows for independent, in the metric of the matrix.
+
+A matrix of the condition 1e12 brings rows to within 1e-6 of one another.
+"""
+
+SHORT = 0.01
+"""Part of Newton's step, in the metric of the matrix, below which a step is refined: it has the other's rounding."""
+
+SOLVED, EQUALITY = 1, 5
+"""What daqp calls a programme that it has solved, and a row that holds with equality."""
+
+
+def find_least_distance(
+    target: FloatArray, rows: FloatArray, lower: FloatArray, upper: FloatArray, equal: BoolArray | None = None
+) -> tuple[FloatArray, FloatArray] | None:
+    """Minimize ½‖e + q‖² subject to ``lower <= G e <= upper``: e and what the rows exert; None if infeasible.
+
+    Tolerances are absolute: rows are to be of the length one, and all quantities of the order 1.
+
+    Parameters
+    ----------
+    target : array, shape (n,)
+        q.
+    rows : array, shape (k, n)
+        G.
+    lower, upper : arrays, shape (k,)
+    equal : array of bool, shape (k,), optional
+        Which of these hold with equality.
+
+    Returns
+    -------
+    e, pull : arrays, shape (n,), (k,)
+        ``e + q = Gᵀ pull``, positive where a lower bound presses and negative where an upper one does.
+    """
+    sense = np.zeros(lower.size, dtype=np.int32) if equal is None else np.where(equal, EQUALITY, 0).astype(np.int32)
+    identity = np.eye(target.size)
+    for tolerance in TOLERANCES:
+        e, _, flag, found = daqp.solve(
+            identity, target, rows, upper, lower, sense, primal_tol=tolerance, sing_tol=PARALLEL
+        )
+        if flag == SOLVED:
+            return e, -found["lam"]
+    return None
 
 
 def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> FloatArray:
-    """Return the feasible point nearest to theta (d,), up to rounding.
-
-    ``min ||s||²`` subject to ``N s >= -slack`` is a nonnegative least-squares problem ([1]_, chapter 23, section 4).
-    """
+    """Return the feasible point nearest to theta (d,), up to rounding: ``min ‖s‖²`` subject to ``N s >= -slack``."""
     slack = constraints.slack(theta)
     if np.all(slack >= 0.0):
         return theta
-    from scipy.optimize import nnls  # here, since importing it takes longer than most fits, which do not need it
-
-    # Least distance by nonnegative least squares: with E = (N'; -slack') and r = E u - e_{d+1} at the best u >= 0,
-    #     s = -r_{1..d} / r_{d+1},
-    # and r = 0 if and only if the constraints contradict one another. `size` takes the unit of the slack away.
-    kept = np.isfinite(slack)
-    normals = constraints.normals[kept]
     size = float(np.max(-slack))
-    right = np.append(np.zeros(theta.size), 1.0)
-    found = nnls(np.vstack([normals.T, -slack[kept] / size]), right)[0]
-    residual = np.append(normals.T @ found, -slack[kept] @ found / size) - right
-    if not residual[-1] < 0.0:
+    rows, lengths = algebra.unit_rows(constraints.A)
+    lower = np.concatenate([constraints.lower - theta, -slack[: len(rows)] / lengths]) / size
+    upper = np.concatenate([constraints.upper - theta, np.full(len(rows), np.inf)]) / size
+    normals = np.concatenate([np.eye(theta.size), rows])
+    found = find_least_distance(np.zeros(theta.size), normals, lower, upper)
+    if found is None:
         raise ValueError("no point satisfies all the constraints")
-    return np.asarray(np.clip(theta - size * residual[:-1] / residual[-1], constraints.lower, constraints.upper))
+    return np.asarray(np.clip(theta + size * found[0], constraints.lower, constraints.upper))
+
+
+class Room(NamedTuple):
+    """Where a step d may go: ``lower <= N d <= upper``; d = 0 may.
+
+    Attributes
+    ----------
+    normals : array, shape (m + d, d)
+        Rows, and the identity.
+    lower, upper : arrays, shape (m + d,)
+    """
+
+    normals: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+    @classmethod
+    def around(cls, constraints: LinearConstraints, slack: FloatArray) -> Room:
+        """Return the room around a feasible point with the given slack (m + 2 d,)."""
+        m, d = constraints.A.shape
+        slack = np.maximum(slack, 0.0)
+        upper = np.concatenate([constraints.open, slack[m + d :]])
+        return cls(constraints.normals[: m + d], -slack[: m + d], upper)
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the step: (d,), (d,)."""
+        d = self.normals.shape[1]
+        return self.lower[-d:], self.upper[-d:]
+
+    def holds(self, step: FloatArray) -> bool:
+        """Return whether a step (d,) is inside."""
+        products = self.normals.dot(step)
+        return np.count_nonzero((self.lower <= products) & (products <= self.upper)) == products.size
+
+    def narrow(self, reach: FloatArray) -> Room:
+        """Return the part of the room in which no unknown moves by more than its `reach` (d,)."""
+        narrowed = Room(self.normals, self.lower.copy(), self.upper.copy())
+        lower, upper = narrowed.bounds
+        np.maximum(lower, -reach, out=lower)
+        np.minimum(upper, reach, out=upper)
+        return narrowed
+
+    def of(self, part: IntArray) -> Room:
+        """Return the room of some of the unknowns, the others being held."""
+        m = len(self.normals) - self.normals.shape[1]
+        kept = np.concatenate([np.arange(m), m + part])
+        return Room(self.normals[kept][:, part], self.lower[kept], self.upper[kept])
+
+    def press(self, step: FloatArray, pull: FloatArray) -> FloatArray:
+        """Return a step (d,) exactly on each of its bounds that pulls (m + d,): kinks depend on it."""
+        (lower, upper), own = self.bounds, pull[-step.size :]
+        return np.minimum(np.maximum(np.where(own > 0.0, lower, np.where(own < 0.0, upper, step)), lower), upper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,15 +366,14 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
         return QPSolution(np.zeros(gradient.size), multipliers)
     factor = CholeskyFactor.of(matrix)
     step = newton_step(gradient, matrix, factor)
-    # The unconstrained minimum, if it is feasible, is the solution: the usual case, for which nothing is whitened.
-    if satisfies(normals, step, offsets):
+    free = np.full(gradient.size, np.inf)
+    upper = np.full(offsets.size + gradient.size, np.inf)
+    room = Room(np.concatenate([normals, np.eye(gradient.size)]), np.concatenate([offsets, -free]), upper)
+    # The unconstrained minimum, if it is feasible, is the solution.
+    if room.holds(step):
         return QPSolution(step, multipliers)
-    return QPSolution(*solve_whitened(gradient, matrix, factor, normals, offsets))
-
-
-def satisfies(normals: FloatArray, step: FloatArray, offsets: FloatArray) -> bool:
-    """Return whether a step (d,) satisfies ``C d >= c``."""
-    return np.count_nonzero(normals.dot(step) >= offsets) == offsets.size
+    step, pull = solve_programme(gradient, matrix, factor, room)
+    return QPSolution(step, pull[: offsets.size])
 
 
 def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
@@ -290,35 +383,37 @@ def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
     return step
 
 
-def solve_whitened(
-    gradient: FloatArray, matrix: Any, factor: Any, normals: FloatArray, offsets: FloatArray
+def solve_programme(
+    gradient: FloatArray, matrix: FloatArray, factor: CholeskyFactor, room: Room
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the step and multipliers of a quadratic programme whose matrix has been factorized, in white variables.
+    """Minimize ``gᵀd + ½ dᵀBd`` inside a room, where that is not Newton's step.
 
-    Parameters
-    ----------
-    gradient, matrix, normals, offsets : as of `solve_qp`
-    factor : CholeskyFactor or ArrowFactor
-        Of the matrix.
+    Returns
+    -------
+    step, pull : arrays, shape (d,), (m + d,)
+        ``B d + g = Nᵀ pull``, positive where a lower bound presses and negative where an upper one does.
     """
-    # With d = length D^-1 L^-T e the objective is length^2 (||e + q||^2 / 2 + const), q = L^-1 D^-1 g / length.
+    # In white variables, d = length D⁻¹ L⁻ᵀ e, nothing has a scale any more.
     target = factor.whiten(gradient)
-    length = norm(target)  # d = length D⁻¹ L⁻ᵀ e
-    target = target / length
-    rows = factor.whiten(normals)
-    norms = np.sqrt((rows * rows).sum(1))
-    # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten, and one of zeros.
-    reached = offsets + length * rows.dot(target) >= (-1.0 - 1e-9) * length * norms
-    kept = (reached & (norms > 0.0)).nonzero()[0]
-    norms = norms[kept]
-    rows, bounds = rows[kept] / norms[:, None], offsets[kept] / (length * norms)
-    e, white_multipliers = _least_distance(target, rows, bounds)
-    # C_iᵀ mu_i = length D L G_iᵀ lam_i, so the constraints' part of the residual is exact in white variables.
-    residual = factor.whiten(gradient + matrix @ (length * factor.unwhiten(e))) / length
-    e, white_multipliers = _refine(residual, rows, bounds, e, white_multipliers)
-    multipliers = np.zeros(offsets.size)
-    multipliers[kept] = white_multipliers * length / norms
-    return length * factor.unwhiten(e), multipliers
+    length = norm(target)
+    rows, lengths = algebra.unit_rows(factor.whiten(room.normals))
+    lower, upper = room.lower / (length * lengths), room.upper / (length * lengths)
+    found = find_least_distance(target / length, rows, lower, upper)
+    if found is None:  # the zero step is feasible; a search along it ends at once
+        return np.zeros(gradient.size), np.zeros(lower.size)
+    e, pull = found
+    if norm(e) < SHORT:
+        # One step of refinement, with a residual that is computed with B itself: the same programme for the error, with
+        # what is active now.
+        active = pull != 0.0
+        missing = np.where(pull > 0.0, lower, upper) - rows.dot(e)
+        residual = factor.whiten(gradient + matrix.dot(length * factor.unwhiten(e))) / length - rows.T.dot(pull)
+        lower, upper = np.where(active, missing, -np.inf), np.where(active, missing, np.inf)
+        refined = find_least_distance(residual, rows, lower, upper, active)
+        if refined is not None:
+            e, pull = e + refined[0], np.where(active, pull + refined[1], 0.0)
+    pull = length * pull / lengths
+    return room.press(length * factor.unwhiten(e), pull), pull
 
 
 class CholeskyFactor(NamedTuple):
@@ -357,134 +452,14 @@ class CholeskyFactor(NamedTuple):
         return np.asarray(lapack.dpotrs(self.lower, vector / self.diagonal, lower=1)[0] / self.diagonal)
 
     def whiten(self, vectors: FloatArray) -> FloatArray:
-        """Return L⁻¹ D⁻¹ v for each of the rows v."""
-        return _solve_triangular(self.lower, (vectors / self.diagonal).T, lower=1).T
+        """Return L⁻¹ D⁻¹ v for a vector or each of the rows v."""
+        return np.asarray(lapack.dtrtrs(self.lower, (vectors / self.diagonal).T, lower=1)[0]).T
 
     def unwhiten(self, vector: FloatArray) -> FloatArray:
         """Return D⁻¹ L⁻ᵀ v."""
-        return _solve_triangular(self.lower, vector, lower=1, trans=1) / self.diagonal
+        return np.asarray(lapack.dtrtrs(self.lower, vector, lower=1, trans=1)[0] / self.diagonal)
 
 
 def is_definite(matrix: FloatArray) -> bool:
     """Return whether a symmetric matrix (d, d) has a Cholesky factorization."""
     return not lapack.dpotrf(matrix, lower=1)[1]
-
-
-def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, trans: int = 0) -> FloatArray:
-    """Return LAPACK's solution; `scipy.linalg.solve_triangular` takes ten times longer on a small system."""
-    solution, singular = lapack.dtrtrs(matrix, right, lower=lower, trans=trans)
-    return np.full_like(right, np.nan) if singular else np.asarray(solution)
-
-
-def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Minimize ½‖e + q‖² subject to G e >= c: e, shape (d,), and multipliers, shape (k,).
-
-    The last resort, e = 0, is feasible; a search along it ends at once.
-    """
-    if offsets.size == 0:
-        return -target, np.zeros(0)
-    for find_active in (_lawson_hanson, _primal_active_set):
-        working = find_active(target, rows, offsets)
-        polished = None if working is None else _polish(target, rows, offsets, working)
-        if polished is not None:
-            return polished
-    return np.zeros(target.size), np.zeros(offsets.size)
-
-
-def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> IntArray | None:
-    """Find the active set by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
-    from scipy.optimize import nnls
-
-    # In z = e + q: minimize ||z|| subject to G z >= c + G q. The rows with u > 0 are the active ones.
-    stacked = np.empty((target.size + 1, offsets.size))
-    stacked[:-1], stacked[-1] = rows.T, offsets + rows.dot(target)
-    goal = np.zeros(target.size + 1)
-    goal[-1] = 1.0
-    try:
-        u, _ = nnls(stacked, goal, maxiter=10 * offsets.size + 30)
-    except RuntimeError:
-        return None
-    return np.asarray((u > 0.0).nonzero()[0])
-
-
-def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Minimize ½‖e + q‖² subject to G e = c for independent rows, by e = Q R⁻ᵀ c − (I − QQᵀ) q."""
-    if offsets.size == 0:
-        return -target, np.zeros(0)
-    packed, tau, _, _ = lapack.dgeqrf(rows.T)  # `np.linalg.qr` takes five times longer on a small matrix
-    Q, R = lapack.dorgqr(packed, tau)[0], packed[: offsets.size]
-    # G' = Q R: e + q = G' lam lies in the range of Q, so that e = Q along - q with R' Q'e = c, and R lam = along.
-    along = _solve_triangular(R, offsets, trans=1) + Q.T.dot(target)
-    return Q.dot(along) - target, _solve_triangular(R, along)
-
-
-def _select_independent(rows: FloatArray, working: IntArray) -> IntArray:
-    """Return a maximal linearly independent part of the working set (unit rows)."""
-    if working.size <= 1:
-        return working
-    R, order, *_ = lapack.dgeqp3(rows[working].T)
-    rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
-    return np.sort(working[order[:rank] - 1])
-
-
-def _polish(
-    target: FloatArray, rows: FloatArray, offsets: FloatArray, working: IntArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return the solution on the working set if it is primal and dual feasible, otherwise None."""
-    # The stages before are asked for the active set alone: one QR factorization on that set gives the numbers, or shows
-    # that the set was wrong.
-    working = _select_independent(rows, working)
-    e, active_multipliers = _equality_solution(target, rows[working], offsets[working])
-    size = max(1.0, float(np.max(np.abs(active_multipliers), initial=0.0)))
-    wrong = np.count_nonzero(active_multipliers < -_WHITE_TOLERANCE * size)
-    if wrong or not satisfies(rows, e, offsets - _WHITE_TOLERANCE) or not is_finite(e):
-        return None
-    multipliers = np.zeros(offsets.size)
-    multipliers[working] = np.maximum(active_multipliers, 0.0)
-    return e, multipliers
-
-
-def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> IntArray | None:
-    """Find the optimal working set by the primal active-set method ([2]_, algorithm 16.3), with Bland's rule."""
-    e = np.zeros(target.size)
-    working: list[int] = []
-    for _ in range(50 + 20 * offsets.size):
-        chosen = np.array(working, dtype=np.intp)
-        # p lies in the null space of the working rows, which hold with equality at e.
-        p, multipliers = _equality_solution(e + target, rows[chosen], np.zeros(chosen.size))
-        if np.linalg.norm(p) <= 1e-13:
-            wrong = np.flatnonzero(multipliers < -1e-13 * max(1.0, float(np.max(np.abs(multipliers), initial=0.0))))
-            if wrong.size == 0:
-                return chosen
-            working.remove(int(chosen[wrong].min()))
-            continue
-        # As far along p as the first row that it approaches allows; of several, the lowest one joins (Bland: no
-        # cycles).
-        slope = rows @ p
-        approaching = slope < -1e-14
-        approaching[chosen] = False
-        lengths = np.full(offsets.size, np.inf)
-        gap = np.maximum(rows @ e - offsets, 0.0)
-        lengths[approaching] = gap[approaching] / -slope[approaching]
-        length = min(1.0, float(lengths.min()))
-        e = e + length * p
-        if length < 1.0:
-            working.append(int(np.flatnonzero(lengths <= length)[0]))
-    return None
-
-
-def _refine(
-    residual: FloatArray, rows: FloatArray, offsets: FloatArray, e: FloatArray, multipliers: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Do one step of iterative refinement: the residual is computed with B itself, not with its factor."""
-    working = (multipliers > 0.0).nonzero()[0]
-    active = rows[working]
-    residual = residual - active.T.dot(multipliers[working])
-    # The same programme for the error: residual for gradient, and what the active rows still miss for offsets.
-    correction, change = _equality_solution(residual, active, offsets[working] - active.dot(e))
-    changed = multipliers[working] + change
-    if not norm(correction) <= 1e-4 * norm(e) + 1e-12 or np.count_nonzero(changed < 0.0):
-        return e, multipliers
-    refined = multipliers.copy()
-    refined[working] = changed
-    return e + correction, refined

@@ -682,7 +682,10 @@ def _solve_on_sides(
         length = jnp.maximum(jnp.max(jnp.where(allowed, jnp.abs(gap), 0.0)), jnp.finfo(float).tiny)
         multipliers = nonnegative_minimum(unit @ unit.T, jnp.where(allowed, gap / length, 0.0), allowed)
         back = jax.scipy.linalg.solve_triangular(factor, length * multipliers @ unit, lower=True, trans=1)
-        return algebra.press_on_bounds(newton + back / scaling, low, high, multipliers, jnp)
+        # Exactly on each bound that has a multiplier: kinks depend on it.
+        at_low, at_high = jnp.split(multipliers[-2 * theta.size :] > 0.0, 2)
+        step = jnp.where(at_low, low, jnp.where(at_high, high, newton + back / scaling))
+        return jnp.clip(step, low, high)
 
     feasible = jnp.all(constraints.normals @ newton >= offsets)
     step = lax.cond(feasible, lambda: newton, solve_constrained)
