@@ -45,7 +45,6 @@ from switchfit.discretization.rows import (
     EXPLICIT_ERROR,
     STIFF,
     STIFF_BEND,
-    Judged,
     Tableau,
     combine,
     cost_of_row,
@@ -221,7 +220,7 @@ class Kernels:
             after = x + combine(tableau.b, k)
         else:
             found = explicit_rows.stages(tableau, field, start, end, x)
-            after = explicit_rows.end_of_row(tableau, h, x, found.slopes)
+            after = x + h * combine(tableau.b, found.slopes)
         stores, factors = store_all("x_after", 0, after), None
         if self.order > Order.COST:
             at_points = found.states
@@ -297,8 +296,9 @@ class Kernels:
         ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
         # The mean of the derivatives at both ends times the change of (t, X) is how f would change if it were smooth.
         f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
-        row = Judged(first, middle, last, bend, times[1] - times[0], states[-1] - states[0], f_t, f_x)
-        self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * measure_jump(h, row, Namespace(graph)))
+        smooth = 0.5 * h * (times_vector(f_x, states[-1] - states[0]) + f_t * (times[1] - times[0]))
+        jump = measure_jump(first, middle, last, bend, smooth, Namespace(graph))
+        self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * jump)
 
     def _load_row(self, graph: Graph, tableau: Tableau) -> tuple[Objects, Node, list[Objects], list[Objects]]:
         """Return the state at the start of a row, its length, the states at its stages, those of `invert_stages`."""
