@@ -105,9 +105,7 @@ IN_ROWS: dict[str, Replacements] = {
     "h' in the tangents of the stages": [
         ("X_d = X_d if h_d is None else X_d + h_d * combine(tableau.a[j], slopes)", "X_d = X_d")
     ],
-    "h' in the tangent behind a row": [
-        ("after if h_d is None else after + h_d * combine(tableau.b, slopes)", "after")
-    ],
+    "h' in the tangent behind a row": [("after if h_d is None else after + h_d * combine(tableau.b, slopes)", "after")],
     "D_1 f in the tangents": [("times_vector(f_x[j], X_d) + forcing[j]", "times_vector(f_x[j], x_d) + forcing[j]")],
     "later stages in the adjoint": [("(b[j] * psi + later)", "(b[j] * psi)")],
     "a transposed in the adjoint": [("[a[m][j] for m in range(j + 1, s)]", "[a[m][m - 1] for m in range(j + 1, s)]")],

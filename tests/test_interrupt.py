@@ -94,14 +94,11 @@ def test_evaluations_row_by_row_are_the_same_bit_by_bit(row_by_row):
 
     def found(tau):
         given = np.asarray(tau, float), np.asarray(P0, float)
-        orders = [
-            native_experiment(this.structure, arguments, nodes, order)
-            for order in (Order.COST, Order.GRADIENT, Order.HESSIAN)
-        ]
-        simulated = orders[2].simulate(*given)
-        seen = orders[2].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
-        first, second = orders[1](*given, 1.0), orders[2](*given, -1.0)
-        values = [value for one in (first, second) for value in (one.cost, one.gradient, one.hessian)]
+        orders = [native_experiment(this.structure, arguments, nodes, order) for order in (Order.COST, Order.HESSIAN)]
+        simulated = orders[1].simulate(*given)
+        seen = orders[1].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
+        sides = orders[1](*given, 1.0), orders[1](*given, -1.0)
+        values = [value for one in sides for value in (one.cost, one.gradient, one.hessian)]
         return [orders[0].cost(*given), *values, *simulated[:-1], *seen]
 
     times = [0.413, 0.791, 1.336], NODES[[4, 4, 13]]

@@ -247,7 +247,7 @@ class NativeExperiment:
     def __call__(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None
     ) -> Evaluation[FloatArray] | None:
-        """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
+        """Return J, its gradient (D,) and its Hessian (D, D).
 
         With multipliers (m,) the constraints too, and the Hessian of ``J + multipliers . c``.
         """
@@ -257,8 +257,7 @@ class NativeExperiment:
                 return None
             g, H = self._read_derivatives()
             if multipliers is None:
-                hessian = H if self.order >= Order.HESSIAN else np.full(H.shape, np.nan)
-                return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
+                return Evaluation(self._J.item(0), g, H, row_errors=self._read_errors())
             where = self._constraint_rows
             # The backward sweep has lam . c in it like a cost: g is that of the Lagrangian, and that of J is g - A'
             # lam.
@@ -271,7 +270,7 @@ class NativeExperiment:
 
     def _read_errors(self) -> tuple[float, ...]:
         """Return the largest error of a row of the evaluation, relative to the states of the first on this mesh."""
-        if self._judged < 0 or self.order < Order.HESSIAN:
+        if self._judged < 0:
             return ()
         if self._size_of_states is None:
             states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
@@ -379,7 +378,7 @@ class NativeExperiment:
                 return self._spread(values) if len(shape) > 1 else np.array(values)
 
             behind = N if self.structure.library.reset_maps else 0
-            rows = cells + N if self.order >= Order.HESSIAN else 0
+            rows = cells + N if self.order > Order.COST else 0
             return Simulated(
                 self._J.item(0),
                 first_cell,

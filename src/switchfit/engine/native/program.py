@@ -297,7 +297,7 @@ _one_at_a_time = threading.Lock()
 
 log = logging.getLogger("switchfit")
 
-PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
+PREFIX = {Order.COST: "plain_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
 """Prefix of the names of functions, by the order of their derivatives."""
 
 
@@ -390,9 +390,8 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
         loops.append(write_costs)
     else:
         loops += [partial(write_backward_rows, curvatures=curvatures), write_backward]
-    if order != Order.GRADIENT:
-        kernels.outputs()
-        module.add(write_loop(writer, "outputs"))
+    kernels.outputs()
+    module.add(write_loop(writer, "outputs"))
     if order == Order.HESSIAN:
         loops.append(write_handler)
     for write in loops:
@@ -424,9 +423,9 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kernels.length()
     if order > Order.COST and late and mode == 0:
         kernels.end_of_late()
-    if order >= Order.HESSIAN:
+    if order > Order.COST:
         kernels.judge_row(mode, stage, tableau)
-    if order == Order.COST:
+    else:
         write_slope(kernels, mode, stage)
         module.add(write_loop(writer, f"slope_{mode}"))
         write_step(kernels, mode, stage)

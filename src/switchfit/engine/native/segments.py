@@ -138,7 +138,7 @@ def write_forward_rows(writer: Writer) -> str:
             if writer.library.implicit[k]:
                 solve_stages(writer, f"newton_{k}", given)
             writer.call(f"forward_{kind}_{k}", given)
-        for level, name in enumerate(("error", "jump") if writer.order >= Order.HESSIAN else ()):
+        for level, name in enumerate(("error", "jump") if writer.order > Order.COST else ()):
             for k in writer.cases((flag > level).choose(mode, -1), modes):
                 writer.call(f"{name}_{k}", given)
     return writer.end()

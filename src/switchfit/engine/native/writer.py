@@ -85,21 +85,21 @@ def sums(library: Structure, sizes: Sizes) -> dict[str, int]:
 def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
     """Return the sizes of the parts of the scratch space."""
     n, N, width = sizes.n, sizes.N, sizes.width
-    second, first = int(order >= Order.HESSIAN), int(order >= Order.GRADIENT)
+    derivatives = int(order > Order.COST)
     resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
     implicit = int(any(library.implicit))
     late = int(any(sensor.delay is not None for sensor in library.measurements))
     return {
         "states": Length(n, n),
         "reset_states": Length(N * n * resets),
-        "tangents": Length(n * width, n * width * second),
+        "tangents": Length(n * width, n * width * derivatives),
         "reset_tangents": Length(N * n * width * resets),
-        "stages": Length(0, STAGES * n * first),
-        "stage_tangents": Length(0, STAGES * n * width * second),
-        "kept": Length(0, count_kept(library, n, order) * first),
-        "jumps": Length(n, n * first * jumps),
-        "late": Length(0, n * first * late),
-        "costates": Length(0, n * first),
+        "stages": Length(0, STAGES * n * derivatives),
+        "stage_tangents": Length(0, STAGES * n * width * derivatives),
+        "kept": Length(0, count_kept(library, n, order) * derivatives),
+        "jumps": Length(n, n * derivatives * jumps),
+        "late": Length(0, n * derivatives * late),
+        "costates": Length(0, n * derivatives),
         "increments": Length(len(STIFF.b) * n * implicit),
         "newton": Length(2 * implicit),
         "entries": Length(STAGES * (1 + n + sizes.M) ** 2),
