@@ -96,7 +96,7 @@ def test_evaluations_row_by_row_are_the_same_bit_by_bit(row_by_row):
         given = np.asarray(tau, float), np.asarray(P0, float)
         orders = [native_experiment(this.structure, arguments, nodes, order) for order in (Order.COST, Order.HESSIAN)]
         simulated = orders[1].simulate(*given)
-        seen = orders[1].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
+        seen = orders[1].outputs(simulated.times[1:], simulated.after, given[1], simulated.after_d)
         sides = orders[1](*given, 1.0), orders[1](*given, -1.0)
         values = [value for one in sides for value in (one.cost, one.gradient, one.hessian)]
         return [orders[0].cost(*given), *values, *simulated[:-1], *seen]
@@ -126,17 +126,17 @@ def test_an_evaluation_that_was_interrupted_leaves_nothing_behind(row_by_row):
     theta = evaluator.problem.initial_theta
     expected = evaluator(theta)
     native = evaluator.engines[0].at(Order.HESSIAN)
-    whole, calls = native._evaluate, []
+    whole, calls = native._call_evaluate, []
 
     def interrupted(*given):
         calls.append(whole(*given))
         if len(calls) == 7:
             raise KeyboardInterrupt
 
-    native._evaluate = interrupted
+    native._call_evaluate = interrupted
     with pytest.raises(KeyboardInterrupt):
         evaluator(theta + 0.01)
-    native._evaluate = whole
+    native._call_evaluate = whole
     again = evaluator(theta)
     assert again.cost == expected.cost
     np.testing.assert_array_equal(again.hessian, expected.hessian)
