@@ -8,7 +8,6 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import cache
 from typing import Any, TypeVar
 
@@ -168,10 +167,10 @@ class NativeEngine:
     def _try(self, order: Order, use: Callable[[NativeExperiment], Found], fall_back: Callable[[], Found]) -> Found:
         """Return what one function finds in machine code of an order, or what another finds by JAX."""
         native = self.at(order)
-        if native is not None:
-            with suppress(FailedCheckError):
-                return use(native)
-        return fall_back()
+        try:
+            return fall_back() if native is None else use(native)
+        except FailedCheckError:
+            return fall_back()
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""

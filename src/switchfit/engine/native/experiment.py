@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Samples
 from switchfit.discretization.model import AT_TRANSITIONS, list_constrained_transitions, read_parameters
-from switchfit.engine.native.llvm import BUDGET, Program
+from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
@@ -104,6 +104,9 @@ def _find_own_directions(
     return found
 
 
+LONG = 200_000_000
+"""Work of an evaluation, in additions, from which Ctrl-C is handled in the meantime: 20 to 100 ms."""
+
 OF_LATE = ("time", "cell", "segment")
 """What is read and written of late samples when their delay changes."""
 
@@ -176,7 +179,7 @@ class NativeExperiment:
         self._inner_nodes, self._cells = times[1:-1], cells
         self._channels = sum(channels for _, channels in structure.outputs)
         self._counts = [count_samples(samples) for samples in arguments.samples]
-        self._call_evaluate = self._find("evaluate", 2 + len(self._counts))
+        self._function = self._find("evaluate", 1 + len(self._counts))
         if order not in program.layouts:
             program.layouts[order] = Layout.of(structure.library, sizes, order)
         layout: Layout = program.layouts[order]
@@ -220,8 +223,7 @@ class NativeExperiment:
         ]
         self._size_of_states: FloatArray | None = None
         self._judged = -1
-        self._progress = (ctypes.c_int64 * 3)()
-        self._progress_address = ctypes.addressof(self._progress)
+        self._work = (cells + N) * max(1, *program.row_work)
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
         self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
@@ -330,20 +332,20 @@ class NativeExperiment:
         # side +1.
         first_cell[:, 1:-1] = self._inner_nodes.searchsorted(times, "right")
         first_cell[:, -1] = self._cells - 1
-        places, found, done = np.ascontiguousarray(places), np.empty((B, 2)), np.zeros(1, dtype=np.int64)
-        function = self._find("all_costs", 7 + len(self._counts))
+        places, found = np.ascontiguousarray(places), np.empty((B, 2))
+        function = self._find("all_costs", 6 + len(self._counts))
         # The loop in machine code writes each schedule over the arrays of this one, which are restored at the end.
         kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
         with self._workspace.lock:
+            self._workspace.finish()
             self._own_p[:] = p
             self._workspace.reserve(self._size)
             if self._memory is not self._workspace.memory:
                 self._bind()
-            before = 0
-            while before < B:  # Ctrl-C is handled after each call
+            at_once = max(1, LONG // self._work)
+            for before in range(0, B, at_once):  # Ctrl-C is handled after each call
                 given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
-                function(self._address, get_address(done), B - before, *given, *self._counts)
-                before += int(done[0])
+                function(self._address, min(at_once, B - before), *given, *self._counts)
             self._named["bounds"][:], self._named["first_cell"][:] = kept
             self._write_places()
         # An infinite J with a failed check stays infinite: both refuse the schedule.
@@ -454,8 +456,7 @@ class NativeExperiment:
         """Take up to `most` adaptive steps from `state` and y, which are updated; return the accepted times (L,) and
         states (L, n).
 
-        y is NaN if a finiteness check failed. If the budget is spent, it returns early, possibly without a step: call
-        it again.
+        y is NaN if a finiteness check failed.
 
         Parameters
         ----------
@@ -493,6 +494,7 @@ class NativeExperiment:
 
     def _evaluate(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
         """Evaluate J and, of a program with derivatives, those of ``J + multipliers . c``."""
+        self._workspace.finish()
         self._tau[:] = tau
         self._own_p[:] = p
         self._find_first_cells(tau, side)
@@ -507,22 +509,20 @@ class NativeExperiment:
             part.fill(0.0)
         if self._late:
             self._find_late_cells(p)
-        self._multipliers.fill(0.0)
         if multipliers is not None:
             self._multipliers[self._constraint_rows] = multipliers
-        self._call_in_pieces()
+        try:
+            if self._work > LONG:
+                self._workspace.call(lambda: self._function(self._address, *self._counts))
+            else:
+                self._function(self._address, *self._counts)
+        finally:
+            if multipliers is not None:
+                self._multipliers[:] = 0.0
         check = self._check.item(0)
         # If the cost is not finite, it is returned without fallback: the caller rejects the point anyway.
         if check != check and math.isfinite(self._J.item(0)):
             raise FailedCheckError
-
-    def _call_in_pieces(self) -> None:
-        """Evaluate, in calls that return when the budget is spent; Ctrl-C is handled after each."""
-        progress = self._progress
-        progress[0] = progress[1] = 0
-        while progress[0] >= 0:
-            progress[2] = BUDGET
-            self._call_evaluate(self._address, self._progress_address, *self._counts)
 
     def _bind(self) -> None:
         """Store the addresses of another workspace in the table."""

@@ -1,4 +1,4 @@
-"""Emit LLVM IR of a library: the table of pointers, calls of functions, loops that return when a budget is spent.
+"""Emit LLVM IR of a library: the table of pointers, and calls of functions.
 
 Layout of the memory that machine code reads and writes, shared by calls from Python and from XLA.
 
@@ -9,7 +9,6 @@ each Measurements what `OF_SAMPLES` lists. Sizes count doubles; those of the scr
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 
 from switchfit.discretization.model import AT_TRANSITIONS
@@ -144,8 +143,6 @@ def pointers(library: Structure, sizes: Sizes, order: Order) -> tuple[str, ...]:
 Pointers = dict[str, Value]
 """Addresses by the names of the pointers of straight-line functions."""
 
-WHOLE = "ptr %table, i64 %segment, ptr %progress"
-
 
 class Writer(Lines):
     """Emits the functions of a library, one at a time.
@@ -157,8 +154,6 @@ class Writer(Lines):
         Names of the pointers in the table.
     rows : dict
         First row of each kind of constraints, see `constraint_rows`.
-    work : int
-        Work of the functions that were called in the current iteration, in additions.
     """
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
@@ -166,7 +161,6 @@ class Writer(Lines):
         self.library, self.sizes, self.order, self.kernels, self.module = library, sizes, order, kernels, module
         self.names = pointers(library, sizes, order)
         self.rows = constraint_rows(library, sizes)
-        self.work = 0
 
     def pointers(self) -> Pointers:
         """Load all pointers of the table."""
@@ -184,41 +178,17 @@ class Writer(Lines):
     def call(self, name: str, given: Pointers) -> None:
         """Emit the call of a straight-line function with its pointers."""
         self.invoke(name, *(given[key] for key in self.module.pointers[name]))
-        self.work += self.module.work(name)
 
     def cases(self, which: Value, count: int) -> Iterator[int]:
         """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
-        before, most, name = self.work, self.work, self.name_block()
+        name = self.name_block()
         cases = " ".join(f"i64 {k}, label %{name}_{k}" for k in range(count))
         self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
         for k in range(count):
             self.label(f"{name}_{k}")
-            self.work = before
             yield k
-            most = max(most, self.work)
             self.go_to(f"{name}_end")
         self.label(f"{name}_end")
-        self.work = most
-
-    @contextmanager
-    def turns(self, count: Value) -> Iterator[Value]:
-        """Emit the loop of a function, which begins where the last call left off and returns when the budget is spent.
-
-        The body is what is emitted inside; the value is its counter, which ends at `count`. `progress` has the number
-        of finished iterations and the rest of the budget.
-        """
-        finished, budget = self.at("%progress", 1), self.at("%progress", 2)
-        self.work = 0
-        with self.repeat() as leave:
-            turn = self.load("i64", finished)
-            yield turn
-            turns, left = turn + 1, self.load("i64", budget) - self.work
-            self.store(turns, finished)
-            self.store(left, budget)
-            done = turns >= count
-            leave(done | (left <= 0))
-        self.store(done.choose(0, turns), finished)
-        self.line(f"ret i1 {done}")
 
     def zero(self, pointer: Value, count: Operand) -> None:
         """Write zeros to `count` doubles."""
