@@ -182,14 +182,24 @@ class Stages(NamedTuple):
     slopes: Any
 
 
-def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array) -> Stages:
-    """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field."""
+def stages(
+    tableau: Tableau,
+    f: Callable[[Array, Array], Array],
+    start: Array,
+    end: Array,
+    x: Array,
+    increments: Sequence[Array] = (),
+) -> Stages:
+    """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field.
+
+    Those of an implicit row follow from its increments (s arrays (n,)), with f at them for the slopes.
+    """
     h = end - start
     found = Stages([], [], [])
     for row, c in zip(tableau.a, tableau.c.tolist(), strict=True):
         found.times.append(start + c * h)
-        # X_j from the slopes before it: a is strictly lower triangular.
-        found.states.append(x + h * combine(row, found.slopes))
+        # X_j of an explicit row from the slopes before it: a is strictly lower triangular.
+        found.states.append(x + (combine(row, increments) if increments else h * combine(row, found.slopes)))
         found.slopes.append(f(found.times[-1], found.states[-1]))
     return found
 

@@ -27,7 +27,7 @@ from switchfit.engine.native.experiment import (
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import program_of
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.writer import GIVEN, constraint_rows, memory, sums
+from switchfit.engine.native.writer import GIVEN, layout_of
 from switchfit.engine.protocol import (
     Costates,
     Engine,
@@ -100,7 +100,7 @@ def foreign_derivatives(
     passed = count_passed(nodes, tau, side)
     begins = jnp.clip(passed - 1, 0, real_cells - 1)
     units, own, there = find_directions(sizes, jumps, jnp)
-    count = max(constraint_rows(library, sizes)["count"], 1)
+    layout = layout_of(library, sizes, Order.HESSIAN)
     given: dict[str, Any] = {
         "nodes": nodes,
         "signals": arguments.signals,
@@ -108,15 +108,15 @@ def foreign_derivatives(
         "p": jnp.append(p, 0.0),
         "bounds": jnp.concatenate([nodes[:1], tau, jnp.repeat(nodes[-1:], idle + 1)]),
         "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(idle + 1, cells - 1)]),
-        "multipliers": np.zeros(count),
+        "multipliers": np.zeros(max(layout.constraint_rows["count"], 1)),
         "units": units,
     }
     given |= places
     buffers = [given[key] for key in GIVEN]
     for samples in arguments.samples:
         buffers += [*samples, np.zeros(1, dtype=np.int64)]
-    lengths = sums(library, sizes)
-    of_memory = sum(length.at(cells + N) for length in memory(library, sizes, Order.HESSIAN).values())
+    lengths = layout.sums
+    of_memory = sum(length.at(cells + N) for length in layout.memory.values())
     results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
     totals = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")(*buffers)[0]
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))

@@ -17,7 +17,7 @@ from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.writer import GIVEN, WHOLE_NUMBERS, ZEROED, Layout
+from switchfit.engine.native.writer import GIVEN, WHOLE_NUMBERS, ZEROED, layout_of
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -180,9 +180,7 @@ class NativeExperiment:
         self._channels = sum(channels for _, channels in structure.outputs)
         self._counts = [count_samples(samples) for samples in arguments.samples]
         self._function = self._find("evaluate", 1 + len(self._counts))
-        if order not in program.layouts:
-            program.layouts[order] = Layout.of(structure.library, sizes, order)
-        layout: Layout = program.layouts[order]
+        layout = layout_of(structure.library, sizes, order)
         self._rows = layout.constraint_rows
         self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
         self._size = sum(self._lengths.values())

@@ -213,14 +213,9 @@ class Kernels:
             return at_stages[-1][0]
 
         # The increments k_j = h K_j were found by the loop of `segments.write_newton` before; here they are inputs.
-        k: list[Objects] = []
-        if tableau.coupled:
-            k = self.load_increments(graph)
-            found = implicit_rows.stages_from(tableau, field, start, end, x, k)
-            after = x + combine(tableau.b, k)
-        else:
-            found = explicit_rows.stages(tableau, field, start, end, x)
-            after = x + h * combine(tableau.b, found.slopes)
+        k = self.load_increments(graph) if tableau.coupled else []
+        found = explicit_rows.stages(tableau, field, start, end, x, k)
+        after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         stores, factors = store_all("x_after", 0, after), None
         if self.order > Order.COST:
             at_points = found.states

@@ -647,8 +647,6 @@ class Program:
     key : str
         Hash of the module, the same in every process.
     workspace : Workspace
-    layouts : dict
-        Layout of the memory that each order of derivatives works on, built by its first experiment.
     row_work : list of int
         Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
     pointers : dict
@@ -658,7 +656,6 @@ class Program:
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
         self.workspace = Workspace()
-        self.layouts: dict[int, Any] = {}
         self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
         self._functions: dict[str, Any] = {}

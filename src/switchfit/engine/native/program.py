@@ -43,7 +43,7 @@ from switchfit.engine.native.segments import (
 )
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, list_place_lengths, memory, sums
+from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, list_place_lengths
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
@@ -100,14 +100,14 @@ def write_handler(writer: Writer) -> str:
     with writer.loop(0, repeats) as which:
         found = {name: writer.at(data[name], which, strides[name]) for name in names}
         rows = writer.get("i64", found["first_cell"], sizes.N + 1) + (sizes.N + 1)
-        parts = sums(library, sizes)
+        parts = writer.layout.sums
         own_totals, position = writer.at(totals, which, sum(parts.values())), 0
         for name, length in parts.items():
             found[name] = writer.at(own_totals, position)
             position += length
         writer.zero(own_totals, position)
         place: Operand = 0
-        for name, extent in memory(library, sizes, writer.order).items():
+        for name, extent in writer.layout.memory.items():
             found[name], count = writer.at(between, place), rows * extent.each_row + extent.fixed
             if name in ZEROED:
                 writer.zero(found[name], count)
@@ -145,7 +145,9 @@ def _call_end(writer: Writer, found: Pointers) -> None:
     N, library = writer.sizes.N, writer.library
     last = state_pointers(writer, found, writer.get("i64", found["first_cell"], N + 1) + (N + 1))
     # No row follows the end: what the terminal terms add to the costate goes to psi itself.
-    given = found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.rows["end"])
+    given = (
+        found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
+    )
     for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
         writer.call(name, given)
 
@@ -169,10 +171,10 @@ def write_costs(writer: Writer) -> str:
             place = writer.at(place, length)
         for name, source in (("bounds", bounds), ("first_cell", first_cell)):
             writer.copy(pointers[name], writer.at(source, which, N + 2), N + 2)
-        parts = sums(writer.library, writer.sizes)
+        parts = writer.layout.sums
         # The sums are one block of memory, so that one call clears all of them.
         writer.zero(pointers[next(iter(parts))], sum(parts.values()))
-        for name, extent in memory(writer.library, writer.sizes, writer.order).items():
+        for name, extent in writer.layout.memory.items():
             if name in ZEROED and extent.fixed:
                 writer.zero(pointers[name], extent.fixed)
         writer.invoke("evaluate", table, *counts)
@@ -319,7 +321,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     With derivatives, the work of a row of each mode is stored in `row_work`.
     """
     kernels = Kernels(library, sizes, order, module)
-    writer = Writer(library, sizes, order, kernels, module)
+    writer = Writer(library, sizes, order, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     curvatures = []
     for mode in range(len(library.modes)):

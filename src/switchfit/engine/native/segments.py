@@ -207,7 +207,7 @@ def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, 
     for kind in AT_TRANSITIONS:
         count = len(getattr(writer.library, kind.name))
         if kind.constraint and count:
-            given |= constraint_pointers(writer, found, segment + writer.rows[kind.name])
+            given |= constraint_pointers(writer, found, segment + writer.layout.constraint_rows[kind.name])
         for k in writer.cases(writer.get("i64", found[kind.name], segment), count):
             writer.call(f"{kind.name}_{k}", given)
 

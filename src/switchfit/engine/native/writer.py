@@ -9,11 +9,12 @@ each Measurements what `OF_SAMPLES` lists. Sizes count doubles; those of the scr
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.discretization.rows import STIFF
-from switchfit.engine.native.kernels import STAGES, Kernels, count_kept, has_jumps
+from switchfit.engine.native.kernels import STAGES, count_kept, has_jumps
 from switchfit.engine.native.llvm import Lines, Module, Operand, Value
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes
@@ -115,29 +116,27 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
     }
 
 
-class Layout(NamedTuple):
-    """What `constraint_rows`, `sums` and `memory` return for one program and order, and the names in its table."""
-
-    constraint_rows: dict[str, int]
-    sums: dict[str, int]
-    memory: dict[str, Length]
-    pointers: tuple[str, ...]
-
-    @classmethod
-    def of(cls, library: Structure, sizes: Sizes, order: Order) -> Layout:
-        """Build the layout of a program's order."""
-        of_samples = [f"{name} {k}" for k in range(len(library.measurements)) for name in OF_SAMPLES]
-        names = (*pointers(library, sizes, order), *of_samples)
-        return cls(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order), names)
-
-
 ZEROED = ("jumps", "late")
 """Parts of the scratch space that start at zero."""
 
 
-def pointers(library: Structure, sizes: Sizes, order: Order) -> tuple[str, ...]:
-    """Return the names of the pointers in the table, except those of the samples."""
-    return (*GIVEN, *sums(library, sizes), *memory(library, sizes, order))
+class Layout(NamedTuple):
+    """What `constraint_rows`, `sums` and `memory` return for one program and order."""
+
+    constraint_rows: dict[str, int]
+    sums: dict[str, int]
+    memory: dict[str, Length]
+
+    @property
+    def pointers(self) -> tuple[str, ...]:
+        """The names in its table, except those of the samples."""
+        return (*GIVEN, *self.sums, *self.memory)
+
+
+@lru_cache(maxsize=64)
+def layout_of(library: Structure, sizes: Sizes, order: Order) -> Layout:
+    """Return the layout of the memory of a program."""
+    return Layout(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order))
 
 
 Pointers = dict[str, Value]
@@ -149,18 +148,17 @@ class Writer(Lines):
 
     Attributes
     ----------
-    library, sizes, order, kernels, module : as given
-    names : list of str
+    library, sizes, order, module : as given
+    layout : Layout
+    names : tuple of str
         Names of the pointers in the table.
-    rows : dict
-        First row of each kind of constraints, see `constraint_rows`.
     """
 
-    def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
+    def __init__(self, library: Structure, sizes: Sizes, order: Order, module: Module) -> None:
         super().__init__()
-        self.library, self.sizes, self.order, self.kernels, self.module = library, sizes, order, kernels, module
-        self.names = pointers(library, sizes, order)
-        self.rows = constraint_rows(library, sizes)
+        self.library, self.sizes, self.order, self.module = library, sizes, order, module
+        self.layout = layout_of(library, sizes, order)
+        self.names = self.layout.pointers
 
     def pointers(self) -> Pointers:
         """Load all pointers of the table."""
