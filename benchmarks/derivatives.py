@@ -16,6 +16,7 @@ from benchmarks import vehicle
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
 from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 
 COARSE = 58
@@ -114,7 +115,7 @@ def gap(ours: Any, J: float, g: np.ndarray, H: np.ndarray) -> float:
 def machine_code(evaluator: Evaluator, theta: np.ndarray) -> Any:
     """What `Evaluator.__call__` calls, without what Python does before and after."""
     structure, arguments = evaluator.problem.structures[0], evaluator.arguments[0]
-    native = native_experiment(structure, arguments, evaluator.meshes[0].times, 2)
+    native = native_experiment(structure, arguments, evaluator.meshes[0].times, Order.HESSIAN)
     if native is None:
         raise RuntimeError("the problem has no machine code")
     tau, p = evaluator.problem.vectors(theta, 0)

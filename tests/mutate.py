@@ -103,18 +103,16 @@ IN_PAPER: dict[str, Replacements] = {
 
 IN_ROWS: dict[str, Replacements] = {
     "h' in the tangents of the stages": [
-        ("X_d = X_d if h_d is None else _plus(X_d, h_d, combine(tableau.a[j], slopes))", "X_d = X_d")
+        ("X_d = X_d if h_d is None else X_d + h_d * combine(tableau.a[j], slopes)", "X_d = X_d")
     ],
-    "h' in the tangent behind a row": [
-        ("after if h_d is None else _plus(after, h_d, combine(tableau.b, slopes))", "after")
-    ],
+    "h' in the tangent behind a row": [("after if h_d is None else after + h_d * combine(tableau.b, slopes)", "after")],
     "D_1 f in the tangents": [("times_vector(f_x[j], X_d) + forcing[j]", "times_vector(f_x[j], x_d) + forcing[j]")],
-    "later stages in the adjoint": [("_sum(b[j] * psi if b[j] else None, later)", "_sum(b[j] * psi, None)")],
+    "later stages in the adjoint": [("(b[j] * psi + later)", "(b[j] * psi)")],
     "a transposed in the adjoint": [("[a[m][j] for m in range(j + 1, s)]", "[a[m][m - 1] for m in range(j + 1, s)]")],
     "psi in the adjoint": [("psi + sum(mu[1:], mu[0])", "sum(mu[1:], mu[0])")],
     "ell in what the length multiplies": [("((psi * slopes[j]).sum() + densities[j])", "(psi * slopes[j]).sum()")],
     "mu in what the length multiplies": [
-        ("total = total + (mu[j] * inside).sum()", "total = total + 0.0 * inside.sum()")
+        ("(mu[j] * combine(tableau.a[j], slopes)).sum()", "0.0 * combine(tableau.a[j], slopes).sum()")
     ],
     "times of the stages": [("[start_d + c * h_d for c", "[end_d - c * h_d for c")],
 }

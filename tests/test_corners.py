@@ -698,7 +698,7 @@ def rooted(t, x, p):
 )
 def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monkeypatch):
     """JAX is not asked for a program of each path, to find that a derivative is infinite."""
-    monkeypatch.setattr(jax_programs, "differentiate_constrained", None)
+    monkeypatch.setattr(jax_programs, "derivatives", None)
     evaluator = Evaluator(problem)
     assert np.isfinite(evaluator.cost(problem.initial_theta))
     for _ in range(2):

@@ -72,7 +72,7 @@ def test_the_errors_of_rows_are_those_of_the_embedded_method():
         errors = np.abs(h * EXPLICIT_ERROR @ np.stack(slopes))
         bends = [-mu * G * SLOW**2 / (X[1] ** 2 + SLOW**2) ** 1.5 for X in (states[0], states[-1])]
         f_x = [np.array([[0.0, 1.0], [0.0, bend]]) for bend in bends]
-        jumps = JUMP_WEIGHT * rows.measure_jump(h, judge(h, slopes, states, h, f_x, EXPLICIT_BEND), np)
+        jumps = JUMP_WEIGHT * rows.measure_jump(*judge(h, slopes, states, f_x, EXPLICIT_BEND), np)
         largest = np.maximum(largest, np.maximum(errors, jumps))
     found = evaluator.judge_rows()(theta).row_errors[0]
     # They are made of differences of states, which are of size 1 and have rounding errors.
@@ -85,11 +85,11 @@ def read_errors(evaluator):
     return evaluator.engines[0].at(Order.HESSIAN)._named["errors"]
 
 
-def judge(h, slopes, states, times, f_x, weights):
+def judge(h, slopes, states, f_x, weights):
     """What is read of a row of a field whose slope in t is 0."""
     k = h * np.stack(slopes)
-    at = k[0], k[len(k) // 2], k[-1], weights @ k
-    return rows.Judged(*at, times, states[-1] - states[0], np.zeros(len(k[0])), f_x[0] + f_x[1])
+    smooth = 0.5 * h * (f_x[0] + f_x[1]) @ (states[-1] - states[0])
+    return k[0], k[len(k) // 2], k[-1], weights @ k, smooth
 
 
 def measure(f, f_x, tableau, weights, h):
@@ -98,8 +98,7 @@ def measure(f, f_x, tableau, weights, h):
     found = stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
     found = rows.Stages(*([np.asarray(value) for value in part] for part in found))
     slopes = [np.array([[f_x(found.times[j], found.states[j][0])]]) for j in (0, -1)]
-    judged = judge(h, found.slopes, found.states, found.times[-1] - found.times[0], slopes, weights)
-    return float(rows.measure_jump(h, judged, np)[0])
+    return float(rows.measure_jump(*judge(h, found.slopes, found.states, slopes, weights), np)[0])
 
 
 @pytest.mark.parametrize(("tableau", "weights"), [(EXPLICIT, EXPLICIT_BEND), (STIFF, STIFF_BEND)])

@@ -13,12 +13,10 @@ import pytest
 from systems import NODES, P0, case, problem_of
 
 from switchfit.batch.chunks import run_chunks
-from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.native import experiment, program
-from switchfit.engine.native.experiment import native_experiment
-from switchfit.engine.native.program import drop_programs
+from switchfit.engine.native import experiment
+from switchfit.engine.native.experiment import native_experiment, places_in_library
 from switchfit.engine.native.templates import Order
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.evaluator import evaluator_of
 
 SLOW = """
 import sys, time
@@ -72,77 +70,41 @@ def test_ctrl_c_is_heard_during_machine_code(what):
     assert heard - sent < 0.5
 
 
-@pytest.fixture
-def row_by_row(monkeypatch):
-    """Machine code that returns to Python after each row, sample and step."""
-
-    def switch():
-        drop_programs()
-        monkeypatch.setattr(experiment, "BUDGET", 1)
-        monkeypatch.setattr(program, "BUDGET", 1)
-
-    yield switch
-    monkeypatch.undo()
-    drop_programs()
-
-
-def test_evaluations_row_by_row_are_the_same_bit_by_bit(row_by_row):
-    """With transitions anywhere, and two of them at one node."""
-    this = case("resets")
-    arguments = this.arguments()
-    nodes = np.unique(np.asarray(arguments.nodes))
-
-    def found(tau):
-        given = np.asarray(tau, float), np.asarray(P0, float)
-        orders = [
-            native_experiment(this.structure, arguments, nodes, order)
-            for order in (Order.COST, Order.GRADIENT, Order.HESSIAN)
-        ]
-        simulated = orders[2].simulate(*given)
-        seen = orders[2].outputs(simulated.times, simulated.states, given[1], simulated.tangents)
-        first, second = orders[1](*given, 1.0), orders[2](*given, -1.0)
-        values = [value for one in (first, second) for value in (one.cost, one.gradient, one.hessian)]
-        return [orders[0].cost(*given), *values, *simulated[:-1], *seen]
-
-    times = [0.413, 0.791, 1.336], NODES[[4, 4, 13]]
-    expected = [found(tau) for tau in times]
-    row_by_row()
-    for tau, wanted in zip(times, expected, strict=True):
-        for one, other in zip(found(tau), wanted, strict=True):
-            np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.slow
-def test_meshes_step_by_step_are_the_same(row_by_row):
-    problem = problem_of("resets")
-    theta = problem.initial_theta
-    expected = refine_mesh(problem, 0, theta)
-    cost = Evaluator(problem, meshes=[expected]).cost(theta)
-    row_by_row()
-    np.testing.assert_array_equal(refine_mesh(problem, 0, theta).times, expected.times)
-    assert Evaluator(problem, meshes=[expected]).cost(theta) == cost
-
-
-def test_an_evaluation_that_was_interrupted_leaves_nothing_behind(row_by_row):
-    row_by_row()
+def test_a_long_evaluation_that_was_interrupted_leaves_nothing_behind(monkeypatch):
+    """What Ctrl-C has left goes on in the background: the next evaluation waits for its end."""
     evaluator = evaluator_of(problem_of("resets"))
     theta = evaluator.problem.initial_theta
     expected = evaluator(theta)
     native = evaluator.engines[0].at(Order.HESSIAN)
-    whole, calls = native._evaluate, []
+    whole, ended = native._function, []
 
-    def interrupted(*given):
-        calls.append(whole(*given))
-        if len(calls) == 7:
-            raise KeyboardInterrupt
+    def slowly(*given):
+        time.sleep(0.3)
+        whole(*given)
+        ended.append(time.monotonic())
 
-    native._evaluate = interrupted
+    native._function = slowly
+    monkeypatch.setattr(experiment, "LONG", 0)
+    threading.Timer(0.1, signal.raise_signal, [signal.SIGINT]).start()
     with pytest.raises(KeyboardInterrupt):
         evaluator(theta + 0.01)
-    native._evaluate = whole
+    assert not ended
+    native._function = whole
     again = evaluator(theta)
+    assert ended
     assert again.cost == expected.cost
     np.testing.assert_array_equal(again.hessian, expected.hessian)
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 7])
+def test_costs_of_schedules_a_few_at_a_time_are_the_same(at_once, monkeypatch):
+    this = case("plain")
+    native = native_experiment(this.structure, this.arguments(), NODES, Order.COST)
+    times = np.sort(np.random.default_rng(0).uniform(0.0, 2.0, (7, 2)))
+    places = np.concatenate([which[:-1] for which in places_in_library(this.structure).values()])
+    expected = [native.cost(each, P0) for each in times]
+    monkeypatch.setattr(experiment, "LONG", at_once * native._work)
+    np.testing.assert_array_equal(native.costs(np.tile(places, (7, 1)), times, P0), expected)
 
 
 class Endless:

@@ -16,7 +16,7 @@ import switchfit as sf
 from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, find_row_ending_cell, pad_length
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
-from switchfit.discretization.rows import ADAPTIVE, Progress, Tolerances, dormand_prince, judge_step, limit_step
+from switchfit.discretization.rows import ADAPTIVE, ADAPTIVE_ERROR, Progress, Tolerances, judge_step, limit_step
 from switchfit.engine.adaptive import (
     PACE,
     Settings,
@@ -347,7 +347,7 @@ def test_both_engines_take_the_steps_of_scipy():
 
 
 def test_the_last_step_ends_at_the_end_and_one_shorter_than_rounding_is_stuck():
-    slopes, y = np.zeros((len(ADAPTIVE.error), 1)), np.zeros(1)
+    slopes, y = np.zeros((len(ADAPTIVE_ERROR), 1)), np.zeros(1)
     tolerances = Tolerances(1e-8, 1e-9)
     third = 1.0 / 3.0
     with np.errstate(divide="ignore"):
@@ -389,8 +389,7 @@ def test_equal_parts_of_a_cell_as_short_as_rounding_are_one(parts):
 
 
 def test_coefficients_of_dormand_and_prince_are_those_of_scipy():
-    pair = dormand_prince()
-    given = (pair.tableau.a, pair.tableau.b, pair.tableau.c, pair.error)
+    given = (ADAPTIVE.a, ADAPTIVE.b, ADAPTIVE.c, ADAPTIVE_ERROR)
     for own, expected in zip(given, (RK45.A, RK45.B, RK45.C, RK45.E), strict=True):
         np.testing.assert_array_equal(own, expected)
 

@@ -106,15 +106,6 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     return Stages(*(_pad(tableau, values, values[-1]) for values in (times, X, K)))
 
 
-def stages_from(
-    tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array, k: Sequence[Array]
-) -> Stages:
-    """Return the stages of a row from its increments k (s arrays (n,)), with f at them for the slopes."""
-    times = [start + c * (end - start) for c in tableau.c.tolist()]
-    states = [x + combine(row, k) for row in tableau.a]
-    return Stages(times, states, [f(t, X) for t, X in zip(times, states, strict=True)])
-
-
 def correct_increments(
     tableau: Tableau, h: Array, k: Sequence[Array], slopes: Sequence[Array], f_x: Sequence[Array], factorize: Factorize
 ) -> list[Array]:

@@ -28,7 +28,7 @@ from switchfit.discretization.model import (
     list_constraints_at_transitions,
     list_costs_at_transitions,
 )
-from switchfit.discretization.rows import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau, end_of_row
+from switchfit.discretization.rows import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau, combine
 
 Array = jax.Array
 
@@ -63,7 +63,7 @@ def step(
     """Return the state after one step and the running cost it adds: (n,) and (), 0 if ell is None."""
     h = end - start
     found = compute_stages(tableau, lambda t, x: f(t, x, p), start, end, x)
-    after = rows.end_of_row(tableau, h, x, found.slopes)
+    after = x + h * combine(tableau.b, found.slopes)
     if ell is None:
         return after, jnp.zeros(())
     densities = jax.vmap(ell, in_axes=(0, 0, None))(found.times, found.states, p)
@@ -143,7 +143,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | N
         def row(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
             f = model.field(mode, piece)
             found = compute_stages(tableau, lambda t, x: f(t, x, p), start, end, x)
-            return end_of_row(tableau, end - start, x, found.slopes), *found
+            return x + (end - start) * combine(tableau.b, found.slopes), *found
 
         return row
 

@@ -53,7 +53,6 @@ class Tableau(NamedTuple):
     Attributes
     ----------
     a, b, c : (s, s), (s,), (s,)
-    order : int
     coupled : int
         Number of stages of an implicit method, whose equations are solved together; 0 for an explicit method. Stages
         behind them repeat the last of them, with weight zero: see `pad`.
@@ -62,7 +61,6 @@ class Tableau(NamedTuple):
     a: FloatArray
     b: FloatArray
     c: FloatArray
-    order: int
     coupled: int = 0
 
     def pad(self, stages: int) -> Tableau:
@@ -87,7 +85,7 @@ def butcher() -> Tableau:
     a[3, :3] = [0, -1 / 2, 1]
     a[4, :4] = [3 / 16, 0, 0, 9 / 16]
     a[5, :5] = [-3 / 7, 2 / 7, 12 / 7, -12 / 7, 8 / 7]
-    return Tableau(a, np.array([7, 0, 32, 12, 32, 7]) / 90, a.sum(1), 5)
+    return Tableau(a, np.array([7, 0, 32, 12, 32, 7]) / 90, a.sum(1))
 
 
 def radau_iia() -> Tableau:
@@ -103,28 +101,13 @@ def radau_iia() -> Tableau:
         ]
     )
     # Stiffly accurate: b is the last row of a, so that x+ is the state of the last stage.
-    return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), 5, coupled=3)
+    return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), coupled=3)
 
 
-class EmbeddedPair(NamedTuple):
-    """A method with an estimate of its error.
+def dormand_prince() -> Tableau:
+    """Return the tableau of Dormand and Prince (1980), order 5 (Hairer, Norsett and Wanner I, table II.5.2).
 
-    Attributes
-    ----------
-    tableau : Tableau
-    error : (s + 1,)
-        Weights of the slopes of the stages, then of the slope behind the step, in the error of a step of length 1.
-    """
-
-    tableau: Tableau
-    error: FloatArray
-
-
-def dormand_prince() -> EmbeddedPair:
-    """Dormand and Prince (1980), order 5 with an error estimate of order 4.
-
-    Hairer, Norsett and Wanner I, table II.5.2. The signs of the error are those of SciPy's RK45, importing which takes
-    longer than most fits.
+    It is that of SciPy's RK45, importing which takes longer than most fits.
     """
     a = np.zeros((6, 5))
     a[1, :1] = [1 / 5]
@@ -133,9 +116,7 @@ def dormand_prince() -> EmbeddedPair:
     a[4, :4] = [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729]
     a[5, :5] = [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656]
     b = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
-    c = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
-    error = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40])
-    return EmbeddedPair(Tableau(a, b, c, 5), error)
+    return Tableau(a, b, np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1]))
 
 
 EXPLICIT, STIFF = butcher(), radau_iia()
@@ -148,6 +129,9 @@ stages."""
 EXPLICIT_BEND = np.array([1.0, 0.0, -4.0, 6.0, -4.0, 1.0])
 """Fourth difference of the slopes at the stages of `EXPLICIT`."""
 ADAPTIVE = dormand_prince()
+ADAPTIVE_ERROR = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40])
+"""Weights of the slopes of the stages, then of the slope behind the step, in the error of a step of `ADAPTIVE` of
+length 1; its order is 4, its signs are those of SciPy."""
 
 
 def radau_error() -> tuple[float, float, float, float]:
@@ -198,26 +182,26 @@ class Stages(NamedTuple):
     slopes: Any
 
 
-def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array) -> Stages:
-    """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field."""
+def stages(
+    tableau: Tableau,
+    f: Callable[[Array, Array], Array],
+    start: Array,
+    end: Array,
+    x: Array,
+    increments: Sequence[Array] = (),
+) -> Stages:
+    """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field.
+
+    Those of an implicit row follow from its increments (s arrays (n,)), with f at them for the slopes.
+    """
     h = end - start
     found = Stages([], [], [])
     for row, c in zip(tableau.a, tableau.c.tolist(), strict=True):
         found.times.append(start + c * h)
-        # X_j from the slopes before it: a is strictly lower triangular.
-        found.states.append(stage_state(row, h, x, found.slopes))
+        # X_j of an explicit row from the slopes before it: a is strictly lower triangular.
+        found.states.append(x + (combine(row, increments) if increments else h * combine(row, found.slopes)))
         found.slopes.append(f(found.times[-1], found.states[-1]))
     return found
-
-
-def stage_state(row: FloatArray, h: Array, x: Array, slopes: Sequence[Array] | FloatArray) -> Array:
-    """Return the state (n,) of a stage from the slopes of those before it; `row` is its row of a."""
-    return _plus(x, h, combine(row, slopes))
-
-
-def end_of_row(tableau: Tableau, h: Array, x: Array, slopes: Sequence[Array] | FloatArray) -> Array:
-    """Return the state after a row: (n,)."""
-    return _plus(x, h, combine(tableau.b, slopes))
 
 
 def cost_of_row(tableau: Tableau, h: Array, densities: Sequence[Array]) -> Array:
@@ -257,12 +241,12 @@ def tangent(
     for j in range(len(tableau.b)):
         # X_j' = x' + h sum_l a_jl K_l' + h' sum_l a_jl K_l: along p this discretizes the linear equation whose solution
         # is (10) of the paper.
-        X_d = _plus(x_d, h, combine(tableau.a[j], found.slopes))
-        X_d = X_d if h_d is None else _plus(X_d, h_d, combine(tableau.a[j], slopes))
+        X_d = x_d + h * combine(tableau.a[j], found.slopes)
+        X_d = X_d if h_d is None else X_d + h_d * combine(tableau.a[j], slopes)
         found.states.append(X_d)
         found.slopes.append(times_vector(f_x[j], X_d) + forcing[j])
-    after = _plus(x_d, h, combine(tableau.b, found.slopes))
-    return found._replace(after=after if h_d is None else _plus(after, h_d, combine(tableau.b, slopes)))
+    after = x_d + h * combine(tableau.b, found.slopes)
+    return found._replace(after=after if h_d is None else after + h_d * combine(tableau.b, slopes))
 
 
 class Adjoint(NamedTuple):
@@ -299,7 +283,7 @@ def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
     # Last stage first: w_j needs mu_l of the stages that use K_j, those behind it. This discretizes (7) of the paper.
     for j in reversed(range(s)):
         later = combine([a[m][j] for m in range(j + 1, s)], mu[j + 1 :])
-        w[j] = h * (_sum(b[j] * psi if b[j] else None, later))
+        w[j] = h * (b[j] * psi + later)
         times[j], mu[j], in_p = pull(j, w[j], h * b[j])
         parameters = parameters + in_p
     return Adjoint(w, mu, psi + sum(mu[1:], mu[0]), times, parameters)
@@ -317,45 +301,29 @@ def length_factor(
         # h stands in x+ and in the cost of the row, h b_j (K_j, ell_j), and in the states of the stages, h a_jl K_l.
         if b:
             total = total + b * ((psi * slopes[j]).sum() + densities[j])
-        inside = combine(tableau.a[j], slopes)
-        if inside is not None:
-            total = total + (mu[j] * inside).sum()
+        if tableau.a[j].any():
+            total = total + (mu[j] * combine(tableau.a[j], slopes)).sum()
     return total
 
 
-class Judged(NamedTuple):
-    """What `measure_jump` reads of a row.
+def measure_jump(first: Array, middle: Array, last: Array, bend: Array, smooth: Array, xp: Any) -> Array:
+    """Return h times the jump of f inside a row, (n,); 0 where f seems smooth.
 
-    Attributes
+    Parameters
     ----------
     first, middle, last : (n,), h times the slopes of three stages
     bend : (n,), a difference of high order of all of them
-    times, states : (), (n,), from the first to the last stage
-    f_t, f_x : (n,), (n, n), sum of those of the first and the last stage
-    """
-
-    first: Array
-    middle: Array
-    last: Array
-    bend: Array
-    times: Array
-    states: Array
-    f_t: Array
-    f_x: Array
-
-
-def measure_jump(h: Array, row: Judged, xp: Any) -> Array:
-    """Return h times the jump of f inside a row, (n,); 0 where f seems smooth.
+    smooth : (n,), h times the change of f from the first to the last stage by the mean of its derivatives there
 
     Where f is smooth, a difference of high order of the slopes is small beside their range, and the derivatives at the
     first and the last stage explain how the slope changes. Where f jumps, neither holds. The state after such a row may
     be accurate, if it is short, but its derivatives have nothing of how the place of the jump moves.
     """
-    change, bend = row.last - row.first, xp.abs(row.bend)
-    rest = xp.abs(change - 0.5 * h * (times_vector(row.f_x, row.states) + row.f_t * row.times))
+    change, bend = last - first, xp.abs(bend)
+    rest = xp.abs(change - smooth)
     # A jump is what neither the smoothness of f nor its derivatives explain: the smaller of bend and rest counts.
-    span = xp.maximum(xp.abs(change), xp.abs(row.middle - row.first))
-    least = LARGEST_BEND * span + SMALLEST_BEND * xp.abs(row.first)
+    span = xp.maximum(xp.abs(change), xp.abs(middle - first))
+    least = LARGEST_BEND * span + SMALLEST_BEND * xp.abs(first)
     return xp.where(xp.less(least, xp.minimum(bend, rest)), bend, 0.0)
 
 
@@ -375,8 +343,8 @@ def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Arr
     return [start_d + c * h_d for c in tableau.c.tolist()]
 
 
-def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | FloatArray) -> Array | None:
-    """Add terms with weights; terms of weight zero are skipped, and the sum of no terms is None.
+def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | FloatArray) -> Array:
+    """Add terms with weights; terms of weight zero are skipped, and the sum of no terms is 0.
 
     The terms may be one NumPy array, along its first axis.
     """
@@ -384,22 +352,12 @@ def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | Floa
         return np.asarray(weights)[: len(terms)] @ terms
     given = weights.tolist() if isinstance(weights, np.ndarray) else weights
     parts = [w * term for w, term in zip(given, terms, strict=False) if w != 0.0]
-    return sum(parts[1:], parts[0]) if parts else None
+    return sum(parts[1:], parts[0]) if parts else 0.0
 
 
 def times_vector(A: Array, v: Array) -> Array:
     """Return ``A v`` for small A (m, n) and v (n,) as products and a sum, without the overhead of a library call."""
     return (A * v[None]).sum(-1)
-
-
-def _plus(x: Array, h: Array, slope: Array | None) -> Array:
-    return x if slope is None else x + h * slope
-
-
-def _sum(one: Array | None, other: Array | None) -> Array:
-    if one is None or other is None:
-        return other if one is None else one
-    return one + other
 
 
 SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
@@ -466,7 +424,7 @@ def judge_step(
     y, after : (n,), before and after the step
     slopes : (s + 1, n), of the stages and after the step
     """
-    return judge_error(at, end, tolerances, y, after, at.step * combine(ADAPTIVE.error, slopes), EXPONENT, xp)
+    return judge_error(at, end, tolerances, y, after, at.step * combine(ADAPTIVE_ERROR, slopes), EXPONENT, xp)
 
 
 def judge_error(

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -26,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.mesh import Arguments, Mesh, Stiffness, merge_stiffness
+from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.rows import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine.branches import (
@@ -39,6 +38,7 @@ from switchfit.engine.branches import (
     SteepError,
     TooManyCrossingsError,
 )
+from switchfit.engine.jax import call_model
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -513,18 +513,6 @@ def _project_steps(accepted: Sequence[float], end: float) -> float:
 
 def _report_infinite(what: str, state: FloatArray) -> NotIntegrableError:
     return NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
-
-
-@partial(jax.jit, static_argnames=("structure", "function", "which"))
-def call_model(
-    arguments: Arguments,
-    *given: Any,
-    structure: Structure,
-    function: Callable[..., jax.Array],
-    which: tuple[int, ...] = (),
-) -> jax.Array:
-    """Return ``function(model, *which, *given)``, compiled."""
-    return function(Model(structure, arguments), *which, *given)
 
 
 def _apply_reset(model: Model, i: int, t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:

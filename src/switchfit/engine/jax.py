@@ -138,12 +138,16 @@ def derivatives(
     tau: Array,
     p: Array,
     side: Array,
+    multipliers: Array | None = None,
     *,
     structure: Structure,
     method: Method,
     matrix: Matrix = "exact",
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, ...]:
     """Return the cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
+
+    With multipliers (m,), the derivatives are those of ``J + multipliers . c``, and the constraints (m,) and their
+    derivatives (m, D) follow.
 
     The method "discrete-adjoint" differentiates the slopes of J backward for the Hessian, where JAX can, "forward"
     forward. With the matrix "none" the Hessian is NaN.
@@ -156,7 +160,10 @@ def derivatives(
     if matrix == "none":
         g, J = differentiate(lambda theta: (_evaluate(model, theta, side)[0],) * 2, theta)
         return J, g, jnp.full((theta.size, theta.size), jnp.nan)
-    return _differentiate_twice(partial(_evaluate, model, side=side), theta, jnp.zeros(0), differentiate)[:3]
+    evaluate = partial(_evaluate, model, side=side, constrained=multipliers is not None)
+    if multipliers is None:
+        return _differentiate_twice(evaluate, theta, jnp.zeros(0), differentiate)[:3]
+    return _differentiate_twice(evaluate, theta, multipliers, differentiate)
 
 
 def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False) -> tuple[Array, Array]:
@@ -173,7 +180,7 @@ def _differentiate_twice(
     multipliers: Array,
     differentiate: Callable[..., Any],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return what `differentiate_constrained` does of a function that returns J and c."""
+    """Return what `derivatives` does with multipliers, of a function that returns J and c."""
 
     # Row k of H: the slope of the Lagrangian along e_k by one tangent, and its gradient is D (D J . e_k).
     def along(direction: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -204,21 +211,6 @@ def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], thet
             raise
         return _differentiate_forward(function, theta)
     return derivative, other
-
-
-@partial(jax.jit, static_argnames=("structure",))
-def differentiate_constrained(
-    arguments: Arguments, tau: Array, p: Array, side: Array, multipliers: Array, *, structure: Structure
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Differentiate ``J + multipliers . c`` of one experiment.
-
-    Returns
-    -------
-    cost, slope, hessian : J, and the derivatives of the Lagrangian (D,) and (D, D)
-    c, jacobian : the constraints (m,) and their derivatives (m, D)
-    """
-    evaluate = partial(_evaluate, Model(structure, arguments), side=side, constrained=True)
-    return _differentiate_twice(evaluate, jnp.concatenate([tau, p]), multipliers, _differentiate_backward)
 
 
 @partial(jax.jit, static_argnames=("structure",))
@@ -302,15 +294,23 @@ def simulate_rows(
     return J, seen, rows, (*derivatives, *map(jax.vmap(see_along), times, states, derivatives))
 
 
-@partial(jax.jit, static_argnames=("structure",))
-def compute_slopes(
-    arguments: Arguments, times: Array, states: Array, pieces: Piece, p: Array, *, structure: Structure
+@partial(jax.jit, static_argnames=("structure", "function", "which"))
+def call_model(
+    arguments: Arguments,
+    *given: Any,
+    structure: Structure,
+    function: Callable[..., Array],
+    which: tuple[int, ...] = (),
 ) -> Array:
+    """Return ``function(model, *which, *given)``, compiled."""
+    return function(Model(structure, arguments), *which, *given)
+
+
+def _compute_fields(model: Model, times: Array, states: Array, pieces: Piece, p: Array) -> Array:
     """Return the vector fields of all modes at times (L,), with the signals of L cells, and states (L, n)."""
-    model = Model(structure, arguments)
 
     def at_point(t: Array, x: Array, piece: Piece) -> Array:
-        return jnp.stack([model.field(mode, piece)(t, x, p) for mode in range(len(structure.modes))])
+        return jnp.stack([model.field(mode, piece)(t, x, p) for mode in range(len(model.structure.modes))])
 
     return jax.vmap(at_point)(times, states, pieces)
 
@@ -371,7 +371,7 @@ class JaxEngine:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         with use_float64(), use_compilation_cache():
             given = self._given(), tau, p, float(side), multipliers
-            found = differentiate_constrained(*given, structure=self._any_sequence)
+            found = derivatives(*given, structure=self._any_sequence, method="discrete-adjoint")
         J, slope, H, c, A = map(np.array, found)
         return Evaluation(float(J), slope - multipliers @ A, H, c, A)
 
@@ -390,7 +390,8 @@ class JaxEngine:
         points = jax.tree.map(lambda a: np.resize(a, (padded, *a.shape[1:])), (times, states, pieces))
         with use_float64(), use_compilation_cache():
             given = self._arguments.without_mesh(), *points, p
-            return np.asarray(compute_slopes(*given, structure=self._structure.functions))[:count]
+            found = call_model(*given, structure=self._structure.functions, function=_compute_fields)
+        return np.asarray(found)[:count]
 
     def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
         """Return the ends of all rows."""

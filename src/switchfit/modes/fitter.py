@@ -32,7 +32,12 @@ from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.engine import NativeEngine
-from switchfit.engine.native.experiment import NativeExperiment, native_experiment, places_in_library
+from switchfit.engine.native.experiment import (
+    FailedCheckError,
+    NativeExperiment,
+    native_experiment,
+    places_in_library,
+)
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
@@ -245,8 +250,10 @@ class ScheduleCosts:
             found = np.empty(len(schedules))
             for i, schedule in enumerate(schedules):
                 native.assign_sequence(self.structure_of(e, schedule.sequence))
-                cost = native.cost(schedule.times, p)
-                found[i] = np.nan if cost is None else cost
+                try:
+                    found[i] = native.cost(schedule.times, p)
+                except FailedCheckError:
+                    found[i] = np.nan
         return found
 
     def _list_places(self, e: int, sequence: tuple[str, ...]) -> NDArray[np.int64]:

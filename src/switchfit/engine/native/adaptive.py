@@ -17,14 +17,13 @@ from switchfit.discretization.rows import (
     combine,
     judge_error,
     judge_step,
-    stage_state,
 )
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
 from switchfit.engine.native.templates import ELL, ELL_X, F_X, F
 
-TIMES = {False: [*ADAPTIVE.tableau.c.tolist(), 1.0], True: [0.0, *STIFF.c.tolist()]}
+TIMES = {False: [*ADAPTIVE.c.tolist(), 1.0], True: [0.0, *STIFF.c.tolist()]}
 """Times at which an explicit (False) or implicit step evaluates the mode, as fractions of it."""
 
 
@@ -91,8 +90,8 @@ def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
         now, y_now = judge_error(*given, y + combine(STIFF.b, k), error, STIFF_EXPONENT, xp)
     else:
         K: list[Objects] = []
-        for row, evaluate in zip((*ADAPTIVE.tableau.a, ADAPTIVE.tableau.b), points, strict=True):
-            after = stage_state(row, h, y, K)
+        for row, evaluate in zip((*ADAPTIVE.a, ADAPTIVE.b), points, strict=True):
+            after = y + h * combine(row, K)
             K.append(np.concatenate([np.ravel(value) for value in evaluate(after[:n], (F, ELL))]))
         now, y_now = judge_step(*given, after, K, xp)
     stores = [("state", at.t, now.t), ("state", at.step, now.step), *(("y", k, node) for k, node in enumerate(y_now))]

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh, count_passed
-from switchfit.engine.native.experiment import NativeExperiment, find_directions, native_experiment, places_in_library
+from switchfit.engine.native.experiment import (
+    FailedCheckError,
+    NativeExperiment,
+    find_directions,
+    native_experiment,
+    places_in_library,
+)
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import program_of, second_order
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.writer import GIVEN, constraint_rows, memory, sums
+from switchfit.engine.native.writer import GIVEN, layout_of
 from switchfit.engine.protocol import (
     Costates,
     Engine,
@@ -35,6 +41,8 @@ from switchfit.engine.protocol import (
 )
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
+
+Found = TypeVar("Found")
 
 _registered: dict[str, Program] = {}
 """Programs whose addresses XLA keeps, by the names of their operations: they must stay alive."""
@@ -92,7 +100,7 @@ def foreign_derivatives(
     passed = count_passed(nodes, tau, side)
     begins = jnp.clip(passed - 1, 0, real_cells - 1)
     units, own, there = find_directions(sizes, jumps, jnp)
-    count = max(constraint_rows(library, sizes)["count"], 1)
+    layout = layout_of(library, sizes, Order.HESSIAN)
     given: dict[str, Any] = {
         "nodes": nodes,
         "signals": arguments.signals,
@@ -100,15 +108,15 @@ def foreign_derivatives(
         "p": jnp.append(p, 0.0),
         "bounds": jnp.concatenate([nodes[:1], tau, jnp.repeat(nodes[-1:], idle + 1)]),
         "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(idle + 1, cells - 1)]),
-        "multipliers": np.zeros(count),
+        "multipliers": np.zeros(max(layout.constraint_rows["count"], 1)),
         "units": units,
     }
     given |= places
     buffers = [given[key] for key in GIVEN]
     for samples in arguments.samples:
         buffers += [*samples, np.zeros(1, dtype=np.int64)]
-    lengths = sums(library, sizes)
-    of_memory = sum(length.at(cells + N) for length in memory(library, sizes, Order.HESSIAN).values())
+    lengths = layout.sums
+    of_memory = sum(length.at(cells + N) for length in layout.memory.values())
     results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
     totals = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")(*buffers)[0]
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
@@ -116,9 +124,6 @@ def foreign_derivatives(
     cost = J[0] + totals[-1]  # NaN if a finiteness check failed: the finisher of a batch then falls back to JAX
     gradient, hessian = g[own], H.reshape(D, width)[own[:, None], own]
     return cost, jnp.where(there, gradient, 0.0), jnp.where(there[:, None] & there[None], hessian, 0.0)
-
-
-ORDERS: dict[Matrix, Order] = {"exact": Order.HESSIAN, "gauss-newton": Order.GAUSS_NEWTON, "none": Order.GRADIENT}
 
 
 class NativeEngine:
@@ -160,114 +165,102 @@ class NativeEngine:
             for each in filter(None, self._experiments.values()):
                 each.judge_rows(jumps=self._mesh.is_sharp)
 
+    def _try(self, order: Order, use: Callable[[NativeExperiment], Found], fall_back: Callable[[], Found]) -> Found:
+        """Return what one function finds in machine code of an order, or what another finds by JAX."""
+        native = self.at(order)
+        try:
+            return fall_back() if native is None else use(native)
+        except FailedCheckError:
+            return fall_back()
+
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
-        native = self.at(Order.COST)
-        found = None if native is None else native.cost(tau, p)
-        return self._fallback.cost(tau, p) if found is None else found
+        return self._try(Order.COST, lambda native: native.cost(tau, p), lambda: self._fallback.cost(tau, p))
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
         """Return J and its derivatives."""
-        native = self.at(ORDERS[matrix])
-        found = None if native is None else native(tau, p, side)
-        return self._fallback.derivatives(tau, p, side, matrix) if found is None else found
+
+        def evaluate(native: NativeExperiment) -> Evaluation[FloatArray]:
+            found = native(tau, p, side)
+            if matrix != "none":
+                return found
+            return Evaluation(found.cost, found.gradient, np.full_like(found.hessian, np.nan))
+
+        order = Order.GAUSS_NEWTON if matrix == "gauss-newton" else Order.HESSIAN
+        return self._try(order, evaluate, lambda: self._fallback.derivatives(tau, p, side, matrix))
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
-        native = self.at(self._second)
-        found = None if native is None else native(tau, p, side, multipliers)
-        return self._fallback.constrained(tau, p, side, multipliers) if found is None else found
+        given = tau, p, side, multipliers
+        return self._try(self._second, lambda native: native(*given), lambda: self._fallback.constrained(*given))
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
-        native = self.at(self._second)
-        found = None if native is None else native.simulate(tau, p, multipliers)
-        if found is None:
-            return self._fallback.costates(tau, p, multipliers)
-        first_row, states = found.first_cell + np.arange(len(found.first_cell)), found.states[:-1].copy()
-        resets = list(self._structure.resets)
-        states[first_row[1:][resets]] = found.reset_states[resets]
-        return Costates.of_rows(self._structure, first_row, found.times[:-1], states, found.costates)
+
+        def simulate(native: NativeExperiment) -> Costates:
+            found = native.simulate(tau, p, multipliers)
+            return Costates.of_rows(self._structure, found.first_row, found.times[:-1], found.before, found.costates)
+
+        return self._try(self._second, simulate, lambda: self._fallback.costates(tau, p, multipliers))
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
-        native = self.at(Order.COST)
-        found = None if native is None else native.slopes(times, cells, states, p)
-        return self._fallback.slopes(times, cells, states, p) if found is None else found
+        given = times, cells, states, p
+        return self._try(Order.COST, lambda native: native.slopes(*given), lambda: self._fallback.slopes(*given))
 
     def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
         """Return the ends of all rows."""
-        native = self.at(Order.COST)
-        found = None if native is None else native.simulate(tau, p)
-        if found is None:
-            return self._fallback.trace(tau, p)
-        first_rows = (found.first_cell + np.arange(len(found.first_cell))).tolist()
-        last = first_rows.pop() if self._structure.has_free_tf else len(found.times) - 1
-        return found.times[1 : last + 1], found.states[1 : last + 1], first_rows
+
+        def simulate(native: NativeExperiment) -> tuple[FloatArray, FloatArray, list[int]]:
+            found = native.simulate(tau, p)
+            first_rows = found.first_row.tolist()
+            last = first_rows.pop() if self._structure.has_free_tf else len(found.after)
+            return found.times[1 : last + 1], found.after[:last], first_rows
+
+        return self._try(Order.COST, simulate, lambda: self._fallback.trace(tau, p))
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
-        native, plain = self.at(self._second if tangents else Order.COST), self.at(Order.COST)
-        found = None
-        if native is not None and plain is not None:
-            found = _simulate(self._structure, self._arguments, native, plain, tau, p, tangents)
-        return self._fallback.simulate(tau, p, tangents=tangents) if found is None else found
+        return self._try(
+            self._second if tangents else Order.COST,
+            lambda native: self._simulate(native, tau, p, tangents),
+            lambda: self._fallback.simulate(tau, p, tangents=tangents),
+        )
 
+    def _simulate(self, native: NativeExperiment, tau: FloatArray, p: FloatArray, tangents: bool) -> Simulation:
+        """Return all rows by machine code.
 
-def _simulate(
-    structure: Structure,
-    arguments: Arguments,
-    native: NativeExperiment,
-    plain: NativeExperiment,
-    tau: FloatArray,
-    p: FloatArray,
-    tangents: bool,
-) -> Simulation | None:
-    """Return all rows; None if a finiteness check failed.
-
-    Machine code has the derivatives at the ends of rows, which move with theta where they are transitions. The
-    derivative at fixed time is this one minus dx/dt, in the column of the transition time. Those in the times of jumps,
-    which are known, are 0.
-    """
-    found = native.simulate(tau, p)
-    if found is None:
-        return None
-    first_cell, start, end = found.first_cell.astype(np.intp), found.times[:-1], found.times[1:]
-    opening = first_cell[1:] + np.arange(1, len(first_cell))  # rows that begin at a transition
-    resets, before = list(structure.resets), found.states[:-1].copy()
-    before[opening[resets]] = found.reset_states[resets]
-    fixed, before_d = found.tangents, found.tangents
-    if tangents:
-        before_d = found.tangents[:-1].copy()
-        before_d[opening[resets]] = found.reset_tangents[resets]
-        moving, modes = np.setdiff1d(np.arange(structure.N), structure.jumps), np.array(structure.mode_of_segment)
-        for derivative, states, own in ((fixed, found.states, modes[:-1]), (before_d, before, modes[1:])):
-            slopes = plain.slopes(tau, first_cell[1:], states[opening], p)
-            if slopes is None:
-                return None
-            derivative[opening[moving], :, moving] -= slopes[moving, own[moving]]
-    seen = native.outputs(found.times, found.states, p, fixed if tangents else None)
-    behind = native.outputs(tau, before[opening], p, before_d[opening] if tangents else None)
-    if seen is None or behind is None:
-        return None
-    y_before, y_before_d = seen[0][:-1].copy(), seen[1][:-1].copy()
-    y_before[opening], y_before_d[opening] = behind
-    simulation = Simulation(
-        cost=found.cost,
-        nodes=native.times,
-        first_cell=first_cell,
-        start=start,
-        end=end,
-        before=before,
-        after=found.states[1:],
-        y_before=y_before,
-        y_after=seen[0][1:],
-        tangents=Tangents(before_d, fixed[1:], y_before_d, seen[1][1:]) if tangents else None,
-    )
-    late = {k: native.outputs(times, states, p) for k, (times, states) in found.late.items()}
-    if None in late.values():
-        return None
-    found_all = add_samples(simulation, structure, arguments, {k: y[0] for k, y in late.items() if y is not None})
-    return cut_at_tf(found_all, structure)
+        It has the derivatives at the ends of rows, which move with theta where they are transitions. The derivative at
+        fixed time is this one minus dx/dt, in the column of the transition time. Those in the times of jumps, which
+        are known, are 0.
+        """
+        structure, found = self._structure, native.simulate(tau, p)
+        start, end, opening = found.times[:-1], found.times[1:], found.first_row[1:]
+        if tangents:
+            moving, modes = np.setdiff1d(np.arange(structure.N), structure.jumps), np.array(structure.mode_of_segment)
+            beside = (
+                (found.after_d, found.after, opening - 1, modes[:-1]),
+                (found.before_d, found.before, opening, modes[1:]),
+            )
+            for derivative, states, rows, own in beside:
+                slopes = self.slopes(tau, found.first_cell[1:], states[rows], p)
+                derivative[rows[moving], :, moving] -= slopes[moving, own[moving]]
+        y_before, y_before_d = native.outputs(start, found.before, p, found.before_d)
+        y_after, y_after_d = native.outputs(end, found.after, p, found.after_d)
+        simulation = Simulation(
+            cost=found.cost,
+            nodes=native.times,
+            first_cell=found.first_cell,
+            start=start,
+            end=end,
+            before=found.before,
+            after=found.after,
+            y_before=y_before,
+            y_after=y_after,
+            tangents=Tangents(found.before_d, found.after_d, y_before_d, y_after_d) if tangents else None,
+        )
+        none = np.zeros(0)
+        late = {k: native.outputs(times, states, p, none)[0] for k, (times, states) in found.late.items()}
+        return cut_at_tf(add_samples(simulation, structure, self._arguments, late), structure)

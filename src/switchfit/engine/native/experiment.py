@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Samples
 from switchfit.discretization.model import AT_TRANSITIONS, list_constrained_transitions, read_parameters
-from switchfit.engine.native.llvm import BUDGET, Program
+from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import PREFIX, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.writer import GIVEN, WHOLE_NUMBERS, ZEROED, Layout
+from switchfit.engine.native.writer import GIVEN, WHOLE_NUMBERS, ZEROED, layout_of
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -104,8 +104,15 @@ def _find_own_directions(
     return found
 
 
+LONG = 200_000_000
+"""Work of an evaluation, in additions, from which Ctrl-C is handled in the meantime: 20 to 100 ms."""
+
 OF_LATE = ("time", "cell", "segment")
 """What is read and written of late samples when their delay changes."""
+
+
+class FailedCheckError(Exception):
+    """A product with a structural zero was left out whose other factor is not finite: the caller falls back to JAX."""
 
 
 class Simulated(NamedTuple):
@@ -115,30 +122,35 @@ class Simulated(NamedTuple):
     ----------
     cost : J
     first_cell : (N + 1,) int, cell in which each segment begins
-    times, states, tangents : (R + 1,), (R + 1, n), (R + 1, n, D)
-        At t0, then at the end of each row, before a jump. The tangents, in second order, are derivatives at an end that
-        moves with theta where it is a transition.
-    reset_states, reset_tangents : (N, n), (N, n, D), after the reset maps; undefined at transitions without one
-    costates : (R, n), in second order: derivatives of the cost to go, with constraints, in the state at each start
+    times : (R + 1,), t0, then the end of each row
+    before, after : (R, n), states at the start of each row, after a reset map, and at its end, before one
+    before_d, after_d : (R, n, D)
+        With derivatives: tangents of these, at a start or an end that moves with theta where it is a transition.
+    costates : (R, n)
+        With derivatives: those of the cost to go, with constraints, in the state at each start.
     late : for each late Measurements, by its index, the times at which its samples saw the state, and the states then
     """
 
     cost: float
-    first_cell: NDArray[np.int64]
+    first_cell: NDArray[np.intp]
     times: FloatArray
-    states: FloatArray
-    reset_states: FloatArray
-    tangents: FloatArray
-    reset_tangents: FloatArray
+    before: FloatArray
+    after: FloatArray
+    before_d: FloatArray
+    after_d: FloatArray
     costates: FloatArray
     late: dict[int, tuple[FloatArray, FloatArray]]
+
+    @property
+    def first_row(self) -> NDArray[np.intp]:
+        """The row in which each segment begins: (N + 1,)."""
+        return self.first_cell + np.arange(len(self.first_cell))
 
 
 class NativeExperiment:
     """Arrays of one experiment on one mesh, and calls of its machine code.
 
-    All methods that evaluate return None, or NaN, if a finiteness check failed: a product with a structural zero was
-    left out whose other factor was not finite. The caller falls back to JAX.
+    Methods that evaluate raise `FailedCheckError`, or return NaN, if a finiteness check failed.
 
     Parameters
     ----------
@@ -167,10 +179,8 @@ class NativeExperiment:
         self._inner_nodes, self._cells = times[1:-1], cells
         self._channels = sum(channels for _, channels in structure.outputs)
         self._counts = [count_samples(samples) for samples in arguments.samples]
-        self._evaluate = self._find("evaluate", 2 + len(self._counts))
-        if order not in program.layouts:
-            program.layouts[order] = Layout.of(structure.library, sizes, order)
-        layout: Layout = program.layouts[order]
+        self._function = self._find("evaluate", 1 + len(self._counts))
+        layout = layout_of(structure.library, sizes, order)
         self._rows = layout.constraint_rows
         self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
         self._size = sum(self._lengths.values())
@@ -211,8 +221,7 @@ class NativeExperiment:
         ]
         self._size_of_states: FloatArray | None = None
         self._judged = -1
-        self._progress = (ctypes.c_int64 * 3)()
-        self._progress_address = ctypes.addressof(self._progress)
+        self._work = (cells + N) * max(1, *program.row_work)
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
         self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
@@ -246,19 +255,16 @@ class NativeExperiment:
 
     def __call__(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None
-    ) -> Evaluation[FloatArray] | None:
-        """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
+    ) -> Evaluation[FloatArray]:
+        """Return J, its gradient (D,) and its Hessian (D, D).
 
         With multipliers (m,) the constraints too, and the Hessian of ``J + multipliers . c``.
         """
         with self._workspace.lock:
-            self._run(tau, p, side, multipliers)
-            if self._has_failed_check:
-                return None
+            self._evaluate(tau, p, side, multipliers)
             g, H = self._read_derivatives()
             if multipliers is None:
-                hessian = H if self.order >= Order.HESSIAN else np.full(H.shape, np.nan)
-                return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
+                return Evaluation(self._J.item(0), g, H, row_errors=self._read_errors())
             where = self._constraint_rows
             # The backward sweep has lam . c in it like a cost: g is that of the Lagrangian, and that of J is g - A'
             # lam.
@@ -271,7 +277,7 @@ class NativeExperiment:
 
     def _read_errors(self) -> tuple[float, ...]:
         """Return the largest error of a row of the evaluation, relative to the states of the first on this mesh."""
-        if self._judged < 0 or self.order < Order.HESSIAN:
+        if self._judged < 0:
             return ()
         if self._size_of_states is None:
             states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
@@ -297,20 +303,11 @@ class NativeExperiment:
         found: FloatArray = values[..., self._places]
         return found if self._has_all else np.where(self._there, found, 0.0)
 
-    @property
-    def _has_failed_check(self) -> bool:
-        """Whether a product with zero was left out whose other factor was not finite.
-
-        If the cost is not finite, it is returned without fallback: the caller rejects the point anyway.
-        """
-        check = self._check.item(0)
-        return check != check and math.isfinite(self._J.item(0))
-
-    def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
         with self._workspace.lock:
-            self._run(tau, p, 1.0)
-            return None if self._has_failed_check else self._J.item(0)
+            self._evaluate(tau, p, 1.0)
+            return self._J.item(0)
 
     def costs(self, places: NDArray[np.int64], times: FloatArray, p: FloatArray) -> FloatArray | None:
         """Return J of B schedules: (B,); NaN where a finiteness check failed, None if samples come late.
@@ -333,20 +330,20 @@ class NativeExperiment:
         # side +1.
         first_cell[:, 1:-1] = self._inner_nodes.searchsorted(times, "right")
         first_cell[:, -1] = self._cells - 1
-        places, found, done = np.ascontiguousarray(places), np.empty((B, 2)), np.zeros(1, dtype=np.int64)
-        function = self._find("all_costs", 7 + len(self._counts))
+        places, found = np.ascontiguousarray(places), np.empty((B, 2))
+        function = self._find("all_costs", 6 + len(self._counts))
         # The loop in machine code writes each schedule over the arrays of this one, which are restored at the end.
         kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
         with self._workspace.lock:
+            self._workspace.finish()
             self._own_p[:] = p
             self._workspace.reserve(self._size)
             if self._memory is not self._workspace.memory:
                 self._bind()
-            before = 0
-            while before < B:  # Ctrl-C is handled after each call
+            at_once = max(1, LONG // self._work)
+            for before in range(0, B, at_once):  # Ctrl-C is handled after each call
                 given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
-                function(self._address, get_address(done), B - before, *given, *self._counts)
-                before += int(done[0])
+                function(self._address, min(at_once, B - before), *given, *self._counts)
             self._named["bounds"][:], self._named["first_cell"][:] = kept
             self._write_places()
         # An infinite J with a failed check stays infinite: both refuse the schedule.
@@ -358,17 +355,15 @@ class NativeExperiment:
             self._named[name][:] = which
         self._named["modes"][-1] = self._judged
 
-    def simulate(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray | None = None) -> Simulated | None:
-        """Return the states at the ends of all rows, at second order with tangents and costates.
+    def simulate(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray | None = None) -> Simulated:
+        """Return the states at the starts and ends of all rows, with tangents and costates if it has derivatives.
 
         The costates are those of ``J + multipliers . c``.
         """
         with self._workspace.lock:
-            self._run(tau, p, 1.0, multipliers)
-            if self._has_failed_check:
-                return None
-            n, N, cells = self.sizes.n, self.structure.N, self._cells
-            first_cell = self._named["first_cell"][: N + 1].copy()
+            self._evaluate(tau, p, 1.0, multipliers)
+            n, N, cells, width = self.sizes.n, self.structure.N, self._cells, self.sizes.width
+            first_cell = self._named["first_cell"][: N + 1].astype(np.intp)
             # Ends of rows: the nodes inside a segment, then its end. A cell that a transition cuts has two rows.
             firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
             ends = zip(firsts, lasts, [*tau.tolist(), self.times[-1]], strict=True)
@@ -378,18 +373,26 @@ class NativeExperiment:
                 values = self._named[name].reshape(-1, *shape)[:count]
                 return self._spread(values) if len(shape) > 1 else np.array(values)
 
-            behind = N if self.structure.library.reset_maps else 0
-            rows = cells + N if self.order >= Order.HESSIAN else 0
+            def of_starts(ends: FloatArray, name: str, *shape: int) -> FloatArray:
+                """Return the values at the starts of rows: those before, or of reset maps."""
+                found, resets = ends[:-1].copy(), list(self.structure.resets)
+                if resets:
+                    found[(first_cell[1:] + np.arange(1, N + 1))[resets]] = of_rows(name, N, *shape)[resets]
+                return found
+
+            rows, derives = cells + N, self.order > Order.COST
+            states = of_rows("states", rows + 1, n)
+            tangents = of_rows("tangents", rows + 1, n, width) if derives else np.zeros((rows + 1, n, 0))
             return Simulated(
                 self._J.item(0),
                 first_cell,
-                np.concatenate([self.times[:1], *inside]),
-                of_rows("states", cells + N + 1, n),
-                of_rows("reset_states", behind, n),
-                of_rows("tangents", rows + (rows > 0), n, self.sizes.width),
-                of_rows("reset_tangents", behind, n, self.sizes.width),
-                of_rows("costates", rows, n),
-                {k: self._find_late_states(k, len(times)) for k, _, times, _, _ in self._late},
+                times=np.concatenate([self.times[:1], *inside]),
+                before=of_starts(states, "reset_states", n),
+                after=states[1:],
+                before_d=of_starts(tangents, "reset_tangents", n, width) if derives else tangents[1:],
+                after_d=tangents[1:],
+                costates=of_rows("costates", rows if derives else 0, n),
+                late={k: self._find_late_states(k, len(seen)) for k, _, seen, _, _ in self._late},
             )
 
     def _find_late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
@@ -398,28 +401,30 @@ class NativeExperiment:
         self._find(f"late_states_{k}", 4)(self._address, count, get_address(times), get_address(states))
         return times, states
 
-    def slopes(
-        self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray
-    ) -> FloatArray | None:
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
         L, modes = len(times), len(self.structure.modes)
         slopes = np.zeros((L, modes, self.sizes.n + 1))
         given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
         given["y"] = np.column_stack([states, np.zeros(L)])
         checks = [self._call(f"slope_{k}", given | {"K": slopes[:, k]}, p, L) for k in range(modes)]
-        return None if np.isnan(checks).any() else slopes[..., :-1]
+        if np.isnan(checks).any():
+            raise FailedCheckError
+        return slopes[..., :-1]
 
     def outputs(
-        self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray] | None:
-        """Return the outputs of all sensors (L, q), and their tangents if those of the states (L, n, D) are given."""
+        self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs of all sensors (L, q), and their tangents from those of the states (L, n, D), or empty."""
         L, width = len(times), self.sizes.width
         y, Y = np.zeros((L, self._channels)), np.zeros((L, self._channels, width))
-        Z = np.zeros((L, self.sizes.n, width) if tangents is not None else 0)
-        if tangents is not None:
+        Z = np.zeros((L, self.sizes.n, width) if tangents.size else 0)
+        if tangents.size:
             Z[..., self._places[self._there]] = tangents[..., self._there]
         given = {"time": times, "x": np.ascontiguousarray(states), "Z": Z, "y": y, "Y": Y}
-        return None if np.isnan(self._call("outputs", given, p, L)) else (y, self._spread(Y))
+        if np.isnan(self._call("outputs", given, p, L)):
+            raise FailedCheckError
+        return y, self._spread(Y)
 
     def initial_state(self, p: FloatArray) -> FloatArray:
         """Return x(t0): (n,)."""
@@ -449,8 +454,7 @@ class NativeExperiment:
         """Take up to `most` adaptive steps from `state` and y, which are updated; return the accepted times (L,) and
         states (L, n).
 
-        y is NaN if a finiteness check failed. If the budget is spent, it returns early, possibly without a step: call
-        it again.
+        y is NaN if a finiteness check failed.
 
         Parameters
         ----------
@@ -486,7 +490,9 @@ class NativeExperiment:
         self._find(f"each_{name}", len(arguments))(*arguments)
         return float(check[0])
 
-    def _run(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
+    def _evaluate(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
+        """Evaluate J and, of a program with derivatives, those of ``J + multipliers . c``."""
+        self._workspace.finish()
         self._tau[:] = tau
         self._own_p[:] = p
         self._find_first_cells(tau, side)
@@ -501,22 +507,20 @@ class NativeExperiment:
             part.fill(0.0)
         if self._late:
             self._find_late_cells(p)
-        if multipliers is None:
-            self._call_in_pieces()
-            return
-        self._multipliers[self._constraint_rows] = multipliers
+        if multipliers is not None:
+            self._multipliers[self._constraint_rows] = multipliers
         try:
-            self._call_in_pieces()
+            if self._work > LONG:
+                self._workspace.call(lambda: self._function(self._address, *self._counts))
+            else:
+                self._function(self._address, *self._counts)
         finally:
-            self._multipliers[:] = 0.0
-
-    def _call_in_pieces(self) -> None:
-        """Evaluate, in calls that return when the budget is spent; Ctrl-C is handled after each."""
-        progress = self._progress
-        progress[0] = progress[1] = 0
-        while progress[0] >= 0:
-            progress[2] = BUDGET
-            self._evaluate(self._address, self._progress_address, *self._counts)
+            if multipliers is not None:
+                self._multipliers[:] = 0.0
+        check = self._check.item(0)
+        # If the cost is not finite, it is returned without fallback: the caller rejects the point anyway.
+        if check != check and math.isfinite(self._J.item(0)):
+            raise FailedCheckError
 
     def _bind(self) -> None:
         """Store the addresses of another workspace in the table."""

@@ -49,22 +49,20 @@ class HypothesisKernels(Kernels):
         start, end = graph.load("row", 0), graph.load("row", 1)
         # The step has no moving ends: births change Z by `move` and `hold`, between steps.
         x, Z, h = graph.loads("x", n), graph.loads("Z", n, vector=True), end - start
-        tangent: Callable[..., explicit_rows.Tangent]
-        if tableau.coupled:
-            k = self.load_increments(graph)
-            found = implicit_rows.stages_from(tableau, field, start, end, x, k)
-            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
-            after, error = x + combine(tableau.b, k), implicit_rows.estimate_error(h, k, slope, jacobian, eliminate)
-            self.newton(f"newton_{mode}", stage)
-        else:
-            found = explicit_rows.stages(tableau, field, start, end, x)
-            after, error = x + h * combine(tableau.b, found.slopes), h * combine(EXPLICIT_ERROR, found.slopes)
-            tangent = explicit_rows.tangent
+        k = self.load_increments(graph) if tableau.coupled else []
+        found = explicit_rows.stages(tableau, field, start, end, x, k)
+        after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         # X_j' of all stages at once; machine code has one vector per state, with an entry for each time and parameter.
         points = list(zip(found.times, found.states, strict=True))
         f_x, f_p = zip(*(stage(graph, *at(t, X), only=(F_X, F_P)) for t, X in points), strict=True)
-        if tableau.coupled:
+        tangent: Callable[..., explicit_rows.Tangent]
+        if k:
+            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
+            error = implicit_rows.estimate_error(h, k, slope, jacobian, eliminate)
             tangent = partial(implicit_rows.tangent, factors=eliminate(tableau.a, h, f_x))
+            self.newton(f"newton_{mode}", stage)
+        else:
+            error, tangent = h * combine(EXPLICIT_ERROR, found.slopes), explicit_rows.tangent
         forcing = [self._along_p(graph, each) for each in f_p]
         along = tangent(tableau, h, found.slopes, f_x, forcing, Z, None)
         stores = store_all("x", 0, after) + store_all("Z", 0, [as_vector(graph, value) for value in along.after])

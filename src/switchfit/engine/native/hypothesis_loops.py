@@ -103,7 +103,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     kernels.move("hold", -1.0, costs)
     kernels.square()
     kernels.nodes()
-    writer = HypothesisWriter(library, sizes, kernels, module)
+    writer = HypothesisWriter(library, sizes, module)
     for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
         module.add(write_newton(writer, f"newton_{mode}"))
     loops: list[Callable[[], str]] = [
@@ -121,8 +121,8 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
 class HypothesisWriter(Writer):
     """Emits the loops of hypotheses."""
 
-    def __init__(self, library: Structure, sizes: Sizes, kernels: HypothesisKernels, module: Module) -> None:
-        super().__init__(library, sizes, Order.GAUSS_NEWTON, kernels, module)
+    def __init__(self, library: Structure, sizes: Sizes, module: Module) -> None:
+        super().__init__(library, sizes, Order.GAUSS_NEWTON, module)
         own = (f"{name}_{k}" for k in range(len(library.measurements)) for name in OF_SAMPLES)
         self.names = (*GIVEN, *scratch_sizes(sizes), *own)
 

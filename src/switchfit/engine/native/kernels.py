@@ -45,7 +45,6 @@ from switchfit.discretization.rows import (
     EXPLICIT_ERROR,
     STIFF,
     STIFF_BEND,
-    Judged,
     Tableau,
     combine,
     cost_of_row,
@@ -103,7 +102,7 @@ def most_kept(n: int) -> int:
 
 def count_kept(library: Structure, n: int, order: Order) -> int:
     """Return how many doubles a row keeps at most for its backward step."""
-    has_factors = order >= Order.HESSIAN and any(library.implicit)
+    has_factors = order > Order.COST and any(library.implicit)
     return STAGES * most_kept(n) + (count_factors(n, len(STIFF.b)) if has_factors else 0)
 
 
@@ -138,7 +137,7 @@ class Kernels:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
         self.goes_back = goes_back and order > Order.COST  # else the functions forward check that they are finite
         self.templates = Templates(library, sizes, order)
-        self.with_tangents = order >= Order.HESSIAN
+        self.with_tangents = order > Order.COST
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
         self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
@@ -214,14 +213,9 @@ class Kernels:
             return at_stages[-1][0]
 
         # The increments k_j = h K_j were found by the loop of `segments.write_newton` before; here they are inputs.
-        k: list[Objects] = []
-        if tableau.coupled:
-            k = self.load_increments(graph)
-            found = implicit_rows.stages_from(tableau, field, start, end, x, k)
-            after = x + combine(tableau.b, k)
-        else:
-            found = explicit_rows.stages(tableau, field, start, end, x)
-            after = explicit_rows.end_of_row(tableau, h, x, found.slopes)
+        k = self.load_increments(graph) if tableau.coupled else []
+        found = explicit_rows.stages(tableau, field, start, end, x, k)
+        after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         stores, factors = store_all("x_after", 0, after), None
         if self.order > Order.COST:
             at_points = found.states
@@ -232,9 +226,8 @@ class Kernels:
                 found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
                 at_points = at_points + (found.slopes if moving else [])
             stores += store_all("X", 0, np.concatenate(at_points))
-        if kept:
-            stores += store_all("kept", 0, np.concatenate([values[-1] for values in at_stages]))
-        if self.with_tangents:
+            if kept:
+                stores += store_all("kept", 0, np.concatenate([values[-1] for values in at_stages]))
             # X_j', K_j' and x+' of `discretization.rows`, with one entry of each vector per unknown: for p this is (10)
             # of the paper discretized, and for tau the products with h' of the rows on both sides of it leave X^i, (8).
             Z = graph.loads("Z", n, vector=True)
@@ -297,8 +290,9 @@ class Kernels:
         ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
         # The mean of the derivatives at both ends times the change of (t, X) is how f would change if it were smooth.
         f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
-        row = Judged(first, middle, last, bend, times[1] - times[0], states[-1] - states[0], f_t, f_x)
-        self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * measure_jump(h, row, Namespace(graph)))
+        smooth = 0.5 * h * (times_vector(f_x, states[-1] - states[0]) + f_t * (times[1] - times[0]))
+        jump = measure_jump(first, middle, last, bend, smooth, Namespace(graph))
+        self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * jump)
 
     def _load_row(self, graph: Graph, tableau: Tableau) -> tuple[Objects, Node, list[Objects], list[Objects]]:
         """Return the state at the start of a row, its length, the states at its stages, those of `invert_stages`."""
@@ -330,8 +324,8 @@ class Kernels:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
         Return which entries of the second derivative along (t, x, p) are stored for each stage. If time is among them,
-        c_j is stored after them. `factors` are those that the forward step keeps, None if it has no tangents. The row
-        of a `late` sample belongs to no segment: no node lies at its ends, so that no jump is added to the costate.
+        c_j is stored after them. `factors` are those that the forward step of an implicit row keeps. The row of a
+        `late` sample belongs to no segment: no node lies at its ends, so that no jump is added to the costate.
         """
         graph, n = Graph(), self.sizes.n
         at, (start, _, h), count = self._row(graph), self._load_times(graph), len(tableau.b)
@@ -353,22 +347,19 @@ class Kernels:
 
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
             given = at(times[j], states[j], w, hb)
-            only = GRADIENT + (SECOND if self.with_tangents else ())
-            g_t, g_x, g_p, *rest = stage(graph, *given, only=only, checked=True, known=known[j])
-            if self.with_tangents:
-                second[j] = list_entries(rest, with_time=moving)
+            g_t, g_x, g_p, *rest = stage(graph, *given, only=GRADIENT + SECOND, checked=True, known=known[j])
+            second[j] = list_entries(rest, with_time=moving)
             if moving:
                 slopes[j] = stage(graph, *given, only=SLOPES, known=known[j])
             return g_t.item(), g_x, g_p
 
-        if tableau.coupled:
+        if factors is not None:
             # The w_j of an implicit row depend on one another: its matrix is factorized from D_1 f at all stages before
             # any `pull`.
             points = zip(times, states, known, strict=True)
-            of_x = [stage(graph, *at(t, X), only=(F_X, ELL_X), known=kept_there) for t, X, kept_there in points]
-            f_x, ell_x = zip(*of_x, strict=True)
-            factors = eliminate(tableau.a, h, f_x) if factors is None else factors.load(graph)
-            found = implicit_rows.adjoint(tableau, h, psi, pull, ell_x, factors)
+            of_x = [stage(graph, *at(t, X), only=(ELL_X,), known=kept_there) for t, X, kept_there in points]
+            ell_x = [each[0] for each in of_x]
+            found = implicit_rows.adjoint(tableau, h, psi, pull, ell_x, factors.load(graph))
         else:
             found = explicit_rows.adjoint(tableau, h, psi, pull)
         # A late sample ends a row of its own, which starts where the row around it does: `late` is its costate there.
@@ -402,7 +393,7 @@ class Kernels:
         stores.append(("g", 0, as_vector(graph, g)))
         # One list of entries for all stages: what is a structural zero at each is neither stored nor multiplied.
         chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
-        for j in range(count if self.with_tangents else 0):
+        for j in range(count):
             values = [second[j][key] for key in chosen] + [graph.constant(tableau.c[j])] * _has_time(chosen)
             stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
         self.module.write_straight_line(name, stores + graph.check())
@@ -416,7 +407,7 @@ class Kernels:
         """
         stages = len(tableau.b)
         key = stages, tuple(chosen)
-        if self.order >= Order.HESSIAN and chosen and key not in self._curvatures:
+        if chosen and key not in self._curvatures:
             at_once = self.curvature(name, chosen, tableau)
             self._curvatures[key] = Curvature(name, len(chosen) + _has_time(chosen), range(0, stages, at_once))
         return self._curvatures.get(key, Curvature())
@@ -649,17 +640,14 @@ class Kernels:
         if moving:
             g = g + g_t.item() * graph.load("moves", 0, vector=True)
         stores = [("g", 0, as_vector(graph, g))]
-        if self.with_tangents:
-            D = self.sizes.D
-            of_time = graph.constant(0.0), [graph.constant(0.0)] * D
-            if moving:
-                of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
-            H = [graph.load("H", d, vector=True) for d in range(D)]
-            along = [of_time, *self._state_directions(graph, "Z")]
-            stores += _store_changed_rows(
-                H, self._add_curvature(graph, H, list_entries(second, with_time=moving), along)
-            )
-        return stores
+        D = self.sizes.D
+        of_time = graph.constant(0.0), [graph.constant(0.0)] * D
+        if moving:
+            of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
+        H = [graph.load("H", d, vector=True) for d in range(D)]
+        along = [of_time, *self._state_directions(graph, "Z")]
+        sums = self._add_curvature(graph, H, list_entries(second, with_time=moving), along)
+        return stores + _store_changed_rows(H, sums)
 
     def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
         """Return stores that add a cost at a node to J, g, H and the costate."""
@@ -676,13 +664,12 @@ class Kernels:
         if self.order == Order.COST:
             return stores
         _, c_t, c_x, c_p, *derivatives = found
-        if self.with_tangents:
-            # The row of the Jacobian follows forward, by Z; lam . c goes backward with the costate, as a cost, for the
-            # Lagrangian.
-            c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
-            if moving:
-                c_d = c_d + c_t * graph.load("moves", 0, vector=True)
-            stores += store_all("jacobian", 0, [as_vector(graph, value) for value in c_d])
+        # The row of the Jacobian follows forward, by Z; lam . c goes backward with the costate, as a cost, for the
+        # Lagrangian.
+        c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
+        if moving:
+            c_d = c_d + c_t * graph.load("moves", 0, vector=True)
+        stores += store_all("jacobian", 0, [as_vector(graph, value) for value in c_d])
         stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 

@@ -30,7 +30,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -39,6 +39,8 @@ from numpy.typing import NDArray
 
 from switchfit.engine.native.scalars import FROM_LIBM, OPERATIONS, Node, Operation, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
+
+Found = TypeVar("Found")
 
 Operand = Any
 """A `Value`, or a number of the type that the other operand has."""
@@ -416,9 +418,6 @@ NEEDED_NEXT = "scipy.linalg.lapack", "scipy.special"
 LOOKUP = 3
 """Cost of a table lookup, in additions."""
 
-BUDGET = 20_000_000
-"""Work, in additions, after which a loop returns to Python, which then handles Ctrl-C. Measured: 2 to 10 ms."""
-
 
 class Module:
     """Text of LLVM functions, collected one by one and taken in parts.
@@ -621,6 +620,18 @@ class Workspace:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.memory = np.zeros(0)
+        self._running: Future[None] | None = None
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Call a function that works here for long, in a thread: Python handles Ctrl-C only while it is not in it."""
+        self._running = ThreadPoolExecutor(1).submit(function)
+        self.finish()
+
+    def finish(self) -> None:
+        """Wait for a call that Ctrl-C has left, and that still works here."""
+        if self._running is not None:
+            wait_for(self._running)
+            self._running = None
 
     def reserve(self, size: int) -> None:
         """Allocate at least `size` doubles; the contents may be lost."""
@@ -636,8 +647,6 @@ class Program:
     key : str
         Hash of the module, the same in every process.
     workspace : Workspace
-    layouts : dict
-        Layout of the memory that each order of derivatives works on, built by its first experiment.
     row_work : list of int
         Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
     pointers : dict
@@ -647,7 +656,6 @@ class Program:
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
         self.workspace = Workspace()
-        self.layouts: dict[int, Any] = {}
         self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
         self._functions: dict[str, Any] = {}
@@ -690,7 +698,7 @@ def compile_modules(texts: Iterable[str]) -> Program:
         if any(isinstance(code, Future) for _, code in codes):
             for name in NEEDED_NEXT:  # Python would only wait for LLVM
                 import_module(name)
-        found = [_wait_for(code, path) if isinstance(code, Future) else code for path, code in codes]
+        found = [_wait_for_code(code, path) if isinstance(code, Future) else code for path, code in codes]
     finally:
         executor.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for LLVM
     # One engine links the objects of all modules: addresses of functions in others are known only then.
@@ -710,11 +718,16 @@ def _compile_to_object_code(text: str) -> bytes:
     return bytes(_create_machine().emit_object(llvm.parse_assembly(text)))
 
 
-def _wait_for(future: Future[bytes], path: Path | None) -> bytes:
-    """Wait for a compilation, which takes seconds for long functions, so that Ctrl-C can interrupt; keep its code."""
+def wait_for(future: Future[Found]) -> Found:
+    """Wait for a result so that Ctrl-C can interrupt."""
     while not wait([future], timeout=0.1).done:  # on Windows, a wait without timeout cannot be interrupted
         pass
-    code = future.result()
+    return future.result()
+
+
+def _wait_for_code(future: Future[bytes], path: Path | None) -> bytes:
+    """Wait for a compilation, which takes seconds for long functions; keep its code."""
+    code = wait_for(future)
     if path is not None:
         write_code(path, code)
     return code

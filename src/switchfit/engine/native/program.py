@@ -13,10 +13,6 @@ Loops that call the straight-line functions of `switchfit.engine.native.kernels`
 Rows are numbered by ``cell + segment``: each transition cuts one cell in two. The mode of a segment, and the reset map
 and other functions of a transition, are read at run time. Segments that a sequence does not need are idle: they begin
 and end at tf.
-
-Python handles Ctrl-C only between two calls. Loops therefore return when a budget is spent, and resume at the next
-call. Their state between two calls is `progress`, three integers: the phase of the evaluation (-1 at its end), the
-number of finished iterations of the loop in this phase, and the rest of the budget (`llvm.BUDGET`).
 """
 
 from __future__ import annotations
@@ -31,18 +27,15 @@ from operator import mul
 from switchfit.discretization.rows import STIFF
 from switchfit.engine.native.adaptive import TIMES, Adaptive, write_slope, write_step
 from switchfit.engine.native.kernels import Curvature, Kernels
-from switchfit.engine.native.llvm import BUDGET, Module, Operand, Program, Value, Variable, compile_modules
+from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variable, compile_modules
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import (
-    USUAL_ITERATIONS,
     constraint_pointers,
     estimate_row,
     solve_stages,
     state_pointers,
     write_backward,
-    write_backward_rows,
     write_forward,
-    write_forward_rows,
     write_late_samples,
     write_late_states,
     write_newton,
@@ -50,7 +43,7 @@ from switchfit.engine.native.segments import (
 )
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, list_place_lengths, memory, sums
+from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, list_place_lengths
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
@@ -79,7 +72,6 @@ def write_handler(writer: Writer) -> str:
     names = [*GIVEN, *(f"{name} {k}" for k in range(measurements) for name in OF_SAMPLES)]
     (frame,) = writer.begin("ptr @xla_handler(ptr %frame)")
     table = writer.allocate("ptr", len(writer.names) + len(OF_SAMPLES) * measurements)
-    progress = writer.allocate("i64", 3)
     extension = writer.load("ptr", writer.into(frame, EXTENSION))
     with writer.when(extension.differs("null")), writer.when(writer.load("i32", writer.into(extension, 8)).equals(1)):
         metadata = writer.load("ptr", writer.into(extension, 24))  # XLA queries the version of the interface
@@ -108,67 +100,43 @@ def write_handler(writer: Writer) -> str:
     with writer.loop(0, repeats) as which:
         found = {name: writer.at(data[name], which, strides[name]) for name in names}
         rows = writer.get("i64", found["first_cell"], sizes.N + 1) + (sizes.N + 1)
-        parts = sums(library, sizes)
+        parts = writer.layout.sums
         own_totals, position = writer.at(totals, which, sum(parts.values())), 0
         for name, length in parts.items():
             found[name] = writer.at(own_totals, position)
             position += length
         writer.zero(own_totals, position)
         place: Operand = 0
-        for name, extent in memory(library, sizes, writer.order).items():
+        for name, extent in writer.layout.memory.items():
             found[name], count = writer.at(between, place), rows * extent.each_row + extent.fixed
             if name in ZEROED:
                 writer.zero(found[name], count)
             place = count + place
         for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
             writer.put(found[name], table, k)
-        writer.store("[i64 0, i64 0, i64 9223372036854775807]", progress, "[3 x i64]")  # unlimited budget
-        writer.invoke("evaluate", table, progress, *(lengths[f"{OF_SAMPLES[0]} {k}"] for k in range(measurements)))
+        writer.invoke("evaluate", table, *(lengths[f"{OF_SAMPLES[0]} {k}"] for k in range(measurements)))
     return writer.end("ptr null")
 
 
-UNLIMITED = 2**63 - 1
-"""A budget that no evaluation spends."""
-
-
 def write_evaluation(writer: Writer) -> str:
-    """Write `evaluate`, which runs all phases in order; the loops among them return whether they are finished.
-
-    The phases are the segments forward, the samples of each Measurements, the terminal terms, and the segments
+    """Write `evaluate`: the segments forward, the samples of each Measurements, the terminal terms, and the segments
     backward.
     """
-    N, K = writer.sizes.N, len(writer.library.measurements)
-    of_samples = "".join(f", i64 %count_{k}" for k in range(K))
-    table, progress, *counts = writer.begin(f"void @evaluate(ptr %table, ptr %progress{of_samples})")
+    N = writer.sizes.N
+    of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
+    table, *counts = writer.begin(f"void @evaluate(ptr %table{of_samples})")
     found = writer.pointers()
-    # Phases: 0 start, 1 .. N + 1 segments forward, then K samples, the end, segments N .. 0 backward, the start
-    # backward. A phase that runs out of budget stores its number and returns: the next call goes on there, and Python
-    # can see Ctrl-C.
-    backward = N + K + 3
-    with writer.repeat():
-        phase = writer.load("i64", progress)
-        is_done = Variable(writer, "i1", True)
-        with writer.when(phase.equals(0)):
-            first = state_pointers(writer, found, 0)
-            writer.call("start", found | {f"{name}_after": pointer for name, pointer in first.items()})
-        with writer.when((phase > 0) & (phase <= N + 1)):
-            is_done.value = writer.invoke("forward_any", table, phase - 1, progress, returns="i1")
-        for k, count in enumerate(counts, start=N + 2):
-            with writer.when(phase.equals(k)):
-                is_done.value = writer.invoke(f"samples_{k - N - 2}", table, count, progress, returns="i1")
-        with writer.when(phase.equals(backward - 1)):
-            _call_end(writer, found)
-        if writer.order > Order.COST:
-            with writer.when((phase >= backward) & (phase <= backward + N)):
-                is_done.value = writer.invoke("backward_any", table, backward + N - phase, progress, returns="i1")
-            with writer.when(phase > backward + N):
-                writer.call("start_back", found | {"jump": found["jumps"]})
-        with writer.when(is_done.value.equals(False)):
-            writer.line("ret void")
-        last = phase >= (backward + N + 1 if writer.order > Order.COST else backward - 1)
-        writer.store(last.choose(-1, phase + 1), progress)
-        with writer.when(last):
-            writer.line("ret void")
+    first = state_pointers(writer, found, 0)
+    writer.call("start", found | {f"{name}_after": pointer for name, pointer in first.items()})
+    with writer.loop(0, N + 1) as segment:
+        writer.invoke("forward", table, segment)
+    for k, count in enumerate(counts):
+        writer.invoke(f"samples_{k}", table, count)
+    _call_end(writer, found)
+    if writer.order > Order.COST:
+        with writer.loop(0, N + 1) as turn:
+            writer.invoke("backward", table, N - turn)
+        writer.call("start_back", found | {"jump": found["jumps"]})
     return writer.end()
 
 
@@ -177,47 +145,41 @@ def _call_end(writer: Writer, found: Pointers) -> None:
     N, library = writer.sizes.N, writer.library
     last = state_pointers(writer, found, writer.get("i64", found["first_cell"], N + 1) + (N + 1))
     # No row follows the end: what the terminal terms add to the costate goes to psi itself.
-    given = found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.rows["end"])
+    given = (
+        found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
+    )
     for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
         writer.call(name, given)
 
 
 def write_costs(writer: Writer) -> str:
-    """Write the loop over schedules that evaluates J of each; it returns how many it has done.
+    """Write the loop over schedules that evaluates J of each.
 
     `places` has for each the arrays of `list_place_lengths`, one after the other, and `bounds` and `first_cell` are as
     in `writer.GIVEN`; J and the finiteness check of each come to `found`.
     """
     N, lengths = writer.sizes.N, list_place_lengths(writer.sizes.N)
-    given = "ptr %done, i64 %count, ptr %places, ptr %bounds, ptr %first_cell, ptr %found"
+    given = "i64 %count, ptr %places, ptr %bounds, ptr %first_cell, ptr %found"
     of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
     signature = f"void @all_costs(ptr %table, {given}{of_samples})"
-    table, done, count, places, bounds, first_cell, results, *counts = writer.begin(signature)
-    pointers, progress = writer.pointers(), writer.allocate("i64", 3)
-    k, budget = Variable(writer, "i64", 0), Variable(writer, "i64", BUDGET)
-    with writer.repeat() as leave:
-        which = k.value
+    table, count, places, bounds, first_cell, results, *counts = writer.begin(signature)
+    pointers = writer.pointers()
+    with writer.loop(0, count) as which:
         place = writer.at(places, which, sum(lengths.values()))
         for name, length in lengths.items():
             writer.copy(pointers[name], place, length)
             place = writer.at(place, length)
         for name, source in (("bounds", bounds), ("first_cell", first_cell)):
             writer.copy(pointers[name], writer.at(source, which, N + 2), N + 2)
-        parts = sums(writer.library, writer.sizes)
+        parts = writer.layout.sums
         # The sums are one block of memory, so that one call clears all of them.
         writer.zero(pointers[next(iter(parts))], sum(parts.values()))
-        for name, extent in memory(writer.library, writer.sizes, writer.order).items():
+        for name, extent in writer.layout.memory.items():
             if name in ZEROED and extent.fixed:
                 writer.zero(pointers[name], extent.fixed)
-        writer.store(f"[i64 0, i64 0, i64 {UNLIMITED}]", progress, "[3 x i64]")
-        writer.invoke("evaluate", table, progress, *counts)
+        writer.invoke("evaluate", table, *counts)
         for entry, name in enumerate(("J", CHECKED)):
             writer.put(writer.load("double", pointers[name]), writer.at(results, which, 2), entry)
-        # Work of this schedule, by what is left of a budget that no evaluation spends.
-        budget.value = budget.value - (UNLIMITED - writer.get("i64", progress, 2))
-        k.value = which + 1
-        leave((k.value >= count) | (budget.value <= 0))
-    writer.store(k.value, done)
     return writer.end()
 
 
@@ -259,25 +221,20 @@ def _store_moment(writer: Writer, found: Pointers, cells: Value, time: Value, mo
 def write_adaptive_solve(writer: Writer, mode: int) -> str:
     """Write the loop over adaptive steps in one mode; it stores the times of accepted steps.
 
-    It ends at the end time, after `most` accepted steps, when the solver is stuck, or when the budget is spent.
-    Rejected steps count for the budget too.
+    It ends at the end time, after `most` accepted steps, or when the solver is stuck.
     """
-    n, at, module, is_implicit = writer.sizes.n, Adaptive(), writer.module, writer.library.implicit[mode]
+    n, at, is_implicit = writer.sizes.n, Adaptive(), writer.library.implicit[mode]
     given = "i64 %cells, ptr %state, ptr %y, ptr %rows, i64 %most, ptr %count"
     _, cells, state, y, rows, most, count = writer.begin(f"void @adaptive_{mode}_steps(ptr %table, {given})")
-    effort = module.work(f"step_{mode}")
-    effort += USUAL_ITERATIONS * module.work(f"newton_step_{mode}") if is_implicit else 0
-    found, tried = writer.pointers() | {"state": state, "y": y}, Variable(writer, "i64", 0)
+    found = writer.pointers() | {"state": state, "y": y}
     lengths = {"increments": len(STIFF.b) * n, "newton": 2}
     found |= {name: writer.allocate("double", length) for name, length in lengths.items()}
     found["J"] = found["newton"]  # NaN if the iterations do not converge, as the increments are
     writer.store(0, count, "i64")
     with writer.repeat() as leave:
         t, end, stuck, step = (writer.get("double", state, k) for k in (at.t, at.end, at.stuck, at.step))
-        # Go on while t < end, not stuck, room for accepted times, and tries within the budget.
-        goes_on = (t < end) & stuck.equals(0.0) & (writer.load("i64", count) < most)
-        leave((goes_on & (tried.value < max(1, BUDGET // effort))).equals(False))
-        tried.value = tried.value + 1
+        # Go on while t < end, not stuck, and with room for accepted times.
+        leave(((t < end) & stuck.equals(0.0) & (writer.load("i64", count) < most)).equals(False))
         for j, c in enumerate(TIMES[is_implicit]):
             found[f"moment{j}"] = writer.allocate("double", 2)
             found[f"signal{j}"] = _store_moment(writer, found, cells, t + step * c, found[f"moment{j}"])
@@ -297,7 +254,7 @@ _one_at_a_time = threading.Lock()
 
 log = logging.getLogger("switchfit")
 
-PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
+PREFIX = {Order.COST: "plain_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
 """Prefix of the names of functions, by the order of their derivatives."""
 
 
@@ -366,15 +323,15 @@ def drop_programs() -> None:
 def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
     """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest.
 
-    With second derivatives, the work of a row of each mode is stored in `row_work`.
+    With derivatives, the work of a row of each mode is stored in `row_work`.
     """
     kernels = Kernels(library, sizes, order, module)
-    writer = Writer(library, sizes, order, kernels, module)
+    writer = Writer(library, sizes, order, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     curvatures = []
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
-        if order >= Order.HESSIAN:
+        if order > Order.COST:
             row_work[mode] = estimate_row(writer, mode, curvatures[mode]["inner"])
         yield module.take()
     kernels.nodes()
@@ -390,14 +347,13 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
         module.add(write_loop(writer, name))
     kernels.state()
-    loops: list[Callable[[Writer], str]] = [write_forward_rows, write_forward, write_evaluation]
+    loops: list[Callable[[Writer], str]] = [write_forward, write_evaluation]
     if order == Order.COST:
         loops.append(write_costs)
     else:
-        loops += [partial(write_backward_rows, curvatures=curvatures), write_backward]
-    if order != Order.GRADIENT:
-        kernels.outputs()
-        module.add(write_loop(writer, "outputs"))
+        loops.append(partial(write_backward, curvatures=curvatures))
+    kernels.outputs()
+    module.add(write_loop(writer, "outputs"))
     if order == Order.HESSIAN:
         loops.append(write_handler)
     for write in loops:
@@ -429,9 +385,9 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kernels.length()
     if order > Order.COST and late and mode == 0:
         kernels.end_of_late()
-    if order >= Order.HESSIAN:
+    if order > Order.COST:
         kernels.judge_row(mode, stage, tableau)
-    if order == Order.COST:
+    else:
         write_slope(kernels, mode, stage)
         module.add(write_loop(writer, f"slope_{mode}"))
         write_step(kernels, mode, stage)

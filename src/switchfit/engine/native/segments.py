@@ -12,7 +12,7 @@ from switchfit.discretization.rows import STIFF
 from switchfit.engine.native.kernels import STAGES, Curvature, count_kept
 from switchfit.engine.native.llvm import Operand, Value
 from switchfit.engine.native.templates import Order
-from switchfit.engine.native.writer import WHOLE, Pointers, Writer
+from switchfit.engine.native.writer import Pointers, Writer
 
 KINDS = "inner", "end"
 """Rows that do not move with theta, and those beside a transition, which do."""
@@ -88,7 +88,7 @@ NEWTON_ITERATIONS = 15
 """Largest number of Newton's iterations; where it converges at all, the sharpest models take 10."""
 
 USUAL_ITERATIONS = 5
-"""Iterations that count for the budget."""
+"""Iterations that count for the work of a row."""
 
 
 def write_newton(writer: Writer, name: str) -> str:
@@ -112,7 +112,6 @@ def write_newton(writer: Writer, name: str) -> str:
 def solve_stages(writer: Writer, name: str, given: Pointers) -> None:
     """Emit the call that computes the increments of an implicit row by the iterations of `write_newton`."""
     writer.invoke(f"solve_{name}", *(given[key] for key in (*writer.module.pointers[name], "J")))
-    writer.work += USUAL_ITERATIONS * writer.module.work(name)
 
 
 def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
@@ -120,41 +119,6 @@ def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
     names = [f"forward_inner_{mode}", f"backward_inner_{mode}", *(curvature.name for _ in curvature.stages)]
     newton = USUAL_ITERATIONS * writer.module.work(f"newton_{mode}") if writer.library.implicit[mode] else 0
     return newton + sum(map(writer.module.work, names))
-
-
-def write_forward_rows(writer: Writer) -> str:
-    """Write the loop over all rows of a segment, forward, from the state `x` and its derivative `Z`."""
-    _, segment, _, x, Z = writer.begin(f"i1 @forward_rows({WHOLE}, ptr %x, ptr %Z)")
-    found = writer.pointers()
-    first, last, count = _find_cells(writer, found, segment)
-    # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
-    flag = writer.get("i64", found["modes"], writer.sizes.N + 1)
-    mode, modes = writer.get("i64", found["modes"], segment), len(writer.library.modes)
-    with writer.turns(count) as turn:
-        given, case = row_pointers(writer, found, segment, first + turn, last)
-        # The first row begins behind the reset map, whose state is not among those of the rows.
-        given |= {name: given["first"].choose(start, given[name]) for name, start in (("x", x), ("Z", Z))}
-        for k, kind in row_cases(writer, case):
-            if writer.library.implicit[k]:
-                solve_stages(writer, f"newton_{k}", given)
-            writer.call(f"forward_{kind}_{k}", given)
-        for level, name in enumerate(("error", "jump") if writer.order >= Order.HESSIAN else ()):
-            for k in writer.cases((flag > level).choose(mode, -1), modes):
-                writer.call(f"{name}_{k}", given)
-    return writer.end()
-
-
-def write_backward_rows(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -> str:
-    """Write the loop over all rows of a segment, backward; `curvatures` are those of `KINDS` for each mode."""
-    _, segment, _ = writer.begin(f"i1 @backward_rows({WHOLE})")
-    found = writer.pointers()
-    _, last, count = _find_cells(writer, found, segment)
-    with writer.turns(count) as turn:
-        given, case = row_pointers(writer, found, segment, last - turn, last)
-        for k, kind in row_cases(writer, case):
-            writer.call(f"backward_{kind}_{k}", given)
-            add_curvature(writer, curvatures[k][kind], given, moving=kind == "end")
-    return writer.end()
 
 
 def add_curvature(writer: Writer, curvature: Curvature, given: Pointers, moving: bool) -> None:
@@ -175,13 +139,6 @@ def _find_cells(writer: Writer, found: Pointers, segment: Value) -> tuple[Value,
     """Emit the first and the last cell of a segment, and their number."""
     first, last = (writer.get("i64", found["first_cell"], k) for k in (segment, segment + 1))
     return first, last, last - first + 1
-
-
-def _call_rows(writer: Writer, name: str, *given: Value) -> None:
-    """Emit the call of a loop over rows, and return unless it is done."""
-    done = writer.invoke(name, *given, returns="i1")
-    with writer.when(done.equals(False)):
-        writer.line("ret i1 false")
 
 
 def find_reset(writer: Writer, found: Pointers, segment: Value, opens: Value) -> tuple[Value, Pointers]:
@@ -206,22 +163,35 @@ def choose_state(which: Value, given: Pointers, state: Pointers) -> Pointers:
 
 def write_forward(writer: Writer) -> str:
     """Write a segment forward: its reset map, its rows, and the functions at its end."""
-    table, segment, progress = writer.begin(f"i1 @forward_any({WHOLE})")
+    _, segment = writer.begin("void @forward(ptr %table, i64 %segment)")
     found = writer.pointers()
-    first, last, _ = _find_cells(writer, found, segment)
-    state = state_pointers(writer, found, first + segment)
+    first, last, count = _find_cells(writer, found, segment)
+    start = state_pointers(writer, found, first + segment)
     if writer.library.reset_maps:
         which, given = find_reset(writer, found, segment, segment > 0)
         for k in writer.cases(which, len(writer.library.reset_maps)):
-            writer.call(f"reset_{k}", found | state | given)
-        state = choose_state(which, given, state)
-    _call_rows(writer, "forward_rows", table, segment, progress, state["x"], state["Z"])
+            writer.call(f"reset_{k}", found | start | given)
+        start = choose_state(which, given, start)
+    # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
+    flag = writer.get("i64", found["modes"], writer.sizes.N + 1)
+    mode, modes = writer.get("i64", found["modes"], segment), len(writer.library.modes)
+    with writer.loop(0, count) as turn:
+        given, case = row_pointers(writer, found, segment, first + turn, last)
+        # The first row begins behind the reset map, whose state is not among those of the rows.
+        given |= {name: given["first"].choose(start[name], given[name]) for name in ("x", "Z")}
+        for k, kind in row_cases(writer, case):
+            if writer.library.implicit[k]:
+                solve_stages(writer, f"newton_{k}", given)
+            writer.call(f"forward_{kind}_{k}", given)
+        for level, name in enumerate(("error", "jump") if writer.order > Order.COST else ()):
+            for k in writer.cases((flag > level).choose(mode, -1), modes):
+                writer.call(f"{name}_{k}", given)
     after = last + segment + 1
     given = found | state_pointers(writer, found, after)
     # Once per segment: what is not finite stays so to its end.
     writer.call("check_state", given)
     _call_transition_functions(writer, given, segment, last, after)
-    return writer.end("i1 true")
+    return writer.end()
 
 
 def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, last: Value, after: Value) -> None:
@@ -237,7 +207,7 @@ def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, 
     for kind in AT_TRANSITIONS:
         count = len(getattr(writer.library, kind.name))
         if kind.constraint and count:
-            given |= constraint_pointers(writer, found, segment + writer.rows[kind.name])
+            given |= constraint_pointers(writer, found, segment + writer.layout.constraint_rows[kind.name])
         for k in writer.cases(writer.get("i64", found[kind.name], segment), count):
             writer.call(f"{kind.name}_{k}", given)
 
@@ -251,29 +221,35 @@ def constraint_pointers(writer: Writer, found: Pointers, row: Operand) -> Pointe
     }
 
 
-def write_backward(writer: Writer) -> str:
-    """Write a segment backward: its rows, then the reset map at its start."""
-    table, segment, progress = writer.begin(f"i1 @backward_any({WHOLE})")
+def write_backward(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -> str:
+    """Write a segment backward: its rows, then the reset map at its start; `curvatures` are those of `KINDS` for each
+    mode.
+    """
+    _, segment = writer.begin("void @backward(ptr %table, i64 %segment)")
     found = writer.pointers()
-    _call_rows(writer, "backward_rows", table, segment, progress)
+    first, last, count = _find_cells(writer, found, segment)
+    with writer.loop(0, count) as turn:
+        given, case = row_pointers(writer, found, segment, last - turn, last)
+        for k, kind in row_cases(writer, case):
+            writer.call(f"backward_{kind}_{k}", given)
+            add_curvature(writer, curvatures[k][kind], given, moving=kind == "end")
     if writer.library.reset_maps:
-        first, _, _ = _find_cells(writer, found, segment)
         state = state_pointers(writer, found, first + segment)
         which, given = find_reset(writer, found, segment, segment > 0)
         for k in writer.cases(which, len(writer.library.reset_maps)):
             # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
             # before.
             writer.call(f"reset_back_{k}", found | state | given)
-    return writer.end("i1 true")
+    return writer.end()
 
 
 def write_samples(writer: Writer, k: int) -> str:
     """Write the loop over the samples of the k-th Measurements, which are at the ends of rows."""
-    _, count, _ = writer.begin(f"i1 @samples_{k}(ptr %table, i64 %count, ptr %progress)")
+    _, count = writer.begin(f"void @samples_{k}(ptr %table, i64 %count)")
     found, own = writer.pointers(), writer.samples_of(k)
     # The state at the end of a cell is that of the last row inside it: cell + (segments begun in it or before) + 1.
     begins = [writer.get("i64", found["first_cell"], i) for i in range(1, writer.sizes.N + 1)]
-    with writer.turns(count) as sample:
+    with writer.loop(0, count) as sample:
         cell = writer.get("i64", own["cell"], sample)
         index = sum(((cell >= begin).to("i64") for begin in begins), cell + 1)
         given = found | state_pointers(writer, found, index) | _sample_pointers(writer, k, own, sample)
@@ -325,9 +301,9 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
 
     `curvatures` have for each mode what adds the second derivatives of such a row to H.
     """
-    _, count, _ = writer.begin(f"i1 @samples_{k}(ptr %table, i64 %count, ptr %progress)")
+    _, count = writer.begin(f"void @samples_{k}(ptr %table, i64 %count)")
     found, own = writer.pointers(), writer.samples_of(k)
-    with writer.turns(count) as sample:
+    with writer.loop(0, count) as sample:
         given, mode = _write_late_row(writer, k, found, own, sample)
         # A late sample is forward and backward at once, as nothing follows it: psi = D_x l at its end, and what is left
         # at its start waits in `late` for the backward step of the row around it.

@@ -38,12 +38,11 @@ SECOND = tuple(range(11, 17))
 
 
 class Order(IntEnum):
-    """What a program computes: each order includes those before it, but GAUSS_NEWTON has its matrix for the Hessian."""
+    """What a program computes: J alone, or with the gradient and the Hessian or the Gauss-Newton matrix."""
 
     COST = 0
-    GRADIENT = 1
-    HESSIAN = 2
-    GAUSS_NEWTON = 3
+    HESSIAN = 1
+    GAUSS_NEWTON = 2
 
 
 @dataclass(frozen=True)
@@ -262,7 +261,7 @@ class Templates:
                 each = [model.observe(observe, t, x, p) for observe, _ in self.library.outputs]
                 return jnp.concatenate([jnp.zeros(0), *each])
 
-            return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.order > Order.GRADIENT else ())]
+            return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.order > Order.COST else ())]
 
         return self._trace(outputs, (), (self.sizes.n,), (self.sizes.M,), name="observe")
 
@@ -293,9 +292,8 @@ class Templates:
         """Return the derivatives of the order; at order GAUSS_NEWTON, the second ones are given."""
         if self.order == Order.COST:
             return []
-        second = []  # first, since the machine code of both is then a little faster
-        if self.order != Order.GRADIENT:
-            second = gauss_newton() if self.order == Order.GAUSS_NEWTON else _list_second(value, t, x, p)
+        # First, since the machine code of both is then a little faster.
+        second = gauss_newton() if self.order == Order.GAUSS_NEWTON else _list_second(value, t, x, p)
         return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), *second]
 
     def _no_second(self) -> list[Any]:

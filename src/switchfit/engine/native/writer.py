@@ -1,4 +1,4 @@
-"""Emit LLVM IR of a library: the table of pointers, calls of functions, loops that return when a budget is spent.
+"""Emit LLVM IR of a library: the table of pointers, and calls of functions.
 
 Layout of the memory that machine code reads and writes, shared by calls from Python and from XLA.
 
@@ -9,12 +9,12 @@ each Measurements what `OF_SAMPLES` lists. Sizes count doubles; those of the scr
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import lru_cache
 from typing import NamedTuple
 
 from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.discretization.rows import STIFF
-from switchfit.engine.native.kernels import STAGES, Kernels, count_kept, has_jumps
+from switchfit.engine.native.kernels import STAGES, count_kept, has_jumps
 from switchfit.engine.native.llvm import Lines, Module, Operand, Value
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes
@@ -85,21 +85,21 @@ def sums(library: Structure, sizes: Sizes) -> dict[str, int]:
 def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
     """Return the sizes of the parts of the scratch space."""
     n, N, width = sizes.n, sizes.N, sizes.width
-    second, first = int(order >= Order.HESSIAN), int(order >= Order.GRADIENT)
+    derivatives = int(order > Order.COST)
     resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
     implicit = int(any(library.implicit))
     late = int(any(sensor.delay is not None for sensor in library.measurements))
     return {
         "states": Length(n, n),
         "reset_states": Length(N * n * resets),
-        "tangents": Length(n * width, n * width * second),
+        "tangents": Length(n * width, n * width * derivatives),
         "reset_tangents": Length(N * n * width * resets),
-        "stages": Length(0, STAGES * n * first),
-        "stage_tangents": Length(0, STAGES * n * width * second),
-        "kept": Length(0, count_kept(library, n, order) * first),
-        "jumps": Length(n, n * first * jumps),
-        "late": Length(0, n * first * late),
-        "costates": Length(0, n * first),
+        "stages": Length(0, STAGES * n * derivatives),
+        "stage_tangents": Length(0, STAGES * n * width * derivatives),
+        "kept": Length(0, count_kept(library, n, order) * derivatives),
+        "jumps": Length(n, n * derivatives * jumps),
+        "late": Length(0, n * derivatives * late),
+        "costates": Length(0, n * derivatives),
         "increments": Length(len(STIFF.b) * n * implicit),
         "newton": Length(2 * implicit),
         "entries": Length(STAGES * (1 + n + sizes.M) ** 2),
@@ -116,35 +116,31 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
     }
 
 
-class Layout(NamedTuple):
-    """What `constraint_rows`, `sums` and `memory` return for one program and order, and the names in its table."""
-
-    constraint_rows: dict[str, int]
-    sums: dict[str, int]
-    memory: dict[str, Length]
-    pointers: tuple[str, ...]
-
-    @classmethod
-    def of(cls, library: Structure, sizes: Sizes, order: Order) -> Layout:
-        """Build the layout of a program's order."""
-        of_samples = [f"{name} {k}" for k in range(len(library.measurements)) for name in OF_SAMPLES]
-        names = (*pointers(library, sizes, order), *of_samples)
-        return cls(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order), names)
-
-
 ZEROED = ("jumps", "late")
 """Parts of the scratch space that start at zero."""
 
 
-def pointers(library: Structure, sizes: Sizes, order: Order) -> tuple[str, ...]:
-    """Return the names of the pointers in the table, except those of the samples."""
-    return (*GIVEN, *sums(library, sizes), *memory(library, sizes, order))
+class Layout(NamedTuple):
+    """What `constraint_rows`, `sums` and `memory` return for one program and order."""
+
+    constraint_rows: dict[str, int]
+    sums: dict[str, int]
+    memory: dict[str, Length]
+
+    @property
+    def pointers(self) -> tuple[str, ...]:
+        """The names in its table, except those of the samples."""
+        return (*GIVEN, *self.sums, *self.memory)
+
+
+@lru_cache(maxsize=64)
+def layout_of(library: Structure, sizes: Sizes, order: Order) -> Layout:
+    """Return the layout of the memory of a program."""
+    return Layout(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order))
 
 
 Pointers = dict[str, Value]
 """Addresses by the names of the pointers of straight-line functions."""
-
-WHOLE = "ptr %table, i64 %segment, ptr %progress"
 
 
 class Writer(Lines):
@@ -152,21 +148,17 @@ class Writer(Lines):
 
     Attributes
     ----------
-    library, sizes, order, kernels, module : as given
-    names : list of str
+    library, sizes, order, module : as given
+    layout : Layout
+    names : tuple of str
         Names of the pointers in the table.
-    rows : dict
-        First row of each kind of constraints, see `constraint_rows`.
-    work : int
-        Work of the functions that were called in the current iteration, in additions.
     """
 
-    def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
+    def __init__(self, library: Structure, sizes: Sizes, order: Order, module: Module) -> None:
         super().__init__()
-        self.library, self.sizes, self.order, self.kernels, self.module = library, sizes, order, kernels, module
-        self.names = pointers(library, sizes, order)
-        self.rows = constraint_rows(library, sizes)
-        self.work = 0
+        self.library, self.sizes, self.order, self.module = library, sizes, order, module
+        self.layout = layout_of(library, sizes, order)
+        self.names = self.layout.pointers
 
     def pointers(self) -> Pointers:
         """Load all pointers of the table."""
@@ -184,41 +176,17 @@ class Writer(Lines):
     def call(self, name: str, given: Pointers) -> None:
         """Emit the call of a straight-line function with its pointers."""
         self.invoke(name, *(given[key] for key in self.module.pointers[name]))
-        self.work += self.module.work(name)
 
     def cases(self, which: Value, count: int) -> Iterator[int]:
         """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
-        before, most, name = self.work, self.work, self.name_block()
+        name = self.name_block()
         cases = " ".join(f"i64 {k}, label %{name}_{k}" for k in range(count))
         self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
         for k in range(count):
             self.label(f"{name}_{k}")
-            self.work = before
             yield k
-            most = max(most, self.work)
             self.go_to(f"{name}_end")
         self.label(f"{name}_end")
-        self.work = most
-
-    @contextmanager
-    def turns(self, count: Value) -> Iterator[Value]:
-        """Emit the loop of a function, which begins where the last call left off and returns when the budget is spent.
-
-        The body is what is emitted inside; the value is its counter, which ends at `count`. `progress` has the number
-        of finished iterations and the rest of the budget.
-        """
-        finished, budget = self.at("%progress", 1), self.at("%progress", 2)
-        self.work = 0
-        with self.repeat() as leave:
-            turn = self.load("i64", finished)
-            yield turn
-            turns, left = turn + 1, self.load("i64", budget) - self.work
-            self.store(turns, finished)
-            self.store(left, budget)
-            done = turns >= count
-            leave(done | (left <= 0))
-        self.store(done.choose(0, turns), finished)
-        self.line(f"ret i1 {done}")
 
     def zero(self, pointer: Value, count: Operand) -> None:
         """Write zeros to `count` doubles."""
