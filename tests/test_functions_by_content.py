@@ -35,7 +35,6 @@ PLAIN = 1.0
 
 
 class Body:
-
     def __init__(self):
         self.g = 1.0
 

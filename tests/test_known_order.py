@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import decay as off
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
@@ -22,10 +23,6 @@ GUESS = {"power": sf.Parameter(2.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.4
 
 def on(t, x, p):
     return p["power"] - p["k"] * x
-
-
-def off(t, x, p):
-    return -p["k"] * x
 
 
 ROOM = sf.HybridSystem({"on": on, "off": off}, [0.2], state_names=("T",))
