@@ -82,7 +82,9 @@ def draw_mistakes(source: Path) -> Iterator[tuple[str, str, str, str, str]]:
     """Yield room, name, file, text and text with the mistake of each mistake that the rule draws."""
     for room in TESTS:
         found = [each for path in sorted((source / room).glob("*.py")) for each in _list_mistakes(path)]
-        for _, name, path, text, mistaken in sorted(found, key=lambda each: each[0])[:PER_ROOM]:
+        by_hash = {key: mistake for key, *mistake in found}  # one of those that a line has twice
+        for key in sorted(by_hash)[:PER_ROOM]:
+            name, path, text, mistaken = by_hash[key]
             yield room, name, str(path.relative_to(source)), text, mistaken
 
 

@@ -8,9 +8,9 @@ from itertools import pairwise
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
 
 import switchfit as sf
+from benchmarks.modes.truths import three_modes
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.protocol import Column, Hypotheses
@@ -316,47 +316,25 @@ def test_parameters_stay_inside_their_bounds():
 # Truths
 
 
-A = ([[-0.5, 2.0], [-2.0, -0.5]], [[-1.0, 0.5], [0.5, -0.2]], [[-0.1, -1.0], [1.0, -0.1]])
-B = ([1.0, 0.0], [0.0, 1.0], [-1.0, 1.0])
-SAMPLES = np.linspace(0.0, 12.0, 121)
+BASE = three_modes(0).problem
+SAMPLES = BASE.experiments[0].data[0].times
 
 
-def affine(k):
-    matrix, offset = np.array(A[k]), np.array(B[k])
-    return lambda t, x, p: p["a"] * (jnp.asarray(matrix) @ x) + jnp.asarray(offset)
+def draw_truth(seed):
+    """A random sequence of six modes, its times, and its samples where a = 1."""
+    truth = three_modes(seed)
+    return truth.sequence, truth.times, truth.problem.experiments[0].data[0].values.copy()
 
 
-SYSTEM = sf.HybridSystem({name: affine(k) for k, name in enumerate("uvw")}, [1.0, -1.0])
-
-
-def draw_truth(seed, segments=6):
-    """A random sequence of modes of at least a second each, with a = 1, and its samples without noise."""
-    rng = np.random.default_rng(seed)
-    sequence = [int(rng.integers(3))]
-    while len(sequence) < segments:
-        sequence += [k for k in [int(rng.integers(3))] if k != sequence[-1]]
-    gaps = 1.0 + np.diff(np.sort(rng.uniform(0.0, 12.0 - segments, segments - 1)), prepend=0.0)
-    times = np.cumsum(gaps)
-    x, t, i, states = np.array([1.0, -1.0, 1.0]), 0.0, 0, []
-    for sample in SAMPLES:
-        while t < sample:
-            end = min(sample, times[i] if i < len(times) else np.inf)
-            M = np.zeros((3, 3))
-            M[:2, :2], M[:2, 2] = A[sequence[i]], B[sequence[i]]
-            x, t, i = scipy.linalg.expm(M * (end - t)) @ x, end, i + (i < len(times) and end == times[i])
-        states.append(x[:2])
-    return tuple("uvw"[k] for k in sequence), times, np.array(states) + 0.05 * rng.normal(size=(121, 2))
-
-
-def truth_problem(values, guess=0.8, sigma=0.05, system=SYSTEM):
-    run = sf.Experiment(sf.Measurements(SAMPLES, values, sigma=sigma), ("u",), (), 0.0, 12.0)
-    return sf.Problem(system, run, {"a": sf.Parameter(guess)})
+def truth_problem(values, guess=0.8, sigma=0.05, system=BASE.system):
+    run = sf.Experiment(sf.Measurements(SAMPLES, values, sigma=sigma), ("A",), (), 0.0, 12.0)
+    return sf.Problem(system, run, {**BASE.parameters, "a": sf.Parameter(guess)})
 
 
 def find(values, library=None, guess=0.8, **settings):
     given = {"penalty": 3.0, "width": 40} | {k: v for k, v in settings.items() if k not in ("sigma", "system")}
     problem = truth_problem(values, guess, **{k: v for k, v in settings.items() if k in ("sigma", "system")})
-    return beam(problem, library or free("uvw"), problem.initial_theta, **given)
+    return beam(problem, library or free("ABC"), problem.initial_theta, **given)
 
 
 def test_random_truths():
@@ -412,8 +390,8 @@ def test_costs_are_those_of_the_evaluator(seed):
 
 def test_the_order_of_modes_does_not_matter():
     _, _, values = draw_truth(3)
-    turned = sf.HybridSystem({name: affine("uvw".index(name)) for name in "wuv"}, [1.0, -1.0])
-    one, other = find(values), find(values, free("vwu"), system=turned)
+    turned = replace(BASE.system, modes={name: BASE.system.modes[name] for name in "CABD"})
+    one, other = find(values), find(values, free("BCA"), system=turned)
     assert [p.sequences for p in one[:5]] == [p.sequences for p in other[:5]]
     np.testing.assert_allclose([p.cost for p in one[:5]], [p.cost for p in other[:5]], rtol=1e-9)
 
@@ -433,22 +411,22 @@ def test_missing_samples():
 
 def test_rules_of_the_library():
     _, _, values = draw_truth(5)
-    follow = {"u": ("v",), "v": ("w", "u"), "w": ("u",)}
-    rules = {"first": ("v",), "last": ("u", "w"), "durations": {"u": 1.5, "v": 0.7}, "successions": follow}
-    found = find(values, free("uvw", 5, **rules))
+    follow = {"A": ("B",), "B": ("C", "A"), "C": ("A",)}
+    rules = {"first": ("B",), "last": ("A", "C"), "durations": {"A": 1.5, "B": 0.7}, "successions": follow}
+    found = find(values, free("ABC", 5, **rules))
     assert len(found) > 5
     for proposal in found:
         names, times = proposal.sequences[0], proposal.transition_times[0]
-        assert names[0] == "v"
-        assert names[-1] in ("u", "w")
+        assert names[0] == "B"
+        assert names[-1] in ("A", "C")
         assert len(times) <= 5
         assert all(b in follow[a] for a, b in pairwise(names))
         lengths = np.diff(np.concatenate([[0.0], times, [12.0]]))
         assert all(
-            length >= {"u": 1.5, "v": 0.7, "w": 0.0}[name] - 1e-9 for name, length in zip(names, lengths, strict=True)
+            length >= {"A": 1.5, "B": 0.7, "C": 0.0}[name] - 1e-9 for name, length in zip(names, lengths, strict=True)
         )
-    assert all(p.sequences[0][0] == "w" for p in find(values, free("uvw", first=("w",))))
-    assert len(find(values, free("uvw", 0))) == 3
+    assert all(p.sequences[0][0] == "C" for p in find(values, free("ABC", first=("C",))))
+    assert len(find(values, free("ABC", 0))) == 3
 
 
 def test_each_switch_costs_its_penalty():

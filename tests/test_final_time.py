@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from derivatives import differentiate
+from models import decay
 
 import switchfit as sf
 from switchfit.discretization.model import Model
@@ -20,10 +21,6 @@ METHODS = ("auto", "forward", "autodiff", "adjoint")
 
 def grow(t, x, p):
     return jnp.stack([p["a"] + 0 * t])
-
-
-def decay(t, x, p):
-    return -p["k"] * x
 
 
 def closed_problem(**settings):

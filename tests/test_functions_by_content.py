@@ -34,66 +34,7 @@ GLOBAL = {"g": 1.0}
 PLAIN = 1.0
 
 
-def by_global_dict():
-    def change():
-        GLOBAL["g"] = 2.0
-
-    GLOBAL["g"] = 1.0
-    return lambda t, x, p: -GLOBAL["g"] * p["a"] * x, change
-
-
-def by_global_number():
-    def change():
-        globals()["PLAIN"] = 2.0
-
-    globals()["PLAIN"] = 1.0
-    return lambda t, x, p: -PLAIN * p["a"] * x, change
-
-
-def by_closure():
-    g = 1.0
-
-    def f(t, x, p):
-        return -g * p["a"] * x
-
-    def change():
-        nonlocal g
-        g = 2.0
-
-    return f, change
-
-
-def by_array_in_place():
-    g = np.array([1.0])
-    return lambda t, x, p: -g * p["a"] * x, lambda: g.__setitem__(0, 2.0)
-
-
-def by_array_without_axes():
-    g = np.array(1.0)
-    return lambda t, x, p: -g * p["a"] * x, lambda: g.__setitem__((), 2.0)
-
-
-def by_default():
-    def f(t, x, p, g=1.0):
-        return -g * p["a"] * x
-
-    def change():
-        f.__defaults__ = (2.0,)
-
-    return f, change
-
-
-def by_attribute_of_the_function():
-    def f(t, x, p):
-        return -f.g * p["a"] * x
-
-    f.g = 1.0
-    return f, lambda: setattr(f, "g", 2.0)
-
-
 class Body:
-    gain = 1.0
-
     def __init__(self):
         self.g = 1.0
 
@@ -104,112 +45,85 @@ class Body:
         return -self.g * p["a"] * x
 
 
-def by_bound_method():
-    body = Body()
-    return body.f, lambda: setattr(body, "g", 2.0)
-
-
-def by_callable_object():
-    body = Body()
-    return body, lambda: setattr(body, "g", 2.0)
-
-
-def by_attribute_of_a_class():
-    body = type("Body", (), {"g": 1.0})
-    return lambda t, x, p: -body.g * p["a"] * x, lambda: setattr(body, "g", 2.0)
-
-
-def by_module():
-    module = types.ModuleType("constants")
+def list_ways():
+    """Return for each way a vector field that reads g = 1, and a function that makes it 2."""
+    GLOBAL["g"] = globals()["PLAIN"] = 1.0
+    body, called = Body(), Body()
+    array, scalar = np.array([1.0]), np.array(1.0)
+    kept, module = type("Kept", (), {"g": 1.0}), types.ModuleType("constants")
     module.g = 1.0
-    return lambda t, x, p: -module.g * p["a"] * x, lambda: setattr(module, "g", 2.0)
+    bound, told, known, mapped, inside, named = ([1.0] for _ in range(6))
+    jitted, vmapped = jax.jit(lambda x: known[0] * x), jax.vmap(lambda x: mapped[0] * x)
+    number = 1.0
 
+    def closure(t, x, p):
+        return -number * p["a"] * x
 
-def by_partial():
-    gains = [1.0]
+    def change_number():
+        nonlocal number
+        number = 2.0
 
-    def f(gains, t, x, p):
+    def default(t, x, p, g=1.0):
+        return -g * p["a"] * x
+
+    def attribute(t, x, p):
+        return -attribute.g * p["a"] * x
+
+    attribute.g = 1.0
+
+    def partial(gains, t, x, p):
         return -gains[0] * p["a"] * x
 
-    return functools.partial(f, gains), lambda: gains.__setitem__(0, 2.0)
-
-
-def by_helper():
-    g = [1.0]
-
     def gain():
-        return g[0]
+        return told[0]
 
     def middle(x):
         return gain() * x
 
-    return lambda t, x, p: -middle(p["a"] * x), lambda: g.__setitem__(0, 2.0)
-
-
-def by_jitted_helper():
-    g = [1.0]
-    helper = jax.jit(lambda x: g[0] * x)
-    return lambda t, x, p: -helper(p["a"] * x), lambda: g.__setitem__(0, 2.0)
-
-
-def by_mapped_helper():
-    g = [1.0]
-    helper = jax.vmap(lambda x: g[0] * x)
-    return lambda t, x, p: -helper(p["a"] * x), lambda: g.__setitem__(0, 2.0)
-
-
-def by_global_lookup():
-    GLOBAL["g"] = 1.0
-    return lambda t, x, p: -globals()["GLOBAL"]["g"] * p["a"] * x, lambda: GLOBAL.__setitem__("g", 2.0)
-
-
-def by_inner_function():
-    g = [1.0]
-
-    def f(t, x, p):
+    def nested(t, x, p):
         def inner(y):
-            return sum(g[0] * y for _ in range(1))
+            return sum(inside[0] * y for _ in range(1))
 
         return -inner(p["a"] * x)
 
-    return f, lambda: g.__setitem__(0, 2.0)
-
-
-def by_name_of_a_library():
-    g = [1.0]
-
     @functools.wraps(jnp.clip)
-    def f(t, x, p):
-        return -g[0] * p["a"] * x
+    def wrapped(t, x, p):
+        return -named[0] * p["a"] * x
 
-    return f, lambda: g.__setitem__(0, 2.0)
+    def put(holder, key=0):
+        return lambda: holder.__setitem__(key, 2.0)
+
+    def set_g(holder):
+        return lambda: setattr(holder, "g", 2.0)
+
+    return {
+        "global dict": (lambda t, x, p: -GLOBAL["g"] * p["a"] * x, put(GLOBAL, "g")),
+        "global number": (lambda t, x, p: -PLAIN * p["a"] * x, put(globals(), "PLAIN")),
+        "global lookup": (lambda t, x, p: -globals()["GLOBAL"]["g"] * p["a"] * x, put(GLOBAL, "g")),
+        "closure": (closure, change_number),
+        "array in place": (lambda t, x, p: -array * p["a"] * x, put(array)),
+        "array without axes": (lambda t, x, p: -scalar * p["a"] * x, put(scalar, ())),
+        "default": (default, lambda: setattr(default, "__defaults__", (2.0,))),
+        "attribute of the function": (attribute, set_g(attribute)),
+        "bound method": (body.f, set_g(body)),
+        "callable object": (called, set_g(called)),
+        "attribute of a class": (lambda t, x, p: -kept.g * p["a"] * x, set_g(kept)),
+        "module": (lambda t, x, p: -module.g * p["a"] * x, set_g(module)),
+        "partial": (functools.partial(partial, bound), put(bound)),
+        "helper": (lambda t, x, p: -middle(p["a"] * x), put(told)),
+        "jitted helper": (lambda t, x, p: -jitted(p["a"] * x), put(known)),
+        "mapped helper": (lambda t, x, p: -vmapped(p["a"] * x), put(mapped)),
+        "inner function": (nested, put(inside)),
+        "name of a library": (wrapped, put(named)),
+    }
 
 
-WAYS = [
-    by_global_dict,
-    by_global_number,
-    by_closure,
-    by_array_in_place,
-    by_array_without_axes,
-    by_default,
-    by_attribute_of_the_function,
-    by_bound_method,
-    by_callable_object,
-    by_attribute_of_a_class,
-    by_module,
-    by_partial,
-    by_helper,
-    by_jitted_helper,
-    by_mapped_helper,
-    by_global_lookup,
-    by_inner_function,
-    by_name_of_a_library,
-]
+WAYS = tuple(list_ways())
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_problem_keeps_its_functions_as_they_were_when_it_was_built(way):
-    f, change = way()
+    f, change = list_ways()[way]
     before = sf.evaluate(problem_of(f)).cost
     old = problem_of(f)
     change()
@@ -394,7 +308,7 @@ def test_helpers_of_built_in_models_are_compared_by_identity(monkeypatch):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_what_is_read_is_told_by_content_or_not_at_all(way):
-    f, change = way()
+    f, change = list_ways()[way]
     before = functions.read_contents(f)
     change()
     after = functions.read_contents(f)

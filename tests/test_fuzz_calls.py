@@ -34,8 +34,8 @@ pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
 SOURCE = str(Path(sf.__file__).parent)
 SECONDS = 20
-SECONDS_WITH_JAX = 120
-"""For calls that JAX compiles a program for: 10 s each where nothing else runs."""
+SECONDS_LONG = 120
+"""For calls that compile a program of JAX or simulate many runs: 10 s each where nothing else runs."""
 LONGEST = 600
 
 
@@ -252,7 +252,7 @@ class Door:
     call : function of keyword arguments
     valid : arguments with which it succeeds
     words : for an argument the words of which a message about it has one; its own name if left out
-    inside : for an argument a function that puts a bad value inside a good one
+    inside : for an argument a function that puts a bad value inside a good one, where `put_inside` cannot
     seconds : after which a call hangs
     """
 
@@ -342,6 +342,17 @@ def of(name, method):
 
 
 LONG = {"seed": 0, "tolerance": 1e-7, "max_iterations": 20, "client": None, "folder": None, "callback": stop}
+WITH_A_LEVEL = (
+    ("Estimate", "fit", ["quantile"]),
+    ("Fits", "many", ["confidence_intervals"]),
+    ("MonteCarlo", "study", ["confidence_intervals", "coverage"]),
+    ("Multistart", "starts", ["confidence_intervals"]),
+    ("Bootstrap", "bootstrap", ["intervals", "confidence_intervals"]),
+    ("Profile", "profile", ["regions", "interval"]),
+    ("Prediction", "prediction", ["state_band", "output_band", "prediction_band"]),
+)
+"""Class, what is made of it, and the methods that take a level."""
+
 THETA = {"theta": [0.45, 1.1]}
 THETA_WORDS = {"theta": ("theta", "tau", "transition times", "at the guess", "the guess leads")}
 SYSTEM_WORDS = {
@@ -350,6 +361,8 @@ SYSTEM_WORDS = {
     "guards": ("guard",),
     "initial_state": ("initial_state", "state"),
 }
+PROBLEM = {"system": system(), "experiments": experiment(), "parameters": PARAMETERS}
+PROBLEM_WORDS = {"parameters": ("parameter", "mode"), "experiments": ("experiment",)}
 DATA_WORDS = {
     "times": ("times", "samples", "values", "ReferenceSignal must reach"),
     "values": ("values", "rows", "channel", "observe", "entries", "samples"),
@@ -367,23 +380,14 @@ def catalogue():
         "HybridSystem": Door(
             build_system,
             SYSTEM
-            | {
-                "reset_maps": {("fall", "rise"): reset},
-                "guards": {},
-                "state_names": ("a", "b"),
-                "state_units": ("m", "m"),
-            },
+            | {"reset_maps": {("fall", "rise"): reset}, "guards": {}}
+            | {"state_names": ("a", "b"), "state_units": ("m", "m")},
             words=SYSTEM_WORDS,
-            inside={
-                "modes": lambda bad: {"fall": bad, "rise": rise},
-                "initial_state": lambda bad: [1.0, bad],
-                "reset_maps": lambda bad: {("fall", "rise"): bad},
-                "guards": lambda bad: {("fall", "rise"): bad},
-                "state_names": lambda bad: ["a", bad],
-                "state_units": lambda bad: ["m", bad],
-            },
+            inside={"guards": lambda bad: {("fall", "rise"): bad}},
         ),
-        "mode names": Door(build_system, SYSTEM, words=SYSTEM_WORDS, inside={"modes": as_key}),
+        "mode names": Door(
+            build_system, SYSTEM, words=SYSTEM_WORDS, inside={"modes": lambda bad: SYSTEM["modes"] | keyed(bad, fall)}
+        ),
         "Experiment": Door(
             build_experiment,
             {"data": measurements()}
@@ -400,52 +404,26 @@ def catalogue():
                 "inputs": ("input", "mode"),
                 "name": ("name",),
             },
-            inside={
-                "data": lambda bad: [measurements(), bad],
-                "mode_sequence": lambda bad: ["fall", bad],
-                "transition_times": lambda bad: [bad],
-                "initial_state": lambda bad: [1.0, bad],
-                "parameter_map": lambda bad: {"k": bad},
-                "jumps": lambda bad: [bad],
-            },
+            inside={"data": lambda bad: [measurements(), bad]},
         ),
         "Jump": Door(
             lambda **given: used(problem(experiment(jumps=[sf.Jump(**given)]))),
             {"time": [0.2, 0.7], "map": reset},
             words={"time": ("Jump",), "map": ("Jump",)},
-            inside={"time": lambda bad: [0.2, bad]},
         ),
         "Problem": Door(
             build_problem,
-            {
-                "system": system(),
-                "experiments": experiment(),
-                "parameters": PARAMETERS,
-                "min_duration": 0.0,
-                "solver": "explicit",
-                "rtol": 1e-6,
-                "atol": 1e-8,
-            },
-            words={"parameters": ("parameter", "mode"), "experiments": ("experiment",)},
-            inside={"parameters": lambda bad: {"k": bad}, "experiments": lambda bad: [experiment(), bad]},
+            PROBLEM | {"min_duration": 0.0, "solver": "explicit", "rtol": 1e-6, "atol": 1e-8},
+            words=PROBLEM_WORDS,
+            inside={"experiments": lambda bad: [experiment(), bad]},
         ),
         "parameter names": Door(
-            build_problem,
-            {"system": system(), "experiments": experiment(), "parameters": PARAMETERS},
-            words={"parameters": ("parameter", "mode"), "experiments": ("experiment",)},
-            inside={"parameters": as_key_of_numbers},
+            build_problem, PROBLEM, words=PROBLEM_WORDS, inside={"parameters": lambda bad: {"k": 1.0} | keyed(bad, 2.0)}
         ),
         "Parameter": Door(
             build_parameter,
-            {
-                "value": 1.0,
-                "lower": 0.1,
-                "upper": 5.0,
-                "unit": "1/s",
-                "fixed": False,
-                "prior": sf.Normal(1.0, 0.5),
-                "scale": "linear",
-            },
+            {"value": 1.0, "lower": 0.1, "upper": 5.0, "unit": "1/s", "fixed": False}
+            | {"prior": sf.Normal(1.0, 0.5), "scale": "linear"},
             words=dict.fromkeys(("value", "lower", "upper"), ("value", "bound", "lower", "upper", "'k'", "mode")),
             inside={"value": lambda bad: [bad], "lower": lambda bad: [bad]},
         ),
@@ -454,45 +432,21 @@ def catalogue():
         "Measurements": Door(
             build_measurements,
             DATA
-            | {
-                "observe": None,
-                "names": ("a", "b"),
-                "loss": "huber",
-                "loss_scale": 2.0,
-                "delay": 0.0,
-                "units": ("m", "rad"),
-            },
+            | {"observe": None, "names": ("a", "b"), "loss": "huber", "loss_scale": 2.0}
+            | {"delay": 0.0, "units": ("m", "rad")},
             words=DATA_WORDS,
-            inside={
-                "times": lambda bad: [bad, *TIMES[1:]],
-                "values": lambda bad: [[bad, 1.0], *VALUES[1:].tolist()],
-                "sigma": lambda bad: [bad, 0.1],
-                "names": lambda bad: ["a", bad],
-            },
+            inside={"sigma": lambda bad: [bad, 0.1]},
         ),
         "ReferenceSignal": Door(
             build_reference,
-            {
-                "times": TIMES,
-                "values": VALUES,
-                "observe": None,
-                "lowpass_hz": 2.0,
-                "weights": [1.0, 2.0],
-                "names": None,
-                "units": None,
-            },
+            {"times": TIMES, "values": VALUES, "observe": None, "lowpass_hz": 2.0}
+            | {"weights": [1.0, 2.0], "names": None, "units": None},
             words=DATA_WORDS,
-            inside={
-                "times": lambda bad: [bad, *TIMES[1:]],
-                "values": lambda bad: [[bad, 1.0], *VALUES[1:].tolist()],
-                "weights": lambda bad: [bad, 1.0],
-            },
         ),
         "Input": Door(
             build_input,
             {"times": TIMES, "values": TIMES, "kind": "linear", "units": ("m",)},
             words={"times": ("times", "samples", "known over"), "values": ("values", "rows", "mode", "samples")},
-            inside={"times": lambda bad: [bad, *TIMES[1:]], "values": lambda bad: [bad, *TIMES[1:]]},
         ),
         "from_epoch": Door(sf.from_epoch, {"numbers": [1.6e9, 1.7e9], "unit": "s"}, words={"unit": ("s", "ms")}),
         "read_log": Door(
@@ -505,7 +459,7 @@ def catalogue():
                 "path": ("file", "path", "folder"),
             }
             | {"origin": ("origin", "latitude"), "range_error": ("range_error", "latitude"), "topic": ("topic",)},
-            inside={"columns": lambda bad: ["yaw", bad], "origin": lambda bad: [bad, 1.0]},
+            inside={"origin": lambda bad: [bad, 1.0]},
         ),
         "RunningCost": Door(lambda **given: problem(experiment(sf.RunningCost(**given))), {"ell": energy}),
         "TransitionCost": Door(
@@ -521,40 +475,27 @@ def catalogue():
             {"problem": GOOD, "hessian": "exact", "tolerance": 1e-7, "max_iterations": 20, "callback": watch}
             | {"start": [0.45, 1.1]},
             words={"start": ("start", "at the guess", "the guess leads")},
-            inside={"start": lambda bad: [0.4, bad]},
         ),
         "estimate_many": Door(
             sf.estimate_many,
             {"problems": [GOOD]} | {key: value for key, value in LONG.items() if key != "seed"},
             words={"problems": ("problem",)},
-            seconds=SECONDS_WITH_JAX,
-            inside={"problems": lambda bad: [GOOD, bad]},
+            seconds=SECONDS_LONG,
         ),
-        "evaluate": Door(
-            sf.evaluate,
-            {"problem": GOOD, "method": "auto"} | THETA,
-            words=THETA_WORDS,
-            inside={"theta": lambda bad: [0.4, bad]},
-        ),
+        "evaluate": Door(sf.evaluate, {"problem": GOOD, "method": "auto"} | THETA, words=THETA_WORDS),
         "find_modes": Door(
             find_quietly,
             {"problem": GOOD, "library": ("fall", "rise"), "first": "fall", "last": "rise"}
             | {"successions": {"fall": ("rise",), "rise": ()}, "min_duration": 0.0, "max_switches": 1}
             | {"criterion": "bic", "method": "beam", "width": 4, "grid": 0.25, "starts": [[1.1]], "seed": 0},
             words={"problem": ("find_modes needs", "problem")},
-            inside={"library": lambda bad: ("fall", bad), "starts": lambda bad: [[bad]]},
         ),
         "OnlineEstimator": Door(
             sf.OnlineEstimator,
             {"problem": ONLINE, "window": 1.0, "threshold": 12.0}
             | {"successions": {"fall": ("rise",), "rise": ()}, "min_duration": 0.0, "max_switches": 2}
             | {"renews": {"rise": "k"}, "drift": {"k": 0.1}, "budget": 1.0, "capacity": 16, "width": 4},
-            inside={
-                "successions": lambda bad: {"fall": bad},
-                "min_duration": lambda bad: {"fall": bad},
-                "renews": lambda bad: {"rise": bad},
-                "drift": lambda bad: {"k": bad},
-            },
+            inside={"min_duration": lambda bad: {"fall": bad}},
         ),
         "keys of OnlineEstimator": Door(
             sf.OnlineEstimator,
@@ -564,76 +505,57 @@ def catalogue():
         "OnlineEstimator.update": Door(
             lambda **given: sf.OnlineEstimator(ONLINE).update(**given),
             {"t": 0.5, "y": [0.1, 0.2]},
-            inside={"y": lambda bad: [bad, 1.0]},
         ),
         "replay": Door(sf.replay, {"problem": ONLINE}),
         "calibrate": Door(
             lambda **given: sf.calibrate(sf.OnlineEstimator(ONLINE), **({"false_alarms": 0.1} | given)),
             {"false_alarms": 0.1},
+            seconds=SECONDS_LONG,
         ),
-        "insertion": Door(
-            sf.insertion, {"problem": GOOD} | THETA, words=THETA_WORDS, inside={"theta": lambda bad: [0.4, bad]}
-        ),
+        "insertion": Door(sf.insertion, {"problem": GOOD} | THETA, words=THETA_WORDS),
         "Insertion.minima": Door(of("rates", "minima"), {"count": 2}),
         "evaluate_on_guards": Door(
-            sf.evaluate_on_guards, {"problem": GUARDED} | THETA, words=THETA_WORDS, seconds=SECONDS_WITH_JAX
+            sf.evaluate_on_guards, {"problem": GUARDED} | THETA, words=THETA_WORDS, seconds=SECONDS_LONG
         ),
-        "simulate": Door(
-            sf.simulate,
-            {"problem": GOOD, "experiment": 0} | THETA,
-            words=THETA_WORDS,
-            inside={"theta": lambda bad: [bad, 1.0]},
-        ),
+        "simulate": Door(sf.simulate, {"problem": GOOD, "experiment": 0} | THETA, words=THETA_WORDS),
         "check_derivatives": Door(
-            sf.check_derivatives, {"problem": GOOD, "seed": 0} | THETA, words=THETA_WORDS, seconds=SECONDS_WITH_JAX
+            sf.check_derivatives, {"problem": GOOD, "seed": 0} | THETA, words=THETA_WORDS, seconds=SECONDS_LONG
         ),
         "identifiability": Door(
             sf.identifiability, {"subject": GOOD}, words={"subject": ("identifiability needs an sf.Estimate",)}
         ),
         "design": Door(
             sf.design,
-            {
-                "problem": GOOD,
-                "free": {},
-                "names": {"k": 1.0},
-                "criterion": "A",
-                "samples": 3,
-                "experiment": 0,
-                "sensors": 1,
-                "budget": None,
-                "starts": 1,
-                "seed": 0,
-            }
+            {"problem": GOOD, "free": {}, "names": {"k": 1.0}, "criterion": "A", "samples": 3, "experiment": 0}
+            | {"sensors": 1, "budget": None, "starts": 1, "seed": 0}
             | THETA,
             words=THETA_WORDS | {"names": ("names", "scale of k")},
-            inside={"theta": lambda bad: [0.4, bad], "names": lambda bad: {"k": bad}},
         ),
         "Design.save": Door(of("plan", "save"), {"path": "design.json"}),
         "monte_carlo": Door(
             sf.monte_carlo,
             {"problem": GOOD, "runs": 2, "start": [0.45, 1.1], "noise": 0.1} | THETA | LONG,
             words=THETA_WORDS | {"start": ("start", "at the guess", "the guess leads")},
-            seconds=SECONDS_WITH_JAX,
-            inside={"noise": lambda bad: [bad, 0.1], "theta": lambda bad: [0.4, bad]},
+            seconds=SECONDS_LONG,
+            inside={"noise": lambda bad: [bad, 0.1]},
         ),
         "multistart": Door(
             sf.multistart,
             {"problem": GOOD, "starts": 2} | LONG,
             words={"starts": ("start",)},
-            seconds=SECONDS_WITH_JAX,
+            seconds=SECONDS_LONG,
             inside={"starts": lambda bad: [[0.4, bad]]},
         ),
         "bootstrap": Door(
             sf.bootstrap,
             {"estimate": made("fit"), "runs": 2, "resample": "blocks", "block": 2} | LONG,
             words={"estimate": ("bootstrap needs the result of sf.estimate",)},
-            seconds=SECONDS_WITH_JAX,
+            seconds=SECONDS_LONG,
         ),
         "predict": Door(
             sf.predict,
             {"estimate": made("fit"), "times": TIMES, "experiment": 0},
             words={"estimate": ("predict needs the result of sf.estimate",)},
-            inside={"times": lambda bad: [0.5, bad]},
         ),
         "Estimate.validate": Door(of("fit", "validate"), {"other": GOOD, "refit": ()}),
         "compare": Door(
@@ -662,27 +584,12 @@ def catalogue():
             of("fit", "confidence_intervals"), {"level": 0.9, "hessian": "gauss-newton"}
         ),
         "Estimate.covariance_from": Door(of("fit", "covariance_from"), {"hessian": "exact"}),
-        "Estimate.quantile": Door(of("fit", "quantile"), {"level": 0.9}),
-        "Fits.confidence_intervals": Door(of("many", "confidence_intervals"), {"level": 0.9}),
-        "MonteCarlo.confidence_intervals": Door(of("study", "confidence_intervals"), {"level": 0.9}),
-        "MonteCarlo.coverage": Door(of("study", "coverage"), {"level": 0.9}),
-        "Multistart.confidence_intervals": Door(of("starts", "confidence_intervals"), {"level": 0.9}),
-        "Bootstrap.intervals": Door(of("bootstrap", "intervals"), {"level": 0.9}),
-        "Bootstrap.confidence_intervals": Door(of("bootstrap", "confidence_intervals"), {"level": 0.9}),
-        "Profile.regions": Door(of("profile", "regions"), {"level": 0.9}),
-        "Profile.interval": Door(of("profile", "interval"), {"level": 0.9}),
-        "Prediction.state_band": Door(of("prediction", "state_band"), {"level": 0.9}),
-        "Prediction.output_band": Door(of("prediction", "output_band"), {"level": 0.9}),
-        "Prediction.prediction_band": Door(of("prediction", "prediction_band"), {"level": 0.9}),
+        **{
+            f"{kind}.{method}": Door(of(name, method), {"level": 0.9})
+            for kind, name, methods in WITH_A_LEVEL
+            for method in methods
+        },
     }
-
-
-def as_key(bad):
-    return {"fall": fall, "rise": rise} | keyed(bad, fall)
-
-
-def as_key_of_numbers(bad):
-    return {"k": 1.0} | keyed(bad, 2.0)
 
 
 def keyed(bad, value):
@@ -778,14 +685,29 @@ def calls_of(doors):
         (name, argument, inside, bad)
         for name, door in doors.items()
         for argument in door.valid
-        for inside in ((False, True) if argument in door.inside else (False,))
+        for inside in ((False, True) if argument in door.inside or has_entries(door.valid[argument]) else (False,))
         for bad in BAD
     ]
 
 
 def malformed(door, argument, inside, bad):
     value = BAD[bad]()
-    return {argument: door.inside[argument](value) if inside else value}
+    if inside:
+        own = door.inside.get(argument)
+        value = put_inside(door.valid[argument], value) if own is None else own(value)
+    return {argument: value}
+
+
+def has_entries(value):
+    return isinstance(value, (dict, list, tuple, np.ndarray)) and len(value) > 0
+
+
+def put_inside(value, bad):
+    """A valid value with a bad one in place of its first entry."""
+    if isinstance(value, dict):
+        return value | {next(iter(value)): bad}
+    first, *others = value
+    return [put_inside(first, bad) if isinstance(first, (list, np.ndarray)) else bad, *others]
 
 
 def complaints(doors, calls):

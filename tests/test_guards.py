@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from models import BALL_G, BALL_HEIGHT, ball, ball_system, constrained, decay
+from models import BALL_G, BALL_HEIGHT, ball, ball_system, constrained, decay, rest
 
 import switchfit as sf
 from switchfit.discretization.model import Model
@@ -95,32 +95,24 @@ def test_events_of_amici_to_twelve_digits():
     np.testing.assert_allclose(found.hessian, hessian, rtol=0, atol=1e-10)
 
 
-def tank_fills(t, x, p):
-    return jnp.stack([p["inflow"] - 0.1 * x[0]])
+TANK_TIMES = np.linspace(0.25, 10.0, 40)
+TANK = sf.HybridSystem(
+    {"fills": lambda t, x, p: jnp.stack([p["inflow"] - 0.1 * x[0]]), "overflows": rest},
+    [0.0],
+    guards={("fills", "overflows"): lambda t, x, p: x[0] - p["rim"]},
+)
 
 
-def tank_overflows(t, x, p):
-    return jnp.zeros(1)
-
-
-def level(inflow, rim, t):
-    return np.minimum(10 * inflow * (1 - np.exp(-0.1 * t)), rim)
-
-
-def tank(sigma=0.02, rng=None):
+def fill_tank(inflow=0.5, guess=3.0, noise=0.0, **more):
     """A tank fills until it overflows: when depends on the inflow and on the height of the rim."""
-    times = np.linspace(0.25, 10.0, 40)
-    values = level(0.5, 2.2, times) + (0.0 if rng is None else sigma * rng.standard_normal(40))
-    system = sf.HybridSystem(
-        {"fills": tank_fills, "overflows": tank_overflows},
-        [0.0],
-        guards={("fills", "overflows"): lambda t, x, p: x[0] - p["rim"]},
-        state_names=("level",),
-        state_units=("m",),
-    )
-    data = sf.Measurements(times, values, sigma=sigma)
-    run = sf.Experiment(data, ("fills", "overflows"), (3.0,), 0.0, 10.0)
-    return sf.Problem(system, run, {"inflow": 0.8, "rim": sf.Parameter(1.5, lower=0.0)})
+    level = np.minimum(10 * inflow * (1 - np.exp(-0.1 * TANK_TIMES)), 2.2)
+    data = sf.Measurements(TANK_TIMES, level + noise, sigma=0.02)
+    return sf.Experiment(data, ("fills", "overflows"), (guess,), 0.0, 10.0, **more)
+
+
+def tank(inflow=0.8, rim=None, **more):
+    rim = sf.Parameter(1.5, lower=0.0) if rim is None else rim
+    return sf.Problem(TANK, fill_tank(**more), {"inflow": inflow, "rim": rim})
 
 
 def test_a_tank_that_overflows_is_fitted_with_the_covariance_of_its_closed_form():
@@ -128,9 +120,8 @@ def test_a_tank_that_overflows_is_fitted_with_the_covariance_of_its_closed_form(
     assert fit.success
     overflow = -10 * np.log(1 - 2.2 / 5)
     np.testing.assert_allclose(fit.theta, [overflow, 0.5, 2.2], rtol=0, atol=1e-8)
-    times = np.linspace(0.25, 10.0, 40)
-    filling = times < overflow
-    slopes = np.stack([np.where(filling, 10 * (1 - np.exp(-0.1 * times)), 0.0), np.where(filling, 0.0, 1.0)], axis=1)
+    filling, grown = overflow > TANK_TIMES, 10 * (1 - np.exp(-0.1 * TANK_TIMES))
+    slopes = np.stack([np.where(filling, grown, 0.0), np.where(filling, 0.0, 1.0)], axis=1)
     covariance = 0.02**2 * np.linalg.inv(slopes.T @ slopes)
     np.testing.assert_allclose(fit.covariance[1:, 1:], covariance, rtol=1e-6, atol=1e-15)
     # The overflow's time follows from both: inflow = rim / (10 (1 - exp(-t/10))).
@@ -142,22 +133,10 @@ def test_a_tank_that_overflows_is_fitted_with_the_covariance_of_its_closed_form(
 @pytest.mark.parametrize("count", [2, 17])
 def test_many_guarded_runs_are_fitted_jointly(count):
     """Tanks with one rim, each with an inflow of its own; 16 runs or more have another shape without guards."""
-    one = tank()
-    rng = np.random.default_rng(3)
-    inflows, times = rng.uniform(0.4, 0.8, count), np.linspace(0.25, 10.0, 40)
-    runs = [
-        sf.Experiment(
-            sf.Measurements(times, level(inflow, 2.2, times), sigma=0.02),
-            ("fills", "overflows"),
-            (4.0,),
-            0.0,
-            10.0,
-            parameter_map={"inflow": f"inflow_{i}"},
-        )
-        for i, inflow in enumerate(inflows)
-    ]
+    inflows = np.random.default_rng(3).uniform(0.4, 0.8, count)
+    runs = [fill_tank(q, 4.0, parameter_map={"inflow": f"inflow_{i}"}) for i, q in enumerate(inflows)]
     own = {f"inflow_{i}": 0.7 for i in range(count)}
-    fit = sf.estimate(sf.Problem(one.system, runs, {"rim": sf.Parameter(1.5, lower=0.0), **own}), strategy="local")
+    fit = sf.estimate(sf.Problem(TANK, runs, {"rim": sf.Parameter(1.5, lower=0.0), **own}), strategy="local")
     assert fit.success
     assert len(fit.constraints) == count
     np.testing.assert_allclose(fit.parameters["rim"], 2.2, rtol=0, atol=1e-8)
@@ -167,10 +146,9 @@ def test_many_guarded_runs_are_fitted_jointly(count):
 
 def test_unknowns_on_a_logarithmic_scale_are_fitted_beside_guards():
     """The optimiser works in their logarithms: the end, the multiplier and the covariance are those of the unknowns."""
-    plain = tank(rng=np.random.default_rng(4))
-    logarithmic = {"inflow": sf.Parameter(0.8, scale="log"), "rim": sf.Parameter(1.5, scale="log")}
-    one = sf.estimate(plain)
-    other = sf.estimate(sf.Problem(plain.system, plain.experiments, logarithmic))
+    noise = 0.02 * np.random.default_rng(4).standard_normal(40)
+    one = sf.estimate(tank(noise=noise))
+    other = sf.estimate(tank(sf.Parameter(0.8, scale="log"), sf.Parameter(1.5, scale="log"), noise=noise))
     assert other.success
     np.testing.assert_allclose(other.theta, one.theta, rtol=1e-7)
     np.testing.assert_allclose(other.hessian, one.hessian, rtol=1e-6, atol=1e-6 * np.abs(one.hessian).max())
@@ -180,9 +158,7 @@ def test_unknowns_on_a_logarithmic_scale_are_fitted_beside_guards():
 
 def test_priors_count_beside_guards():
     """They are part of J and of the Lagrangian, and pull a fit whose data say less."""
-    plain = tank()
-    known = {"inflow": sf.Parameter(0.8, prior=sf.Normal(0.45, 1e-3)), "rim": sf.Parameter(1.5, lower=0.0)}
-    problem = sf.Problem(plain.system, plain.experiments, known)
+    problem = tank(sf.Parameter(0.8, prior=sf.Normal(0.45, 1e-3)))
     theta = problem.initial_theta
     evaluator = Evaluator(problem)
     found, expected = evaluator.constrained(theta), evaluator(theta)

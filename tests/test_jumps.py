@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import decay as eliminate
 
 import switchfit as sf
 from switchfit.engine.native.engine import foreign_derivatives
@@ -24,10 +25,6 @@ TIMES = np.arange(0.0, 37.0)
 
 TRUE = {"k": 0.13, "V": 11.0}
 GUESS = {"k": 0.2, "V": sf.Parameter(8.0, lower=1.0)}
-
-
-def eliminate(t, x, p):
-    return -p["k"] * x
 
 
 def dose(t, x, p):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import decay as off
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
@@ -22,10 +23,6 @@ GUESS = {"power": sf.Parameter(2.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.4
 
 def on(t, x, p):
     return p["power"] - p["k"] * x
-
-
-def off(t, x, p):
-    return -p["k"] * x
 
 
 ROOM = sf.HybridSystem({"on": on, "off": off}, [0.2], state_names=("T",))
@@ -216,9 +213,12 @@ def test_only_runs_that_a_fit_has_moved_are_followed_again():
     np.testing.assert_array_equal(q[[1, 3, 4]], late[beams.first :][[1, 3, 4]])  # their own powers stay
 
 
-def test_shared_parameters_are_at_the_minimum_of_what_all_runs_say():
+@pytest.mark.parametrize("precision", [0.0, 2.0])
+def test_shared_parameters_are_at_the_minimum_of_what_all_runs_and_priors_say(precision):
     """With a quadratic cost of each run; a run is told the sum of the others, whose own parameters follow."""
     problem, _ = many_rooms(3)  # parameters: k, shared, then a power of each run
+    prior = sf.Normal(1.2, precision**-0.5) if precision else None
+    problem = replace(problem, parameters={**problem.parameters, "k": sf.Parameter(2.0, 0.05, 3.0, prior=prior)})
     random, own = np.random.default_rng(0), [np.array([0, 1 + e]) for e in range(3)]
     roots = random.normal(size=(3, 2, 2))
     said = [Quadratic(np.array([1.0, 1.5]), random.normal(size=2), root @ root.T + np.eye(2)) for root in roots]
@@ -233,7 +233,8 @@ def test_shared_parameters_are_at_the_minimum_of_what_all_runs_say():
         found, moved = beams.follow(q, follow)
     g = np.array([g[0] - Q[0, 1] / Q[1, 1] * g[1] for _, g, Q in said])
     Q = np.array([Q[0, 0] - Q[0, 1] ** 2 / Q[1, 1] for _, _, Q in said])
-    np.testing.assert_allclose(moved, [1.0 - g.sum() / Q.sum(), *q[1:]], rtol=1e-12)
+    lowest = ((Q - g).sum() + 1.2 * precision) / (Q.sum() + precision)
+    np.testing.assert_allclose(moved, [lowest, *q[1:]], rtol=1e-12)
     [joined] = beams.join(found, moved)
     assert joined.sequences == (SEQUENCE,) * 3
     np.testing.assert_allclose(told[3].center, [1.0 - g[1:].sum() / Q[1:].sum(), q[1]], rtol=1e-12)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from benchmarks.modes.truths import random_modes
+from benchmarks.modes.truths import random_modes, three_modes
 from switchfit.batch.posterior import link_times
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
@@ -52,42 +52,52 @@ def pull(t, x, p):
 SYSTEM = sf.HybridSystem({"rise": rise, "fall": fall, "turn": turn}, [0.2, 1.0])
 
 
-def simulate(system, sequence, times, parameters, seed=0, sigma=SIGMA):
+SEQUENCE, SWITCHES = ("rise", "turn", "fall"), (2.5, 5.5)
+
+
+def simulate(sequence=SEQUENCE, times=SWITCHES, seed=0, sigma=SIGMA, system=SYSTEM, force=5.0):
+    """Values of both states with noise, rate being 1."""
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), sequence, times, 0.0, 8.0)
-    problem = sf.Problem(system, run, parameters, max_transitions=3)
+    problem = sf.Problem(system, run, {"rate": 1.0, "force": force}, max_transitions=3)
     trajectory = sf.simulate(problem)
     states = np.stack([np.interp(TIMES, trajectory.times, column) for column in trajectory.states.T], axis=1)
     return states + sigma * np.random.default_rng(seed).standard_normal(states.shape)
 
 
-def make_run(sequence=("rise", "turn", "fall"), times=(2.5, 5.5), seed=0, sigma=SIGMA, name=None, given=("rise",)):
-    values = simulate(SYSTEM, sequence, times, {"rate": 1.0}, seed)
-    log = sf.Measurements(TIMES, values, sigma=sigma, names=("x", "y"))
+def make_run(sequence=SEQUENCE, times=SWITCHES, seed=0, sigma=SIGMA, name=None, given=("rise",), values=None):
+    values = simulate(sequence, times, seed) if values is None else values
+    log = sf.Measurements(TIMES, values, sigma=sigma, names=("x", "y") if np.ndim(values) == 2 else None)
     return sf.Experiment(log, given, (), 0.0, 8.0, name=name)
 
 
-def make_problem(**changes):
-    return sf.Problem(SYSTEM, make_run(**changes), FREE)
+def make_problem(*, system=SYSTEM, parameters=FREE, **changes):
+    return sf.Problem(system, make_run(**changes), parameters)
+
+
+def kinds_of(warnings, kind):
+    return [warning for warning in warnings if warning.kind == kind]
+
+
+SEEN: list[sf.SearchProgress] = []
+"""What the search of `found` has told on its way."""
 
 
 @pytest.fixture(scope="module")
 def found():
-    return sf.find_modes(make_problem(), max_switches=3)
+    return sf.find_modes(make_problem(), max_switches=3, callback=SEEN.append)
 
 
 def test_the_sequence_is_found_with_its_times_and_parameters(found):
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.mode_sequence == SEQUENCE
     assert found.status is sf.ModeStatus.FOUND
     assert found.success
     np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.1)
     assert abs(found.parameters["rate"] - 1.0) < 0.02
     assert found.best.success
-    assert found.fits > 3
+    assert found.fits == SEEN[-1].fits > 3
+    assert [progress.fits for progress in SEEN] == sorted(progress.fits for progress in SEEN)
     assert found.evaluations > found.fits
-
-
-def test_it_is_the_fit_of_the_true_sequence(found):
-    run = replace(make_run(), mode_sequence=("rise", "turn", "fall"), transition_times=(2.5, 5.5))
+    run = replace(make_run(), mode_sequence=SEQUENCE, transition_times=SWITCHES)
     fit = sf.estimate(sf.Problem(SYSTEM, run, FREE))
     assert abs(found.best.cost - fit.cost) < 1e-6 * fit.cost
 
@@ -119,7 +129,7 @@ def test_alternatives_have_weights_that_sum_to_one(found):
 def test_mode_probabilities_are_those_of_the_alternatives(found):
     probability = found.mode_probability([1.0, 4.0, 7.0])
     np.testing.assert_allclose(probability.sum(axis=1), 1.0)
-    assert probability.argmax(axis=1).tolist() == [found.modes.index(m) for m in ("rise", "turn", "fall")]
+    assert probability.argmax(axis=1).tolist() == [found.modes.index(m) for m in SEQUENCE]
     with pytest.raises(ValueError, match="t must lie inside the horizon"):
         found.mode_probability([9.0])
     with pytest.raises(ValueError, match="experiment"):
@@ -187,7 +197,7 @@ def test_without_machine_code_the_sequence_is_found_without_the_beam():
         seen = []
         found = sf.find_modes(sf.Problem(system, given, FREE), max_switches=3, callback=seen.append)
         assert found.status is sf.ModeStatus.FOUND
-        assert found.mode_sequence == ("rise", "turn", "fall")
+        assert found.mode_sequence == SEQUENCE
         np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.1)
         assert {"matching", "exhaustive"} & {each.stage for each in seen} == {used}
         assert "mode 'turn' calls jnp.linalg.eigvalsh" in str(found.best.engine)
@@ -221,10 +231,8 @@ def test_as_many_switches_as_allowed_are_said_to_be_so(found):
 
 
 def test_data_without_noise_are_explained():
-    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0}, sigma=0.0)
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
-    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=3)
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    found = sf.find_modes(make_problem(values=simulate(sigma=0.0)), max_switches=3)
+    assert found.mode_sequence == SEQUENCE
     assert found.status is sf.ModeStatus.FOUND
     # Residuals are errors of interpolation: small, and anything but white.
     assert measure_whiteness(found.best) < CORRELATED
@@ -256,9 +264,9 @@ def test_a_fit_that_does_not_converge_is_said_to_be_so(monkeypatch):
 
 def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
-    values = simulate(system, ("rise", "fall"), (3.0,), {"rate": 1.0, "force": 5.0})
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
-    found = sf.find_modes(sf.Problem(system, run, FREE | {"force": 4.0}), max_switches=3)
+    values = simulate(("rise", "fall"), (3.0,), system=system)
+    problem = make_problem(system=system, parameters=FREE | {"force": 4.0}, values=values)
+    found = sf.find_modes(problem, max_switches=3)
     assert found.mode_sequence == ("rise", "fall")
     assert found.status is sf.ModeStatus.FOUND
     assert found.ending.held == ()
@@ -279,9 +287,9 @@ def test_entries_of_an_array_for_modes_that_do_not_occur_are_a_note():
         TIMES < 3.0, 1.0 - 0.8 * np.exp(-TIMES), (1.0 - 0.8 * np.exp(-3.0)) * np.exp(-0.5 * (TIMES - 3.0))
     )
     values = values + SIGMA * np.random.default_rng(0).standard_normal(len(TIMES))
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
     chain = {"rise": "decay 0", "decay 0": "decay 1", "decay 1": "decay 2", "decay 2": "decay 3"}
-    found = sf.find_modes(sf.Problem(system, run, {"rate": [0.4, 0.3, 0.2, 0.1]}), first="rise", successions=chain)
+    problem = make_problem(system=system, parameters={"rate": [0.4, 0.3, 0.2, 0.1]}, values=values)
+    found = sf.find_modes(problem, first="rise", successions=chain)
     assert found.mode_sequence == ("rise", "decay 0")
     assert found.status is sf.ModeStatus.FOUND
     assert "rate[1], rate[2], rate[3] act in modes that do not occur: they keep their guesses" in str(found).replace(
@@ -290,8 +298,8 @@ def test_entries_of_an_array_for_modes_that_do_not_occur_are_a_note():
 
 
 def test_a_parameter_that_no_mode_of_the_library_reads_is_unidentified():
-    found = sf.find_modes(sf.Problem(SYSTEM, make_run(), FREE | {"unused": 4.0}), max_switches=3)
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    found = sf.find_modes(make_problem(parameters=FREE | {"unused": 4.0}), max_switches=3)
+    assert found.mode_sequence == SEQUENCE
     assert found.status is sf.ModeStatus.UNIDENTIFIED
     assert found.ending.held == ("unused",)
     assert "unused acts in no mode of the library, and cannot be estimated. Fix it" in found.message
@@ -320,16 +328,15 @@ def test_an_interrupted_search_returns_the_best_so_far(how):
 @pytest.mark.parametrize("sigma", [SIGMA, None])
 def test_modes_that_make_up_for_correlated_noise_do_not_win(sigma):
     """As they stand, BIC and mBIC want more switches; n correlated values are not worth n independent ones."""
-    clean = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0}, sigma=0.0)
+    clean = simulate(sigma=0.0)
     noise = 0.6 * np.random.default_rng(2).standard_normal(clean.shape)  # and 0.8 of the one before: variance 1
     for i in range(1, len(noise)):
         noise[i] += 0.8 * noise[i - 1]
-    log = sf.Measurements(TIMES, clean + SIGMA * noise, sigma=sigma, names=("x", "y"))
-    found = sf.find_modes(sf.Problem(SYSTEM, sf.Experiment(log, ("rise",), (), 0.0, 8.0), FREE), max_switches=4)
+    found = sf.find_modes(make_problem(values=clean + SIGMA * noise, sigma=sigma), max_switches=4)
     assert min(found.fitted, key=lambda fit: fit.bic).switches == 4
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.mode_sequence == SEQUENCE
     assert found.status is sf.ModeStatus.NOT_EXPLAINED
-    [note] = [warning for warning in found.warnings if warning.kind == "discounted"]
+    [note] = kinds_of(found.warnings, "discounted")
     assert note.switches == 2
     assert note.samples < 60
     assert "2 switches by the discounted mBIC" in str(note)
@@ -363,15 +370,14 @@ def test_no_sequence_at_all_is_said_to_be_so():
     with pytest.raises(ValueError, match="no mode sequence was found"):
         _ = found.mode_sequence
     longer = sf.find_modes(make_problem(), first="rise", last="fall", successions=chain, max_switches=2)
-    assert longer.mode_sequence == ("rise", "turn", "fall")
+    assert longer.mode_sequence == SEQUENCE
 
 
 def test_a_mode_of_few_samples_is_warned_of():
-    values = simulate(SYSTEM, ("rise", "turn", "rise"), (3.0, 3.25), {"rate": 1.0}, sigma=0.002)
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=0.002), ("rise",), (), 0.0, 8.0)
-    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=3)
+    values = simulate(("rise", "turn", "rise"), (3.0, 3.25), sigma=0.002)
+    found = sf.find_modes(make_problem(values=values, sigma=0.002), max_switches=3)
     assert found.mode_sequence == ("rise", "turn", "rise")
-    [warning] = [w for w in found.warnings if w.kind == "short segment"]
+    [warning] = kinds_of(found.warnings, "short segment")
     assert warning.mode == "turn"
     assert warning.samples < 5
     assert "it may make up for an error of the model" in str(warning)
@@ -394,7 +400,7 @@ def test_successions_and_durations_are_kept():
 
 def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
     found = sf.find_modes(make_problem(), first="rise", last="fall", min_duration={"turn": 3.5}, max_switches=2)
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.mode_sequence == SEQUENCE
     first, second = found.transition_times[0]
     assert abs(second - first - 3.5) < 1e-9
     assert [issue.mode for issue in found.best.active] == ["turn"]
@@ -407,17 +413,17 @@ def test_a_log_that_begins_in_the_middle_of_a_mode():
     problem = sf.Problem(SYSTEM, run, FREE, min_duration=2.0)
     bound = sf.find_modes(problem, first="rise", max_switches=2, successions={"rise": "turn", "turn": "fall"})
     assert abs(bound.transition_times[0][0] - 2.0) < 1e-6
-    [warning] = [warning for warning in bound.warnings if warning.kind == "cut off"]
+    [warning] = kinds_of(bound.warnings, "cut off")
     assert (warning.mode, warning.begin) == ("rise", 0.0)
     assert str(warning).startswith("rise from 0 to 2 s is as short as its min_duration allows")
     free = sf.find_modes(problem, max_switches=2, min_duration={"rise": 0.0})
-    assert free.mode_sequence == ("rise", "turn", "fall")
+    assert free.mode_sequence == SEQUENCE
     np.testing.assert_allclose(free.transition_times[0], [0.6, 5.0], atol=0.1)
-    assert not [warning for warning in free.warnings if warning.kind == "cut off"]
+    assert not kinds_of(free.warnings, "cut off")
 
 
 def test_a_problem_may_have_a_shortest_duration_for_each_mode():
-    run = replace(make_run(), mode_sequence=("rise", "turn", "fall"), transition_times=(2.0, 6.0))
+    run = replace(make_run(), mode_sequence=SEQUENCE, transition_times=(2.0, 6.0))
     fit = sf.estimate(sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 3.5}))
     assert abs(np.diff(fit.transition_times[0])[0] - 3.5) < 1e-9
     with pytest.raises(ValueError, match="min_duration names the unknown mode 'jump'"):
@@ -432,7 +438,7 @@ def test_a_problem_may_have_a_shortest_duration_for_each_mode():
 
 def make_unusual(kind):
     """A problem with something that sets it apart, all with the same sequence."""
-    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0})
+    values = simulate()
     parameters, initial, times = dict(FREE), None, TIMES
     settings = {"sigma": SIGMA}
     if kind == "outliers":
@@ -462,7 +468,7 @@ UNUSUAL = (
 @pytest.mark.parametrize("kind", UNUSUAL)
 def test_whatever_else_is_unknown(kind):
     found = sf.find_modes(make_unusual(kind), max_switches=3)
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.mode_sequence == SEQUENCE
     assert found.status is sf.ModeStatus.FOUND
     np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.2)
 
@@ -506,7 +512,7 @@ def joint():
 
 def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
     found = sf.find_modes(joint, max_switches=3)
-    assert found.mode_sequences == (("rise", "turn", "fall"), ("fall", "rise"))
+    assert found.mode_sequences == (SEQUENCE, ("fall", "rise"))
     assert found.status is sf.ModeStatus.FOUND
     assert list(found.best.parameters) == ["rate"]
     assert [row.switches for row in found.fitted if row.sequences == found.mode_sequences] == [3]
@@ -570,9 +576,9 @@ def test_starts_are_the_guess_and_a_little_beside_it():
 
 def test_parameters_far_off_are_found_from_other_starts():
     far = replace(make_problem(), parameters={"rate": sf.Parameter(2.2, lower=0.1, upper=3.0)})
-    assert sf.find_modes(far, max_switches=3).mode_sequence == ("rise", "turn", "fall")
+    assert sf.find_modes(far, max_switches=3).mode_sequence == SEQUENCE
     given = sf.find_modes(far, max_switches=3, starts=[[1.1]])
-    assert given.mode_sequence == ("rise", "turn", "fall")
+    assert given.mode_sequence == SEQUENCE
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -640,7 +646,7 @@ def test_problems_that_cannot_be_searched_are_refused():
 def test_durations_that_leave_no_room_are_warned_of():
     with pytest.warns(UserWarning, match="leave room for 2 switches in a horizon of 8"):
         found = sf.find_modes(make_problem(), max_switches=3, min_duration=2.4)
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.mode_sequence == SEQUENCE
 
 
 def test_a_hidden_switch_is_refused():
@@ -723,57 +729,18 @@ def test_no_mode_of_a_long_sequence_is_left_out_of_the_table():
     assert "".join(lines).replace("  -> ", " -> ").split(" -> ") == names
 
 
-def test_progress_is_told_after_every_fit():
-    seen = []
-    found = sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: seen.append(progress))
-    assert seen[-1].fits == found.fits
-    assert [p.fits for p in seen] == sorted(p.fits for p in seen)
-
-
 # --- statistics -------------------------------------------------------------------------------------------------------
-
-MATRICES = {
-    "a": ([[-0.3, 1.0], [-1.0, -0.3]], [0.0, 1.0]),
-    "b": ([[-0.5, 0.0], [0.0, -0.2]], [2.0, 0.0]),
-    "c": ([[-0.1, -1.0], [1.0, -0.1]], [-1.0, -1.0]),
-}
-
-
-def draw_truth(seed, modes="abc"):
-    """A problem with three linear modes and six random segments, its parameter guessed 20 % off; and the truth."""
-    random = np.random.default_rng(seed)
-
-    def field(A, b):
-        return lambda t, x, p: p["a"] * (jnp.asarray(A) @ x) + jnp.asarray(b)
-
-    fields = {name: field(np.array(A), np.array(b)) for name, (A, b) in MATRICES.items()}
-    sequence = [str(random.choice(list("abc")))]
-    while len(sequence) < 6:
-        sequence.append(str(random.choice([mode for mode in "abc" if mode != sequence[-1]])))
-    tau = np.sort(random.uniform(0.5, 11.5, 5))
-    while np.diff(np.concatenate([[0.0], tau, [12.0]])).min() <= 0.8:
-        tau = np.sort(random.uniform(0.5, 11.5, 5))
-    times = np.linspace(0.0, 12.0, 121)
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), tuple(sequence), tuple(tau), 0.0, 12.0)
-    trajectory = sf.simulate(sf.Problem(sf.HybridSystem(fields, [1.0, 0.0]), run, {"a": 1.0}))
-    states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=1)
-    log = sf.Measurements(times, states + 0.05 * random.standard_normal(states.shape), sigma=0.05)
-    system = sf.HybridSystem({name: fields[name] for name in modes}, [1.0, 0.0])
-    problem = sf.Problem(
-        system, sf.Experiment(log, ("a",), (), 0.0, 12.0), {"a": sf.Parameter(0.8, lower=0.1, upper=3)}
-    )
-    return problem, tuple(sequence)
 
 
 @pytest.mark.slow
 def test_random_truths_are_found_and_never_something_else_called_found(optimised_machine_code):
     right = same = wrong = 0
     for seed in range(100):
-        problem, truth = draw_truth(seed)
-        found = sf.find_modes(problem, criterion="mbic")
+        truth = three_modes(seed)
+        found = sf.find_modes(truth.problem, ("A", "B", "C"), criterion="mbic")
         right += found.chosen[0].switches == 5
-        same += found.mode_sequence == truth
-        wrong += found.success and found.mode_sequence != truth
+        same += found.mode_sequence == truth.sequence
+        wrong += found.success and found.mode_sequence != truth.sequence
     assert right >= 99
     assert same >= 99
     assert wrong == 0
@@ -782,9 +749,9 @@ def test_random_truths_are_found_and_never_something_else_called_found(optimised
 @pytest.mark.slow
 def test_truths_with_a_mode_that_is_missing_are_never_called_found(optimised_machine_code):
     for seed in range(1000, 1010):
-        problem, truth = draw_truth(seed, "ab")
-        assert "c" in truth
-        assert sf.find_modes(problem).status is sf.ModeStatus.NOT_EXPLAINED
+        truth = three_modes(seed)
+        assert "C" in truth.sequence
+        assert sf.find_modes(truth.problem, ("A", "B")).status is sf.ModeStatus.NOT_EXPLAINED
 
 
 def test_the_best_is_the_lowest_among_the_sample_intervals():
@@ -866,13 +833,13 @@ def test_a_mode_that_leaves_no_trace_is_a_warning():
     found = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed", "fill"))
     assert found.status is sf.ModeStatus.AMBIGUOUS
     assert found.ending.traceless
-    untraced = [warning for warning in found.warnings if warning.kind == "no trace"]
-    assert [(warning.mode, warning.end) for warning in untraced] in ([("fill", 20.0)], [("closed", 20.0)])
-    assert 9.0 < untraced[0].begin < 11.0
-    assert f"{untraced[0].mode} from" in str(untraced[0])
+    [untraced] = kinds_of(found.warnings, "no trace")
+    assert (untraced.mode, untraced.end) in (("fill", 20.0), ("closed", 20.0))
+    assert 9.0 < untraced.begin < 11.0
+    assert f"{untraced.mode} from" in str(untraced)
     alone = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed"))
     assert alone.status is sf.ModeStatus.FOUND
-    assert not any(warning.kind == "no trace" for warning in alone.warnings)
+    assert not kinds_of(alone.warnings, "no trace")
 
 
 def test_all_neighbours_of_what_is_found_are_fitted():
@@ -889,14 +856,12 @@ def test_all_neighbours_of_what_is_found_are_fitted():
 
 def test_outliers_are_told_from_modes():
     """Two values in a hundred are off by 20 sigma: the search weighs them by a robust loss, and says so."""
-    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.0, 5.0), {"rate": 1.0})
+    values = simulate(times=(2.0, 5.0))
     off = np.random.default_rng(3).random(values.shape) < 0.02
-    values = np.where(off, values + 20 * SIGMA, values)
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
-    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=5)
+    found = sf.find_modes(make_problem(values=np.where(off, values + 20 * SIGMA, values)), max_switches=5)
     assert found.status is sf.ModeStatus.FOUND
-    assert found.mode_sequence == ("rise", "turn", "fall")
-    warning = next(warning for warning in found.warnings if warning.kind == "outliers")
+    assert found.mode_sequence == SEQUENCE
+    [warning] = kinds_of(found.warnings, "outliers")
     assert warning.samples == off.sum()
     assert f"{off.sum()} samples are outliers" in str(found)
     assert found.best.problem.experiments[0].data[0].loss == "huber"
@@ -905,12 +870,10 @@ def test_outliers_are_told_from_modes():
 @pytest.mark.parametrize("factor", [0.3, 0.5])
 def test_a_wrong_sigma_is_told_from_modes(factor):
     """The sequence is right, but whether it is sigma or the model that is wrong, the data cannot say."""
-    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.0, 5.0), {"rate": 1.0})
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=factor * SIGMA), ("rise",), (), 0.0, 8.0)
-    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=5)
+    found = sf.find_modes(make_problem(times=(2.0, 5.0), sigma=factor * SIGMA), max_switches=5)
     assert found.status is sf.ModeStatus.NOT_EXPLAINED
     assert found.ending.reason == "sigma"
-    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.mode_sequence == SEQUENCE
     assert abs(found.ending.ratio * factor - 1.0) < 0.15
     assert f"unless sigma is {found.ending.ratio:.2g} times as large as given" in found.message
     assert abs(found.best.residual_variance - 1.0) < 0.25

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import decay
 
 import switchfit as sf
 from switchfit.engine.protocol import Hypotheses
@@ -40,8 +41,15 @@ def problem(log: np.ndarray) -> sf.Problem:
     return vehicle(log)
 
 
-def feed_all(online: sf.OnlineEstimator, log: np.ndarray, begin: int = 0) -> list[sf.Now]:
-    return [online.update(t, y) for t, y in zip(TIMES[begin:], log[begin:], strict=True)]
+def feed_all(online: sf.OnlineEstimator, log: np.ndarray, times: np.ndarray = TIMES) -> list[sf.Now]:
+    """Give a log to an estimator, as far as there are values."""
+    return [online.update(t, np.atleast_1d(y)) for t, y in zip(times, log, strict=False)]
+
+
+def track(modes: dict, start: list, data, parameters: dict, tf: float | None = None) -> sf.Problem:
+    """Return the problem of a log that begins in the first mode."""
+    run = sf.Experiment(data, (next(iter(modes)),), (), 0.0, tf)
+    return sf.Problem(sf.HybridSystem(modes, start), run, parameters)
 
 
 # --- a drive ----------------------------------------------------------------------------------------------------------
@@ -95,12 +103,9 @@ def test_a_window_is_exact_for_a_linear_model():
     rng, times = np.random.default_rng(3), 0.1 * np.arange(1, 101)
     values = 0.2 * times**2 + 0.05 * rng.standard_normal(100)
     data = sf.Measurements(times, values, lambda t, x, p: x[:1], 0.05)
-    run = sf.Experiment(data, ("on",), (), 0.0, 10.0)
-    start = [sf.Parameter(0.1), 0.0]
-    problem = sf.Problem(sf.HybridSystem(modes, start), run, {"a": sf.Parameter(1.0), "b": sf.Parameter(0.2)})
+    problem = track(modes, [sf.Parameter(0.1), 0.0], data, {"a": 1.0, "b": 0.2}, 10.0)
     online = sf.OnlineEstimator(problem, window=2.0)
-    for t, y in zip(times, values, strict=True):
-        now = online.update(t, [y])
+    now = feed_all(online, values, times)[-1]
     batch = sf.estimate(problem)
     for name in ("a", "b"):
         np.testing.assert_allclose(now.parameters[name], batch.parameters[name], rtol=1e-10, atol=1e-11)
@@ -137,18 +142,10 @@ def test_a_parameter_that_drifts_is_followed():
     x = np.cumsum(0.1 * a)
     log = x + 0.05 * rng.standard_normal(600)
     data = sf.Measurements(times, log, sigma=0.05)
-    run = sf.Experiment(data, ("on",), (), 0.0, 60.0)
-    problem = sf.Problem(
-        sf.HybridSystem({"on": lambda t, x, p: jnp.stack([p["a"]])}, [0.0]), run, {"a": sf.Parameter(1.0)}
-    )
+    problem = track({"on": lambda t, x, p: jnp.stack([p["a"]])}, [0.0], data, {"a": 1.0}, 60.0)
     errors = {}
     for drift in (None, {"a": 0.01}):
-        said = [
-            now
-            for online in [sf.OnlineEstimator(problem, window=2.0, drift=drift)]
-            for t, y in zip(times, log, strict=True)
-            for now in [online.update(t, [y])]
-        ]
+        said = feed_all(sf.OnlineEstimator(problem, window=2.0, drift=drift), log, times)
         away = np.array([float(now.parameters["a"]) for now in said]) - a
         spread = np.array([float(now.standard_errors["a"]) for now in said])
         errors[drift is None] = np.sqrt((away[100:] ** 2).mean()), np.sqrt(((away / spread)[100:] ** 2).mean())
@@ -159,7 +156,7 @@ def test_a_parameter_that_drifts_is_followed():
 @pytest.mark.parametrize("window", [None, 3.0])
 def test_without_changes_there_is_one_hypothesis(problem, log, window):
     online = sf.OnlineEstimator(problem, max_switches=0, window=window)
-    now = [online.update(t, y) for t, y in zip(TIMES[:50], log, strict=False)][-1]
+    now = feed_all(online, log[:50])[-1]
     assert now.mode_sequence == ("stick",)
     assert now.mode_probability["stick"] == 1.0
     assert now.statistic == -np.inf
@@ -192,9 +189,7 @@ def test_the_data_of_the_problem_may_be_empty(problem, log):
 def test_a_problem_without_samples_is_simulated_and_costs_nothing(engine):
     data = sf.Measurements([], np.empty((0, 1)), sigma=0.1)
     run = sf.Experiment(data, ("on",), t0=0.5, tf=1.5)
-    problem = sf.Problem(
-        sf.HybridSystem({"on": lambda t, x, p: -p["k"] * x}, [1.0]), run, {"k": sf.Parameter(0.7)}, engine=engine
-    )
+    problem = sf.Problem(sf.HybridSystem({"on": decay}, [1.0]), run, {"k": 0.7}, engine=engine)
     assert sf.evaluate(problem).cost == 0.0
     np.testing.assert_allclose(sf.simulate(problem, times=[1.5]).states[0], np.exp(-0.7), rtol=1e-8)
 
@@ -347,8 +342,7 @@ def test_a_second_sensor_at_a_time_that_there_is():
     times = 0.1 * np.arange(1, 31)
     values = np.exp(-times) + 0.01 * np.random.default_rng(0).standard_normal((2, 30))
     sensors = [sf.Measurements(times, v, sigma=0.01, names=[n]) for v, n in zip(values, "ab", strict=True)]
-    system = sf.HybridSystem({"on": lambda t, x, p: -p["k"] * x}, [1.0])
-    problem = sf.Problem(system, sf.Experiment(sensors, ("on",), (), 0.0, 3.0), {"k": sf.Parameter(0.7)})
+    problem = track({"on": decay}, [1.0], sensors, {"k": 0.7}, 3.0)
     online = sf.OnlineEstimator(problem)
     for t, y in zip(times, values.T, strict=True):
         online.update(t, {"a": y[0]})
@@ -365,7 +359,7 @@ def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
     online = sf.OnlineEstimator(problem, threshold=8.0)
     wrong = log.copy()
     wrong[40:44] += [0.25, 0.25, 0.0]
-    said = [online.update(t, y) for t, y in zip(TIMES[:58], wrong[:58], strict=True)]
+    said = feed_all(online, wrong[:58])
     alarms, retracted = [now.alarm for now in said if now.alarm], [now.retracted for now in said if now.retracted]
     assert alarms
     assert retracted
@@ -380,7 +374,7 @@ def test_a_model_that_cannot_be_simulated_any_more_is_said(window, tmp_path):
     data = sf.Measurements([], np.empty((0, 1)), sigma=0.1)
     modes = {"grow": lambda t, x, p: p["k"] * x**2, "more": lambda t, x, p: 2.0 * p["k"] * x**2}
     parameters = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 1e-6))}
-    problem = sf.Problem(sf.HybridSystem(modes, [1.0]), sf.Experiment(data, ("grow",), t0=0.0), parameters)
+    problem = track(modes, [1.0], data, parameters)
     online = sf.OnlineEstimator(problem, window=window)
     for k in range(1, 9):
         online.update(0.1 * k, [1 / (1 - 0.1 * k)])
@@ -408,7 +402,7 @@ def test_few_samples_and_a_wrong_model_are_said(problem, log):
     online = sf.OnlineEstimator(problem)
     assert online.update(0.05).status is sf.OnlineStatus.WAITING
     single = sf.OnlineEstimator(problem, successions={"stick": ()})
-    said = [single.update(t, y + 3.0 * max(t - 3.0, 0.0)) for t, y in zip(TIMES, log, strict=True)]
+    said = feed_all(single, log + 3.0 * np.maximum(TIMES - 3.0, 0.0)[:, None])
     assert said[-1].status is sf.OnlineStatus.LOST
 
 
@@ -418,8 +412,8 @@ def test_a_model_that_has_lost_the_samples_stays_so():
     noise = 0.1 * np.random.default_rng(0).standard_normal(100)
     log = np.where(times < 3, 1 - np.exp(-0.7 * times), (1 - np.exp(-2.1)) * np.exp(-0.7 * (times - 3))) / 0.7 + noise
     modes = {"rise": lambda t, x, p: 1 - p["k"] * x, "fall": lambda t, x, p: -p["k"] * x}
-    run = sf.Experiment(sf.Measurements(times, log, sigma=0.1), ("rise",), (), 0.0, 10.0)
-    problem = sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"k": sf.Parameter(0.7, lower=0.01)})
+    data = sf.Measurements(times, log, sigma=0.1)
+    problem = track(modes, [0.0], data, {"k": sf.Parameter(0.7, lower=0.01)}, 10.0)
     said = sf.replay(problem, successions={"rise": ()}).status
     first = said.index(sf.OnlineStatus.LOST)
     assert set(said[first:]) == {sf.OnlineStatus.LOST}
@@ -616,8 +610,7 @@ def test_a_wrong_model_of_a_log_with_outliers_is_followed_to_the_end(seed):
     rng, modes = np.random.default_rng(seed), {"up": lambda t, x, p: p["rate"] + 0.0 * x}
     modes["down"] = lambda t, x, p: -p["rate"] + 0.0 * x
     gps = sf.Measurements([], np.empty((0, 1)), sigma=0.05)
-    run = sf.Experiment(gps, ("up",), t0=0.0)
-    problem = sf.Problem(sf.HybridSystem(modes, [sf.Parameter(0.0)]), run, {"rate": 0.5})
+    problem = track(modes, [sf.Parameter(0.0)], gps, {"rate": 0.5})
     online = sf.OnlineEstimator(problem, window=3.0)
     for k in range(1, 300):
         outlier = 2.0 * rng.standard_normal() if k % 20 == 10 else 0.0

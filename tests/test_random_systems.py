@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -159,60 +160,37 @@ def number(tree: Tree, xp: Any, *, arguments: str = "txp") -> Callable[..., Any]
 # Random problems
 
 
-@dataclass(frozen=True)
-class Features:
+def draw_features(rng: np.random.Generator, **given: Any) -> SimpleNamespace:
     """What a system has; each is drawn unless it is given."""
 
-    states: int
-    transitions: int
-    modes: int
-    runs: int
-    input: str | None
-    tracking: bool
-    running: bool
-    terminal: bool
-    samples: int
-    late: bool
-    noise: str
-    robust: bool
-    priors: bool
-    resets: bool
-    guards: bool
-    constraints: bool
-    initial: str
-    array: bool
-    fixed: bool
-    solver: str
+    def flag(probability: float) -> bool:
+        return bool(rng.random() < probability)
 
-    @classmethod
-    def drawn(cls, rng: np.random.Generator, **given: Any) -> Features:
-        def flag(probability: float) -> bool:
-            return bool(rng.random() < probability)
-
-        kinds = ["unknown", "number", "channel", "sample", "parameter", "mixed"]
-        drawn = {
-            "states": int(rng.choice([1, 2, 3, 4, 6, 8, 10], p=[0.15, 0.25, 0.2, 0.15, 0.1, 0.075, 0.075])),
-            "transitions": int(rng.choice([0, 1, 2, 3, 4], p=[0.05, 0.25, 0.35, 0.2, 0.15])),
-            "modes": int(rng.integers(1, 4)),
-            "runs": 2 if flag(0.2) else 1,
-            "input": str(rng.choice(["hold", "linear", "cubic"])) if flag(0.35) else None,
-            "tracking": flag(0.25),
-            "running": flag(0.3),
-            "terminal": flag(0.35),
-            "samples": int(rng.choice([0, 1, 2], p=[0.2, 0.6, 0.2])),
-            "late": flag(0.15),
-            "noise": str(rng.choice(kinds)),
-            "robust": flag(0.35),
-            "priors": flag(0.35),
-            "resets": flag(0.45),
-            "guards": flag(0.3),
-            "constraints": flag(0.25),
-            "initial": str(rng.choice(["numbers", "unknown", "function"])),
-            "array": flag(0.2),
-            "fixed": flag(0.35),
-            "solver": "stiff" if flag(0.03) else "explicit",
-        }
-        return cls(**{**drawn, **given})
+    kinds = ["unknown", "number", "channel", "sample", "parameter", "mixed"]
+    drawn = {
+        "states": int(rng.choice([1, 2, 3, 4, 6, 8, 10], p=[0.15, 0.25, 0.2, 0.15, 0.1, 0.075, 0.075])),
+        "transitions": int(rng.choice([0, 1, 2, 3, 4], p=[0.05, 0.25, 0.35, 0.2, 0.15])),
+        "modes": int(rng.integers(1, 4)),
+        "runs": 2 if flag(0.2) else 1,
+        "input": str(rng.choice(["hold", "linear", "cubic"])) if flag(0.35) else None,
+        "tracking": flag(0.25),
+        "running": flag(0.3),
+        "terminal": flag(0.35),
+        "samples": int(rng.choice([0, 1, 2], p=[0.2, 0.6, 0.2])),
+        "late": flag(0.15),
+        "noise": str(rng.choice(kinds)),
+        "robust": flag(0.35),
+        "priors": flag(0.35),
+        "resets": flag(0.45),
+        "guards": flag(0.3),
+        "constraints": flag(0.25),
+        "initial": str(rng.choice(["numbers", "unknown", "function"])),
+        "array": flag(0.2),
+        "fixed": flag(0.35),
+        "solver": "stiff" if flag(0.03) else "explicit",
+    }
+    assert given.keys() <= drawn.keys()
+    return SimpleNamespace(**{**drawn, **given})
 
 
 class System:
@@ -220,7 +198,7 @@ class System:
 
     def __init__(self, seed: int, **given: Any) -> None:
         self.rng = rng = np.random.default_rng([7, seed])
-        self.has = has = Features.drawn(rng, **given)
+        self.has = has = draw_features(rng, **given)
         self.t0 = float(np.round(rng.uniform(-2.0, 2.0), 2))
         self.tf = self.t0 + float(np.round(rng.uniform(1.0, 2.5), 2))
         self.weighed = has.noise != "unknown"  # robust losses, priors and sigmas need a sigma
@@ -563,14 +541,9 @@ class Comparison:
             errors = [("", float(np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1.0), initial=0.0)))]
         else:
             errors = list(self.errors(order, found, expected))
-        LARGEST[what] = max(LARGEST.get(what, 0.0), *(error for _, error in errors), 0.0)
         return [
             f"{self.where}: {what} {block} is off by {error:.1e}" for block, error in errors if not error <= tolerance
         ]
-
-
-LARGEST: dict[str, float] = {}
-"""The largest error of each kind that was seen: to set the tolerances by."""
 
 
 def differences(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_modes import fall, pull, rise
 
 import switchfit as sf
 from switchfit.engine.native import program
@@ -15,18 +16,6 @@ from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, list_insertions, space_evenly, splice
 
 TIMES = np.linspace(0.0, 8.0, 41)
-
-
-def rise(t, x, p):
-    return p["rate"] * jnp.stack([1.0 - x[0], -x[1]])
-
-
-def fall(t, x, p):
-    return p["rate"] * jnp.stack([-x[0], -x[1]])
-
-
-def pull(t, x, p):
-    return jnp.stack([-p["rate"] * x[0], p["force"] - x[1]])
 
 
 RESETS = {("rise", "fall"): lambda t, x, p: x * jnp.stack([1.0 + 0.1 * t, p["rate"]])}

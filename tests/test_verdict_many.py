@@ -10,7 +10,7 @@ from models import decay
 
 import switchfit as sf
 from switchfit.batch.program import CHUNK
-from switchfit.batch.verdict import find_elsewhere
+from switchfit.batch.verdict import _count_collapsed, find_elsewhere
 from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -168,6 +168,14 @@ def test_collapsed_modes_are_counted():
     assert many.verdict.level == "doubtful"
     assert "some a mode collapsed" in kinds(many)
     assert "modes collapsed in" in str(many.verdict)
+
+
+def test_a_short_mode_is_one_of_its_horizon_wherever_the_clock_begins():
+    """Of 6 s that begin at 1e9 s, 1 s is a sixth."""
+    cost = sf.RunningCost(lambda t, x, p: x[0])
+    run = sf.Experiment(cost, ("on", "off"), (1e9 + 1.0,), 1e9, 1e9 + 6.0)
+    ends = 1e9 + np.array([[0.0, 1.0, 6.0], [0.0, 0.0, 6.0], [0.0, 6.0, 6.0]])
+    assert _count_collapsed(sf.Problem(ROOM, run, {"k": 1.0}), run, ends).tolist() == [0, 1, 1]
 
 
 def test_a_stop_is_said():
