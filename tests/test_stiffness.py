@@ -166,10 +166,10 @@ def test_the_look_at_eigenvalues_survives_a_model_that_is_undefined_beside_the_t
     watch = Watch()
     watch.enter("m")
 
-    def slope(t, y):
-        return np.array([np.nan, 0.0]) if y[0] > 1.0 else np.array([-1e6, 0.0])
+    def slopes(times, y):
+        return np.where(y[:, :1] > 1.0, [np.nan, 0.0], [-1e6, 0.0])
 
-    watch.look(1e-3, slope, 0.0, np.array([1.0, 0.0]), 1e-2)
+    watch.look(1e-3, slopes, 0.0, np.array([1.0, 0.0]), 1e-2)
     assert watch.modes["m"].rates == [0.0]
 
 
@@ -180,7 +180,7 @@ def test_eigenvalues_are_those_of_the_vector_field():
         watch = Watch()
         watch.enter("m")
         y = size * np.array([1.0, -2.0, 0.5, 0.0])
-        watch.look(0.01, lambda t, y: np.append(A @ y[:3], 0.0), 0.0, y, 1e-2 * size)
+        watch.look(0.01, lambda t, y: np.pad(y[:, :3] @ A.T, [(0, 0), (0, 1)]), 0.0, y, 1e-2 * size)
         (rate,) = watch.modes["m"].rates
         assert rate == pytest.approx(np.hypot(3.0, 400.0), rel=1e-5)
         assert watch.modes["m"].limited == [0.01 * rate]

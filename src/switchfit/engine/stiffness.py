@@ -20,16 +20,16 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.problem.data import FloatArray
-from switchfit.runtime.errors import NotIntegrableError
 
 log = logging.getLogger("switchfit")
 
@@ -55,23 +55,18 @@ coarser, or as soon as theta moves (Van der Pol's oscillator with mu = 100: J is
 of twice as many cells)."""
 
 
+Slopes = Callable[[FloatArray, FloatArray], FloatArray]
+"""The vector field and the running cost (L, n + 1) at times (L,) and y (L, n + 1); NaN where they are not defined."""
+
+
 class _Look(NamedTuple):
     """A state of an explicit solve at which the eigenvalues can be computed: the arguments of `Watch.look`."""
 
     step: float
-    slope: Callable[[float, FloatArray], FloatArray]
+    slopes: Slopes
     t: float
     y: FloatArray
     smallest: float
-
-    def measure_rate(self) -> float:
-        """Return the largest ``|lambda|`` of a component that decays; 0 if none does, or the model is undefined."""
-        try:
-            with np.errstate(all="ignore"):
-                jacobian = _differentiate(self.slope, self.t, self.y, self.smallest)
-        except NotIntegrableError:  # beside the trajectory the model need not be defined
-            return 0.0
-        return _largest_decay(jacobian) if np.isfinite(jacobian).all() else 0.0
 
 
 @dataclass
@@ -89,8 +84,9 @@ class _ModeSteps:
 
     @cached_property
     def rates(self) -> list[float]:
-        """``|lambda|`` at each look."""
-        return [look.measure_rate() for look in self.looks]
+        """The largest ``|lambda|`` of a component that decays at each look."""
+        # The looks of one stretch together: their slopes are one call of machine code.
+        return [rate for slopes, looks in groupby(self.looks, _get_slopes) for rate in _measure_rates(slopes, [*looks])]
 
     @property
     def limited(self) -> list[float]:
@@ -175,17 +171,15 @@ class Watch:
             raise TooManyStepsError
         return mode.count - mode.looked >= self.between
 
-    def look(
-        self, step: float, slope: Callable[[float, FloatArray], FloatArray], t: float, y: FloatArray, smallest: float
-    ) -> None:
+    def look(self, step: float, slopes: Slopes, t: float, y: FloatArray, smallest: float) -> None:
         """Keep a state of the current mode, for its eigenvalues; they are computed only if it takes many steps.
 
         Parameters
         ----------
         step : float
             Length of the last step.
-        slope : callable
-            ``slope(t, y) -> (n + 1,)``: the vector field, and the running cost, which is left out.
+        slopes : Slopes
+            The running cost is left out.
         t, y : float, (n + 1,)
             The end of that step.
         smallest : float
@@ -193,7 +187,7 @@ class Watch:
         """
         mode = self.modes[self.current]
         mode.looked = mode.count
-        mode.looks.append(_Look(step, slope, t, y.copy(), smallest))
+        mode.looks.append(_Look(step, slopes, t, y.copy(), smallest))
 
     def add_rows(self, rows: int) -> None:
         """Count rows of a mesh in the current mode."""
@@ -282,23 +276,32 @@ class Choice:
             log.info("%s.", text[0].upper() + text[1:])
 
 
-def _differentiate(
-    slope: Callable[[float, FloatArray], FloatArray], t: float, y: FloatArray, smallest: float
-) -> FloatArray:
-    """Return the Jacobian of the vector field by differences, (n, n), good enough for the size of its eigenvalues."""
-    n = len(y) - 1
-    before = slope(t, y)[:n]
+def _get_slopes(look: _Look) -> Slopes:
+    return look.slopes
+
+
+def _measure_rates(slopes: Slopes, looks: Sequence[_Look]) -> list[float]:
+    """Return the largest ``|lambda|`` of a component that decays at each look; 0 if none does, or the model is
+    undefined.
+    """
+    y, times = np.array([look.y for look in looks]), np.array([look.t for look in looks])
+    with np.errstate(all="ignore"):
+        jacobians = _differentiate(slopes, times, y, np.array([look.smallest for look in looks]))
+    rates = np.zeros(len(looks))
+    defined = np.isfinite(jacobians).all(axis=(1, 2))  # beside the trajectory the model need not be
+    eigenvalues = np.linalg.eigvals(jacobians[defined])
+    rates[defined] = np.where(eigenvalues.real < 0, np.abs(eigenvalues), 0.0).max(axis=1, initial=0.0)
+    return rates.tolist()
+
+
+def _differentiate(slopes: Slopes, times: FloatArray, y: FloatArray, smallest: FloatArray) -> FloatArray:
+    """Return the Jacobians of the vector field at times (L,) by differences, (L, n, n), good enough for the size of
+    their eigenvalues.
+    """
+    n, each = y.shape[1] - 1, np.arange(y.shape[1] - 1)
     # Differences from t on one side: lambda is needed to a factor, and n + 1 slopes are all that it costs.
-    steps = np.sqrt(np.finfo(float).eps) * (np.abs(y[:n]) + smallest)
-    columns = []
-    for k, step in enumerate(steps):
-        moved = y.copy()
-        moved[k] += step
-        columns.append((slope(t, moved)[:n] - before) / (moved[k] - y[k]))
-    return np.stack(columns, axis=1)
-
-
-def _largest_decay(jacobian: FloatArray) -> float:
-    """Return the largest size of an eigenvalue whose component decays; 0 if none does."""
-    eigenvalues = np.linalg.eigvals(jacobian)
-    return float(np.max(np.abs(eigenvalues[eigenvalues.real < 0]), initial=0.0))
+    moved = np.repeat(y[:, None], n + 1, axis=1)
+    moved[:, 1 + each, each] += np.sqrt(np.finfo(float).eps) * (np.abs(y[:, :n]) + smallest[:, None])
+    steps = moved[:, 1 + each, each] - y[:, :n]
+    found = slopes(np.repeat(times, n + 1), moved.reshape(-1, n + 1)).reshape(moved.shape)[..., :n]
+    return np.swapaxes((found[:, 1:] - found[:, :1]) / steps[..., None], 1, 2)
