@@ -121,6 +121,17 @@ def test_explicit_steps_that_make_the_cost_nan_at_the_guess_are_not_taken():
     assert np.isfinite(evaluator_of(problem).cost(problem.initial_theta))
 
 
+def test_the_explicit_solve_is_given_up_once_it_is_clear_that_stability_limits_it(monkeypatch):
+    watches, watch = [], Choice.watch
+    monkeypatch.setattr(Choice, "watch", lambda choice, k: watches.append(watch(choice, k)) or watches[-1])
+    problem, explicit = relaxing(1e4), relaxing(1e4, solver="explicit")
+    (stiffness,) = refine_mesh(problem, 0, problem.initial_theta).stiffness
+    assert watches[0].modes["m"].count <= 20 * 256
+    assert stiffness.explicit_steps > 15_000
+    cells = refine_mesh(explicit, 0, explicit.initial_theta).cells
+    assert stiffness.explicit_steps == pytest.approx(cells, rel=0.1)
+
+
 # What is not
 
 

@@ -437,6 +437,9 @@ class _Solve:
             if watch is not None and watch.add(len(times)) and len(times) and stretch.is_explicit:
                 smallest = self._tolerances.atol / self._tolerances.rtol
                 watch.look(accepted[-1] - accepted[-2], steps.slopes, accepted[-1], steps.y, smallest)
+                if len(accepted) > PACE and watch.is_clear():
+                    watch.give_up(_project_steps(accepted, stretch.end))
+                    raise TooManyStepsError
         # Stuck, or at rest, beside a corner beyond which the field is undefined.
         if course is not None:
             course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))

@@ -20,7 +20,7 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
@@ -42,6 +42,12 @@ STEPS_BETWEEN_AFTER_FAILURE = 64
 FEW_STEPS = 1000
 """A mode with fewer steps is not called stiff, and its eigenvalues are not computed: its rows take less than a
 millisecond, and the program with implicit rows takes a second to compile."""
+
+LOOKS_TO_STOP = 20
+"""Looks in a row at which stability limits the step after which the explicit solve is given up: the steps that it would
+take are known well enough from its pace. It took 25 ms to the end, where friction is regularised at 1e-6 m/s."""
+
+_LOOKS_THAT_MAY_STOP = range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
 
 LIMITED = 2.0
 """``|lambda| h`` from which stability limits the step: the region of stability reaches to 3.3 for eigenvalues whose
@@ -85,8 +91,7 @@ class _ModeSteps:
     @cached_property
     def rates(self) -> list[float]:
         """The largest ``|lambda|`` of a component that decays at each look."""
-        # The looks of one stretch together: their slopes are one call of machine code.
-        return [rate for slopes, looks in groupby(self.looks, _get_slopes) for rate in _measure_rates(slopes, [*looks])]
+        return _measure_all_rates(self.looks)
 
     @property
     def limited(self) -> list[float]:
@@ -119,6 +124,8 @@ class Watch:
         Work in a mode after which `add` raises `TooManyStepsError`.
     between : int
         Steps in a mode between two looks.
+    refused : container of str, optional
+        Modes that take explicit steps although they are stiff; by default all do.
 
     Attributes
     ----------
@@ -127,9 +134,14 @@ class Watch:
         The mode that is being solved; "" before the first.
     """
 
-    def __init__(self, most: Mapping[str, float] | None = None, between: int = STEPS_BETWEEN) -> None:
+    def __init__(
+        self,
+        most: Mapping[str, float] | None = None,
+        between: int = STEPS_BETWEEN,
+        refused: Container[str] | None = None,
+    ) -> None:
         self.modes: dict[str, _ModeSteps] = {}
-        self.most, self.between = most or {}, between
+        self.most, self.between, self.refused = most or {}, between, refused
         self.current = ""
 
     def find_stiff(self) -> dict[str, float]:
@@ -189,6 +201,16 @@ class Watch:
         mode.looked = mode.count
         mode.looks.append(_Look(step, slopes, t, y.copy(), smallest))
 
+    def is_clear(self) -> bool:
+        """Return whether the current mode is stiff, however its solve goes on, and may take implicit steps."""
+        looks = self.modes[self.current].looks
+        # 20 of at most 60 looks are more than a quarter of them.
+        if self.refused is None or self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
+            return False
+        last = looks[-LOOKS_TO_STOP:]
+        rates = _measure_all_rates(last)
+        return all(rate * look.step > LIMITED for rate, look in zip(rates, last, strict=True))
+
     def add_rows(self, rows: int) -> None:
         """Count rows of a mesh in the current mode."""
         self.modes[self.current].rows += rows
@@ -228,7 +250,7 @@ class Choice:
 
     def watch(self, k: int) -> Watch:
         """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its work is limited."""
-        return Watch({name: most for name, (at, most) in self._most.items() if at == k})
+        return Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
 
     def add(self, stiff: Mapping[str, float], explicit: Watch, k: int) -> bool:
         """Let modes take implicit steps, and return whether there is one among them that did not.
@@ -274,6 +296,12 @@ class Choice:
         for each in self.stiffness:
             text = str(each)
             log.info("%s.", text[0].upper() + text[1:])
+
+
+def _measure_all_rates(looks: Sequence[_Look]) -> list[float]:
+    """Return what `_measure_rates` does for looks of several stretches."""
+    # The looks of one stretch together: their slopes are one call of machine code.
+    return [rate for slopes, own in groupby(looks, _get_slopes) for rate in _measure_rates(slopes, [*own])]
 
 
 def _get_slopes(look: _Look) -> Slopes:
