@@ -101,6 +101,8 @@ class NativeHypotheses:
     ) -> None:
         self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
+        self._shape = sizes.n, sizes.D, sizes.width
+        self._shape = sizes.n, sizes.D, sizes.width
         # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
@@ -290,8 +292,7 @@ class NativeHypotheses:
 
     def view(self, records: FloatArray) -> Hypotheses:
         """Return what records (B, size) hold, as views."""
-        D, width, at, rows = self._sizes.D, self._sizes.width, self._at, {"H": self._sizes.D, "Z": self._sizes.n}
-        H, Z = (records[:, at[name]].reshape(len(records), n, width)[..., :D] for name, n in rows.items())
-        g = records[:, at["g"]][:, :D]
-        scores, costs = records[:, at["score"].start], records[:, at["J"].start]
+        at, B, (n, D, width) = self._at, len(records), self._shape
+        H, Z = records[:, at["H"]].reshape(B, D, width)[..., :D], records[:, at["Z"]].reshape(B, n, width)[..., :D]
+        g, scores, costs = records[:, at["g"]][:, :D], records[:, at["score"].start], records[:, at["J"].start]
         return Hypotheses(scores, costs, g, H, records[:, at["moved"]], records[:, at["x"]], Z, records)
