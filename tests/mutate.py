@@ -344,6 +344,10 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
         HYPOTHESIS_LOOPS,
         [('self.invoke("at_node", table, record, here + 1)', 'self.invoke("at_node", table, record, here)')],
     ),
+    "the highest scores of a place are kept": (
+        HYPOTHESIS_LOOPS,
+        [("leave(score >= self._load_score", "leave(score <= self._load_score")],
+    ),
     "dropped penalty": (BEAM, [(" + self.penalty * switches", "")]),
     "dropped limit for each sequence": ("strategy/library.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
     "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),

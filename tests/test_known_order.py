@@ -153,6 +153,19 @@ def test_the_best_is_found_from_a_bad_guess(name):
     assert np.all((end.theta >= problem.unknowns.lower) & (end.theta <= problem.unknowns.upper))
 
 
+@pytest.mark.parametrize("name", ["nothing more", "bounded times", "sigma unknown"])
+def test_machine_code_keeps_the_hypotheses_that_the_rules_say(name, monkeypatch):
+    problem = replace(CASES[name]()[0], min_duration={"on": 0.5, "off": 0.4})
+    by_code = beam.follow_order(problem, 0, problem.initial_theta[3:])
+    monkeypatch.setattr(beam.Pass, "order", None)
+    by_rules = beam.follow_order(problem, 0, problem.initial_theta[3:])
+    assert len(by_code) > 0
+    for one, other in zip(by_code, by_rules, strict=True):
+        assert one.cost == other.cost
+        np.testing.assert_array_equal(one.transition_times[0], other.transition_times[0])
+        np.testing.assert_array_equal(one.parameters, other.parameters)
+
+
 def test_a_reference_is_followed():
     path = sf.simulate(pose([measure()])[0], np.array([*TAU, POWER, LOSS]))
     reference = sf.ReferenceSignal.from_samples(path.times, path.states)

@@ -121,6 +121,17 @@ def test_explicit_steps_that_make_the_cost_nan_at_the_guess_are_not_taken():
     assert np.isfinite(evaluator_of(problem).cost(problem.initial_theta))
 
 
+def test_the_explicit_solve_is_given_up_once_it_is_clear_that_stability_limits_it(monkeypatch):
+    watches, watch = [], Choice.watch
+    monkeypatch.setattr(Choice, "watch", lambda choice, k: watches.append(watch(choice, k)) or watches[-1])
+    problem, explicit = relaxing(1e4), relaxing(1e4, solver="explicit")
+    (stiffness,) = refine_mesh(problem, 0, problem.initial_theta).stiffness
+    assert watches[0].modes["m"].count <= 20 * 256
+    assert stiffness.explicit_steps > 15_000
+    cells = refine_mesh(explicit, 0, explicit.initial_theta).cells
+    assert stiffness.explicit_steps == pytest.approx(cells, rel=0.1)
+
+
 # What is not
 
 
@@ -166,10 +177,10 @@ def test_the_look_at_eigenvalues_survives_a_model_that_is_undefined_beside_the_t
     watch = Watch()
     watch.enter("m")
 
-    def slope(t, y):
-        return np.array([np.nan, 0.0]) if y[0] > 1.0 else np.array([-1e6, 0.0])
+    def slopes(times, y):
+        return np.where(y[:, :1] > 1.0, [np.nan, 0.0], [-1e6, 0.0])
 
-    watch.look(1e-3, slope, 0.0, np.array([1.0, 0.0]), 1e-2)
+    watch.look(1e-3, slopes, 0.0, np.array([1.0, 0.0]), 1e-2)
     assert watch.modes["m"].rates == [0.0]
 
 
@@ -180,7 +191,7 @@ def test_eigenvalues_are_those_of_the_vector_field():
         watch = Watch()
         watch.enter("m")
         y = size * np.array([1.0, -2.0, 0.5, 0.0])
-        watch.look(0.01, lambda t, y: np.append(A @ y[:3], 0.0), 0.0, y, 1e-2 * size)
+        watch.look(0.01, lambda t, y: np.pad(y[:, :3] @ A.T, [(0, 0), (0, 1)]), 0.0, y, 1e-2 * size)
         (rate,) = watch.modes["m"].rates
         assert rate == pytest.approx(np.hypot(3.0, 400.0), rel=1e-5)
         assert watch.modes["m"].limited == [0.01 * rate]

@@ -177,6 +177,10 @@ class _NativeSteps:
         """Return the slope at a time."""
         return self._native.slope(self._mode, t, y, self._p)
 
+    def slopes(self, times: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the slopes at times (L,) and y (L, n + 1); NaN where the model is not defined."""
+        return self._native.slopes_in(self._mode, times, y, self._p)
+
     @property
     def t(self) -> float:
         """The time so far."""
@@ -204,10 +208,16 @@ class _PythonSteps:
             start = stretch.start, np.append(stretch.x, 0.0), stretch.end
             self._solver = method(slope, *start, rtol=given.rtol, atol=given.atol)
 
-    def slope(self, t: float, y: FloatArray) -> FloatArray:
-        """Return the slope at a time, outside of the solve too."""
+    def slopes(self, times: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the slopes at times (L,) and y (L, n + 1), outside of the solve too; NaN where the model is not
+        defined.
+        """
+        found = np.full(y.shape, np.nan)
         with use_float64(), use_compilation_cache():
-            return self._slope(t, y)
+            for k, t in enumerate(times.tolist()):
+                with suppress(NotIntegrableError):
+                    found[k] = self._slope(t, y[k])
+        return found
 
     @property
     def t(self) -> float:
@@ -426,7 +436,10 @@ class _Solve:
             # them.
             if watch is not None and watch.add(len(times)) and len(times) and stretch.is_explicit:
                 smallest = self._tolerances.atol / self._tolerances.rtol
-                watch.look(accepted[-1] - accepted[-2], steps.slope, accepted[-1], steps.y, smallest)
+                watch.look(accepted[-1] - accepted[-2], steps.slopes, accepted[-1], steps.y, smallest)
+                if len(accepted) > PACE and watch.is_clear():
+                    watch.give_up(_project_steps(accepted, stretch.end))
+                    raise TooManyStepsError
         # Stuck, or at rest, beside a corner beyond which the field is undefined.
         if course is not None:
             course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))

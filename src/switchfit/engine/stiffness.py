@@ -20,16 +20,16 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.problem.data import FloatArray
-from switchfit.runtime.errors import NotIntegrableError
 
 log = logging.getLogger("switchfit")
 
@@ -43,6 +43,12 @@ FEW_STEPS = 1000
 """A mode with fewer steps is not called stiff, and its eigenvalues are not computed: its rows take less than a
 millisecond, and the program with implicit rows takes a second to compile."""
 
+LOOKS_TO_STOP = 20
+"""Looks in a row at which stability limits the step after which the explicit solve is given up: the steps that it would
+take are known well enough from its pace. It took 25 ms to the end, where friction is regularised at 1e-6 m/s."""
+
+_LOOKS_THAT_MAY_STOP = range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
+
 LIMITED = 2.0
 """``|lambda| h`` from which stability limits the step: the region of stability reaches to 3.3 for eigenvalues whose
 damping ratio is above 0.3, to 2.1 for one of 0.02. Accuracy limits it to less: at rtol = 1e-8 to 0.1 in an
@@ -55,23 +61,18 @@ coarser, or as soon as theta moves (Van der Pol's oscillator with mu = 100: J is
 of twice as many cells)."""
 
 
+Slopes = Callable[[FloatArray, FloatArray], FloatArray]
+"""The vector field and the running cost (L, n + 1) at times (L,) and y (L, n + 1); NaN where they are not defined."""
+
+
 class _Look(NamedTuple):
     """A state of an explicit solve at which the eigenvalues can be computed: the arguments of `Watch.look`."""
 
     step: float
-    slope: Callable[[float, FloatArray], FloatArray]
+    slopes: Slopes
     t: float
     y: FloatArray
     smallest: float
-
-    def measure_rate(self) -> float:
-        """Return the largest ``|lambda|`` of a component that decays; 0 if none does, or the model is undefined."""
-        try:
-            with np.errstate(all="ignore"):
-                jacobian = _differentiate(self.slope, self.t, self.y, self.smallest)
-        except NotIntegrableError:  # beside the trajectory the model need not be defined
-            return 0.0
-        return _largest_decay(jacobian) if np.isfinite(jacobian).all() else 0.0
 
 
 @dataclass
@@ -89,8 +90,8 @@ class _ModeSteps:
 
     @cached_property
     def rates(self) -> list[float]:
-        """``|lambda|`` at each look."""
-        return [look.measure_rate() for look in self.looks]
+        """The largest ``|lambda|`` of a component that decays at each look."""
+        return _measure_all_rates(self.looks)
 
     @property
     def limited(self) -> list[float]:
@@ -123,6 +124,8 @@ class Watch:
         Work in a mode after which `add` raises `TooManyStepsError`.
     between : int
         Steps in a mode between two looks.
+    refused : container of str, optional
+        Modes that take explicit steps although they are stiff; by default all do.
 
     Attributes
     ----------
@@ -131,9 +134,14 @@ class Watch:
         The mode that is being solved; "" before the first.
     """
 
-    def __init__(self, most: Mapping[str, float] | None = None, between: int = STEPS_BETWEEN) -> None:
+    def __init__(
+        self,
+        most: Mapping[str, float] | None = None,
+        between: int = STEPS_BETWEEN,
+        refused: Container[str] | None = None,
+    ) -> None:
         self.modes: dict[str, _ModeSteps] = {}
-        self.most, self.between = most or {}, between
+        self.most, self.between, self.refused = most or {}, between, refused
         self.current = ""
 
     def find_stiff(self) -> dict[str, float]:
@@ -175,17 +183,15 @@ class Watch:
             raise TooManyStepsError
         return mode.count - mode.looked >= self.between
 
-    def look(
-        self, step: float, slope: Callable[[float, FloatArray], FloatArray], t: float, y: FloatArray, smallest: float
-    ) -> None:
+    def look(self, step: float, slopes: Slopes, t: float, y: FloatArray, smallest: float) -> None:
         """Keep a state of the current mode, for its eigenvalues; they are computed only if it takes many steps.
 
         Parameters
         ----------
         step : float
             Length of the last step.
-        slope : callable
-            ``slope(t, y) -> (n + 1,)``: the vector field, and the running cost, which is left out.
+        slopes : Slopes
+            The running cost is left out.
         t, y : float, (n + 1,)
             The end of that step.
         smallest : float
@@ -193,7 +199,17 @@ class Watch:
         """
         mode = self.modes[self.current]
         mode.looked = mode.count
-        mode.looks.append(_Look(step, slope, t, y.copy(), smallest))
+        mode.looks.append(_Look(step, slopes, t, y.copy(), smallest))
+
+    def is_clear(self) -> bool:
+        """Return whether the current mode is stiff, however its solve goes on, and may take implicit steps."""
+        looks = self.modes[self.current].looks
+        # 20 of at most 60 looks are more than a quarter of them.
+        if self.refused is None or self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
+            return False
+        last = looks[-LOOKS_TO_STOP:]
+        rates = _measure_all_rates(last)
+        return all(rate * look.step > LIMITED for rate, look in zip(rates, last, strict=True))
 
     def add_rows(self, rows: int) -> None:
         """Count rows of a mesh in the current mode."""
@@ -234,7 +250,7 @@ class Choice:
 
     def watch(self, k: int) -> Watch:
         """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its work is limited."""
-        return Watch({name: most for name, (at, most) in self._most.items() if at == k})
+        return Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
 
     def add(self, stiff: Mapping[str, float], explicit: Watch, k: int) -> bool:
         """Let modes take implicit steps, and return whether there is one among them that did not.
@@ -282,23 +298,38 @@ class Choice:
             log.info("%s.", text[0].upper() + text[1:])
 
 
-def _differentiate(
-    slope: Callable[[float, FloatArray], FloatArray], t: float, y: FloatArray, smallest: float
-) -> FloatArray:
-    """Return the Jacobian of the vector field by differences, (n, n), good enough for the size of its eigenvalues."""
-    n = len(y) - 1
-    before = slope(t, y)[:n]
+def _measure_all_rates(looks: Sequence[_Look]) -> list[float]:
+    """Return what `_measure_rates` does for looks of several stretches."""
+    # The looks of one stretch together: their slopes are one call of machine code.
+    return [rate for slopes, own in groupby(looks, _get_slopes) for rate in _measure_rates(slopes, [*own])]
+
+
+def _get_slopes(look: _Look) -> Slopes:
+    return look.slopes
+
+
+def _measure_rates(slopes: Slopes, looks: Sequence[_Look]) -> list[float]:
+    """Return the largest ``|lambda|`` of a component that decays at each look; 0 if none does, or the model is
+    undefined.
+    """
+    y, times = np.array([look.y for look in looks]), np.array([look.t for look in looks])
+    with np.errstate(all="ignore"):
+        jacobians = _differentiate(slopes, times, y, np.array([look.smallest for look in looks]))
+    rates = np.zeros(len(looks))
+    defined = np.isfinite(jacobians).all(axis=(1, 2))  # beside the trajectory the model need not be
+    eigenvalues = np.linalg.eigvals(jacobians[defined])
+    rates[defined] = np.where(eigenvalues.real < 0, np.abs(eigenvalues), 0.0).max(axis=1, initial=0.0)
+    return rates.tolist()
+
+
+def _differentiate(slopes: Slopes, times: FloatArray, y: FloatArray, smallest: FloatArray) -> FloatArray:
+    """Return the Jacobians of the vector field at times (L,) by differences, (L, n, n), good enough for the size of
+    their eigenvalues.
+    """
+    n, each = y.shape[1] - 1, np.arange(y.shape[1] - 1)
     # Differences from t on one side: lambda is needed to a factor, and n + 1 slopes are all that it costs.
-    steps = np.sqrt(np.finfo(float).eps) * (np.abs(y[:n]) + smallest)
-    columns = []
-    for k, step in enumerate(steps):
-        moved = y.copy()
-        moved[k] += step
-        columns.append((slope(t, moved)[:n] - before) / (moved[k] - y[k]))
-    return np.stack(columns, axis=1)
-
-
-def _largest_decay(jacobian: FloatArray) -> float:
-    """Return the largest size of an eigenvalue whose component decays; 0 if none does."""
-    eigenvalues = np.linalg.eigvals(jacobian)
-    return float(np.max(np.abs(eigenvalues[eigenvalues.real < 0]), initial=0.0))
+    moved = np.repeat(y[:, None], n + 1, axis=1)
+    moved[:, 1 + each, each] += np.sqrt(np.finfo(float).eps) * (np.abs(y[:, :n]) + smallest[:, None])
+    steps = moved[:, 1 + each, each] - y[:, :n]
+    found = slopes(np.repeat(times, n + 1), moved.reshape(-1, n + 1)).reshape(moved.shape)[..., :n]
+    return np.swapaxes((found[:, 1:] - found[:, :1]) / steps[..., None], 1, 2)

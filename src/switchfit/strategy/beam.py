@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.choice import hypotheses_of
-from switchfit.engine.native.hypotheses import NativeHypotheses
+from switchfit.engine.native.hypotheses import NativeHypotheses, OrderTables
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.fit.evaluator import assume_noise
 from switchfit.problem.data import FloatArray, Measurements
@@ -420,37 +420,66 @@ class Pass:
         kept = Sequences.start(rules.first, beam.births, float(beam.times[0]))
         start = self.build_start(np.zeros((1, beam.births + len(beam.places))))
         states = beam.engine.begin(self.parameters[beam.places], start, beam.tolerances, self.build_limits())
-        chosen = np.zeros(len(kept.mode), dtype=np.int64)
-        end, last, since = float(beam.times[-1]), int(beam.stops[-1]), 0
-        for begin, stop in pairwise(beam.stops.tolist()):
+        chosen, last = np.zeros(len(kept.mode), dtype=np.int64), len(beam.stops) - 1
+        # The hypotheses are propagated anew every 1 / replays of the stops; not right after another time, nor at the
+        # end, where LAST_REPLAYS come anyway.
+        stretch = max(-(-len(beam.stops) // max(replays, 1)), 2)
+        for first in range(0, last, stretch):
+            check_time()
+            until = min(first + stretch, last)
+            kept, states, chosen = self._follow(kept, states, chosen, (first, until), width)
+            if until < last:
+                kept, states = self._replay(kept, states, chosen, int(beam.stops[until]))
+                chosen = np.arange(len(chosen))
+        left, best, node = states.take(chosen), np.arange(len(chosen)), int(beam.stops[last])
+        for _ in range(LAST_REPLAYS if len(chosen) else 0):
+            kept, left = self._replay(kept.take(best), left, best, node)
+            # Where they converge, hypotheses with the same sequence become one.
+            value = self._value(left.scores, kept.switches, node, kept.times)
+            best = select_lowest(value, kept.code, kept.switches, width, 1)
+        return self._propose(kept, left)
+
+    def _follow(
+        self, kept: Sequences, states: Hypotheses, chosen: Integers, ends: tuple[int, int], width: int
+    ) -> tuple[Sequences, Hypotheses, Integers]:
+        """Return hypotheses, of which those with records in `chosen` are kept, at a later one of the stops."""
+        beam, rules = self.beam, self.rules
+        if self.order is not None:
+            last, births = kept.last[:, None], kept.times
+            given = states.records[chosen], kept.mode, np.concatenate([last, births], axis=1), self.order, *ends
+            places, born, found = beam.engine.follow_order(*given)
+            return Sequences.of_places(places, born[:, 1:], born[:, 0]), found, np.arange(len(places))
+        tf = float(beam.times[-1])
+        for begin, stop in pairwise(beam.stops[ends[0] : ends[1] + 1].tolist()):
             check_time()
             t = float(beam.times[begin])
             # All that were kept go on as they are, then come the births at this node; the engine takes both to the next
             # stop.
-            children = kept.list_children(*rules.list_births(kept, t, end))
+            children = kept.list_children(*rules.list_births(kept, t, tf))
             states = beam.engine.advance(states, self.build_table(kept, children, chosen), begin, stop)
             times = None
             if self.has_prior_times:
                 times = kept.follow(children, np.arange(len(children.mode)), t).times
             value = self._value(states.scores, children.switches, stop, times)
             # Sequences that may not end here drop out.
-            if stop == last:
+            if stop == beam.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
             chosen = select_lowest(value, children.code, children.switches, width)
             kept = kept.follow(children, chosen, t)
-            since += 1
-            # Every 1 / replays of the stops; not right after another one, nor at the end, where LAST_REPLAYS come
-            # anyway.
-            if since > 1 and replays * since >= len(beam.stops) and stop != last:
-                kept, states = self._replay(kept, states, chosen, stop)
-                chosen, since = np.arange(len(chosen)), 0
-        left, value = states.take(chosen), value[chosen]
-        for each in range(LAST_REPLAYS if len(chosen) else 0):
-            # Where they converge, hypotheses with the same sequence become one.
-            best = np.arange(len(value)) if each == 0 else select_lowest(value, kept.code, kept.switches, width, 1)
-            kept, left = self._replay(kept.take(best), left, best, last)
-            value = self._value(left.scores, kept.switches, last, kept.times)
-        return self._propose(kept, left)
+        return kept, states, chosen
+
+    @cached_property
+    def order(self) -> OrderTables | None:
+        """The order of modes, where it is given and nothing but their scores counts of its hypotheses; else None."""
+        rules, windows = self.rules, self.rules.list_windows()
+        if windows is None or self.has_prior_times:
+            return None
+        places = np.arange(len(rules.modes))
+        children = self.steps[places, np.minimum(places + 1, places[-1])]
+        children[:, SLOT] = places
+        counts = np.zeros((2, len(places), 3), dtype=np.int64)
+        counts[1, :, 0], counts[:, :, 1] = 1, rules.modes
+        return OrderTables(children, counts, windows, self.beam.stops.astype(np.int64))
 
     def _replay(self, kept: Sequences, states: Hypotheses, chosen: Integers, stop: int) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses with all births where they have moved, and their states at a node.

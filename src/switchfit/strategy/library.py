@@ -232,9 +232,7 @@ class Rules(NamedTuple):
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
-        # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
-        least = np.maximum(self.shortest * (1 - 1e-9), SMALLEST)
-        may_leave = t - kept.last >= least[kept.mode]
+        may_leave = t - kept.last >= self._list_least()[kept.mode]
         if self.between is not None and self.between.size:
             earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
             may_leave &= (earliest < t) & (t < latest)
@@ -243,6 +241,18 @@ class Rules(NamedTuple):
         follows = self.follows.reshape(-1, K).take(kept.switches * K + kept.mode, axis=0)
         parents, after = (follows & may_leave[:, None] & may_enter).nonzero()
         return parents, after
+
+    def list_windows(self) -> FloatArray | None:
+        """Return what limits when places of a given order are left, see `OrderTables`; None without such an order."""
+        if self.between is None:
+            return None
+        limits = np.zeros((len(self.modes), 4))
+        limits[:, 0], limits[:-1, 1:3], limits[:-1, 3] = self._list_least(), self.between.T, self.shortest[1:]
+        return limits
+
+    def _list_least(self) -> FloatArray:
+        """Return how long a hypothesis stays in each place: its mode's shortest time, and more than an instant."""
+        return np.maximum(self.shortest * (1 - 1e-9), SMALLEST)
 
 
 def _list_follows(allowed: NDArray[np.bool_], ends: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -281,6 +291,12 @@ class Sequences(NamedTuple):
         modes = np.zeros((B, births + 1), dtype=np.int64)
         modes[:, 0] = first
         return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
+
+    @classmethod
+    def of_places(cls, places: Integers, times: FloatArray, last: FloatArray) -> Sequences:
+        """Return those of hypotheses in these places of a given order, with their births (B, S), and the last ones."""
+        passed = np.arange(times.shape[1] + 1)
+        return cls(places, places, last, places, np.where(passed <= places[:, None], passed, 0), times)
 
     def take(self, chosen: Integers | slice) -> Sequences:
         """Return some of them."""

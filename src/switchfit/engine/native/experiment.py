@@ -403,14 +403,21 @@ class NativeExperiment:
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
-        L, modes = len(times), len(self.structure.modes)
-        slopes = np.zeros((L, modes, self.sizes.n + 1))
-        given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
-        given["y"] = np.column_stack([states, np.zeros(L)])
-        checks = [self._call(f"slope_{k}", given | {"K": slopes[:, k]}, p, L) for k in range(modes)]
-        if np.isnan(checks).any():
+        y = np.column_stack([states, np.zeros(len(times))])
+        slopes = np.stack([self.slopes_in(k, times, y, p, cells) for k in range(len(self.structure.modes))], axis=1)
+        if np.isnan(slopes[..., -1]).any():
             raise FailedCheckError
         return slopes[..., :-1]
+
+    def slopes_in(
+        self, mode: int, times: FloatArray, y: FloatArray, p: FloatArray, cells: NDArray[np.intp] | None = None
+    ) -> FloatArray:
+        """Return what `slope` does at times (L,) and y (L, n + 1): (L, n + 1), NaN where a finiteness check failed."""
+        cells = self._find_cells(times) if cells is None else cells
+        slopes = np.zeros(y.shape)
+        given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
+        checks = self._call(f"slope_{mode}", given | {"y": y, "K": slopes}, p, len(times))
+        return slopes + checks[:, None]
 
     def outputs(
         self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray
@@ -422,7 +429,7 @@ class NativeExperiment:
         if tangents.size:
             Z[..., self._places[self._there]] = tangents[..., self._there]
         given = {"time": times, "x": np.ascontiguousarray(states), "Z": Z, "y": y, "Y": Y}
-        if np.isnan(self._call("outputs", given, p, L)):
+        if np.isnan(self._call("outputs", given, p, L)).any():
             raise FailedCheckError
         return y, self._spread(Y)
 
@@ -476,19 +483,23 @@ class NativeExperiment:
         """Return a function of the driver with a number of arguments: integers and addresses."""
         return self._program.function(f"{self._prefix}{name}", *[ctypes.c_int64] * count)
 
-    def _call(self, name: str, given: Mapping[str, FloatArray], p: FloatArray, count: int = 1) -> float:
+    def _find_cells(self, times: FloatArray) -> NDArray[np.intp]:
+        """Return the cells that hold times (L,)."""
+        return np.clip(self.times.searchsorted(times, "right") - 1, 0, self._cells - 1)
+
+    def _call(self, name: str, given: Mapping[str, FloatArray], p: FloatArray, count: int = 1) -> FloatArray:
         """Call a straight-line function at `count` points, with an array for each pointer that is not an argument.
 
-        Return 0, or NaN if a finiteness check failed.
+        Return 0 for each point, or NaN if a finiteness check failed there: (count,).
         """
         self._own_p[:] = p
-        check, arguments = np.zeros(1), [count]
-        arrays = {CHECKED: check, **given}
+        checks, arguments = np.zeros(count), [count]
+        arrays = {CHECKED: checks, **given}
         for key in self._program.pointers[f"{self._prefix}{name}"]:
             array = arrays.get(key)
             arguments += (self._addresses[key], 0) if array is None else (get_address(array), array.strides[0])
         self._find(f"each_{name}", len(arguments))(*arguments)
-        return float(check[0])
+        return checks
 
     def _evaluate(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
         """Evaluate J and, of a program with derivatives, those of ``J + multipliers . c``."""

@@ -14,6 +14,7 @@ from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import (
     COLUMNS,
     OF_SAMPLES,
+    PER_PLACE,
     divide_record,
     hypotheses_program,
     measure_record,
@@ -51,6 +52,25 @@ class Reserved(NamedTuple):
     samples: list[tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]]
 
 
+class OrderTables(NamedTuple):
+    """A given order of modes, N + 1 places, as machine code takes it.
+
+    Attributes
+    ----------
+    children : (N + 1, 7), the birth at the end of each place, see `Column`; the last one is not read
+    counts : (2, N + 1, 3), the number of births of a hypothesis that stays in a place and of one that leaves it, the
+        mode of the place, and 0
+    windows : (N + 1, 4), how long the mode of each place lasts at least, the times between which its end is, and how
+        long the next mode lasts at least
+    stops : (L,), nodes between which births are
+    """
+
+    children: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    windows: FloatArray
+    stops: NDArray[np.int64]
+
+
 class NativeHypotheses:
     """Propagates hypotheses on the mode sequence of one experiment from node to node of a mesh.
 
@@ -81,6 +101,8 @@ class NativeHypotheses:
     ) -> None:
         self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
+        self._shape = sizes.n, sizes.D, sizes.width
+        self._shape = sizes.n, sizes.D, sizes.width
         # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
@@ -105,6 +127,10 @@ class NativeHypotheses:
         self._table_at = get_address(self._table)
         self._propagate = program.function(
             f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 8
+        )
+
+        self._follow_order = program.function(
+            f"{PREFIX[Order.GAUSS_NEWTON]}follow_order", *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 5
         )
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
@@ -169,6 +195,45 @@ class NativeHypotheses:
         counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
         return self._go_on(parents.records, counts, children, times, (first, last, False))
 
+    def follow_order(
+        self,
+        parents: FloatArray,
+        places: NDArray[np.int64],
+        births: FloatArray,
+        order: OrderTables,
+        first: int,
+        last: int,
+    ) -> tuple[NDArray[np.int64], FloatArray, Hypotheses]:
+        """Take hypotheses from one stop to another in a given order of modes; the lowest scores of each place are kept.
+
+        Parameters
+        ----------
+        parents : records (B, size) at the first stop
+        places : (B,), their places in the order
+        births : (B, S + 1), the time of their last birth, or t0, then those of all
+        order : OrderTables
+        first, last : int
+            Among the stops of the order.
+
+        Returns
+        -------
+        places, births, Hypotheses : at the last stop, the lowest score first
+        """
+        K, room = len(order.counts[0]), PER_PLACE + 1
+        records, wide = np.empty((2, K * room, self.record_size)), np.empty((2, K * room, births.shape[1]))
+        numbers, ranks = np.zeros((2, K), dtype=np.int64), np.arange(2 * K * room).reshape(2, K * room)
+        rank = [places[:k].tolist().count(place) for k, place in enumerate(places.tolist())]
+        at = places * room + rank
+        records[0, at], wide[0, at], numbers[0] = parents, births, np.bincount(places, minlength=K)
+        given = records, numbers, ranks, wide, *order
+        sizes = K, births.shape[1], first, last, self._cells
+        self._follow_order(self._table_at, *map(get_address, given), *sizes)
+        end = (last - first) % 2
+        kept = np.arange(room) < numbers[end, :, None]
+        found = ranks[end].reshape(K, room)[kept] - end * K * room
+        found = found[np.argsort(records[end, found, self._at["score"].start], kind="stable")]
+        return found // room, wide[end, found], self.view(records[end, found])
+
     def replay(
         self,
         start: Hypotheses,
@@ -227,8 +292,7 @@ class NativeHypotheses:
 
     def view(self, records: FloatArray) -> Hypotheses:
         """Return what records (B, size) hold, as views."""
-        D, width, at, rows = self._sizes.D, self._sizes.width, self._at, {"H": self._sizes.D, "Z": self._sizes.n}
-        H, Z = (records[:, at[name]].reshape(len(records), n, width)[..., :D] for name, n in rows.items())
-        g = records[:, at["g"]][:, :D]
-        scores, costs = records[:, at["score"].start], records[:, at["J"].start]
+        at, B, (n, D, width) = self._at, len(records), self._shape
+        H, Z = records[:, at["H"]].reshape(B, D, width)[..., :D], records[:, at["Z"]].reshape(B, n, width)[..., :D]
+        g, scores, costs = records[:, at["g"]][:, :D], records[:, at["score"].start], records[:, at["J"].start]
         return Hypotheses(scores, costs, g, H, records[:, at["moved"]], records[:, at["x"]], Z, records)

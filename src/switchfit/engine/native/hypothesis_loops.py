@@ -32,6 +32,13 @@ SMALL_ERROR = 1 / 64
 
 COLUMNS = len(Column)
 
+PER_PLACE = 3
+"""Hypotheses that `follow_order` keeps in each place of a given order of modes: as many as a beam of one sequence."""
+
+WINDOW = 4
+"""What limits the births at the end of a place, in doubles: how long its mode lasts at least, the times between which
+the birth is, and how long the next mode lasts at least."""
+
 GIVEN = "nodes", "signals", "c", "units", "tolerances", "low", "high", "most", "jump_first", "jump_map"
 """Pointers in the table, before those of the scratch space and of the samples. `jump_first` (G + 2,) has the place in
 `jump_map` of the first jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far
@@ -112,6 +119,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
         writer.write_score,
         writer.write_birth,
         writer.write_propagation,
+        writer.write_following,
     ]
     for write in loops:
         module.add(write())
@@ -319,3 +327,75 @@ class HypothesisWriter(Writer):
                 self.call("shift", found)
                 self.call("shift_back", found)
         return self.end()
+
+    def write_following(self) -> str:
+        """Write the loop over the stops of a beam whose modes are in a given order: hypotheses differ in their times.
+
+        From stop to stop, those in each of the `places` go on as they are, then come births into the next place; of
+        each place the `PER_PLACE` with the lowest scores are kept. There are two generations in memory, that at a stop
+        and that at the next one; in each, a place has `PER_PLACE` + 1 records, of which the last is spare. For each
+        place there are `numbers` (2, places) of hypotheses and the `ranks` (2, places, PER_PLACE + 1) of its records,
+        the lowest score first; for each record, `births` (2, places, PER_PLACE + 1, births + 1) has the time of its
+        last birth, or t0, then those of all. At the `final` node only the last place is left. The generation at the end
+        is the first one after an even number of steps.
+        """
+        arrays = "ptr %records, ptr %numbers, ptr %ranks, ptr %births, ptr %children, ptr %counts, ptr %windows"
+        settings = "ptr %stops, i64 %places, i64 %length, i64 %first, i64 %last, i64 %final"
+        given = self.begin(f"void @follow_order(ptr %table, {arrays}, {settings})")
+        table, records, numbers, ranks, births, children, counts, windows, stops = given[:9]
+        places, length, first, last, final = given[9:]
+        size, room, nodes = measure_record(self.sizes), PER_PLACE + 1, self.pointers()["nodes"]
+        tf, now = self.get("double", nodes, final), Variable(self, "i64", 0)
+        with self.loop(first, last) as step:
+            here, there = (self.get("i64", stops, k) for k in (step, step + 1))
+            time_at, at_end = self.at(nodes, here), (there >= final).to("i64")
+            time, old, new = self.load("double", time_at), now.value, 1 - now.value
+            self.zero(self.at(numbers, new * places), places)
+            with self.loop(0, 2) as born, self.loop(0, places - born) as place:
+                entry, window = place + born, self.at(windows, place, WINDOW)
+                count = self.get("i64", numbers, old * places + place)
+                is_open = (at_end < 1) | (entry + 1 >= places)
+                with self.loop(0, is_open.choose(count, 0)) as rank:
+                    parent = self.get("i64", ranks, (old * places + place) * room + rank)
+                    past = self.at(births, parent, length)
+                    least, earliest, latest, after = (self.get("double", window, k) for k in range(WINDOW))
+                    may_leave = (time - self.load("double", past) >= least) & (time > earliest) & (time < latest)
+                    with self.when((born < 1) | (may_leave & (time + after <= tf))):
+                        kept = self.get("i64", numbers, new * places + entry)
+                        own_ranks = self.at(ranks, new * places + entry, room)
+                        child = self.get("i64", own_ranks, kept)
+                        record, own_births = self.at(records, child, size), self.at(births, child, length)
+                        own_counts = self.at(counts, born * places + place, 3)
+                        birth, before = self.at(children, place, COLUMNS), self.at(records, parent, size)
+                        whole = (table, record, before, birth, time_at, own_counts, 1, here, there, 0, 0, 1, at_end, 1)
+                        self.invoke("propagate", *whole)
+                        self._copy_each(own_births, past, length)
+                        with self.when(born > 0):
+                            self.store(time, own_births)
+                            self.put(time, own_births, entry)
+                        score = self._load_score(record)
+                        with self.when((score < float("inf")) & (score > float("-inf"))):
+                            self._insert(records, own_ranks, kept, child, score)
+                            is_full = kept >= PER_PLACE
+                            self.put(is_full.choose(kept, kept + 1), numbers, new * places + entry)
+            now.value = new
+        return self.end()
+
+    def _load_score(self, record: Value) -> Value:
+        return self.get("double", record, divide_record(self.sizes)["score"].start)
+
+    def _copy_each(self, target: Value, source: Value, length: Value) -> None:
+        """Emit the copy of so many doubles, a number that is not known."""
+        with self.loop(0, length) as k:
+            self.put(self.get("double", source, k), target, k)
+
+    def _insert(self, records: Value, ranks: Value, count: Value, child: Value, score: Value) -> None:
+        """Emit the insertion of a record behind those of its place, `count` of them, whose scores are no higher."""
+        size, rank = measure_record(self.sizes), Variable(self, "i64", count)
+        with self.repeat() as leave:
+            leave(rank.value < 1)
+            other = self.get("i64", ranks, rank.value - 1)
+            leave(score >= self._load_score(self.at(records, other, size)))
+            self.put(other, ranks, rank.value)
+            rank.value = rank.value - 1
+        self.put(child, ranks, rank.value)
