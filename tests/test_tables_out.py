@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import sys
-import warnings
 from dataclasses import fields, replace
 
 import numpy as np
@@ -228,31 +227,6 @@ def test_many_fits_have_a_row_each(studies, kind, tmp_path):
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "fits.parquet"), table)
     np.testing.assert_allclose(through_csv(table)["k"], table["k"], rtol=1e-15)
     xr.testing.assert_identical(through_netcdf(found), found)
-
-
-@pytest.mark.parametrize("kind", ["MonteCarlo", "Bootstrap"])
-def test_draws_for_arviz(studies, kind, monkeypatch, tmp_path):
-    study = studies[kind]
-    status = study.status.copy()
-    status[1] = "MAX_ITERATIONS"  # which is left out
-    study = replace(study, status=status)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # ArviZ 0.23 warns of its next version
-        import arviz
-
-        draws = study.to_arviz()
-        summary = arviz.summary(draws, kind="stats", round_to="none")
-    good = np.delete(study.theta, 1, axis=0)
-    np.testing.assert_array_equal(draws.posterior["k"], good[None, :, 1])
-    assert draws.posterior["tau_1"].attrs == {"units": "h"}
-    np.testing.assert_allclose(summary.loc[["tau_1", "k"], "mean"].astype(float), good.mean(0))
-    name = "truth" if kind == "MonteCarlo" else "estimate"
-    assert draws.constant_data[f"k {name}"].item() == getattr(study, name)[1]
-    monkeypatch.setattr(arviz, "InferenceData", None)
-    monkeypatch.delattr(arviz, "InferenceData")  # as in ArviZ 1.0
-    tree = study.to_arviz()
-    assert isinstance(tree, xr.DataTree)
-    xr.testing.assert_identical(tree["posterior"].to_dataset(), draws.posterior)
 
 
 @pytest.mark.parametrize("kind", KINDS)

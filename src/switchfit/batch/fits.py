@@ -38,7 +38,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
-from switchfit.runtime.frames import Tabular, Variable, build_arviz
+from switchfit.runtime.frames import Tabular
 from switchfit.runtime.json_records import from_json, to_json
 from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first
 from switchfit.runtime.progress import show_progress
@@ -427,15 +427,6 @@ class Fits(Tabular, Displayed):
         ('Multistart', 'CONVERGED')
         """
         return load_fits(cls, as_path(path, "path"))
-
-    def _collect_draws(self, what: str, centre_name: str, centre: FloatArray) -> Any:
-        """Return the estimates of the fits that converged as draws for ArviZ, and where they are drawn around."""
-        units = [unit if unit != "1" else "" for unit in self.theta_units]
-        named = list(zip(self.theta_names, units, strict=True))
-        good = self.theta[self.success]
-        draws = [Variable(name, good[None, :, k], ("chain", "draw"), unit) for k, (name, unit) in enumerate(named)]
-        constants = [Variable(f"{name} {centre_name}", centre[k], (), unit) for k, (name, unit) in enumerate(named)]
-        return build_arviz(draws, constants, {"inference_library": "switchfit", "draws": what})
 
 
 class LongRun(NamedTuple):

@@ -107,36 +107,6 @@ class MonteCarlo(Fits):
         inside = (low <= self.truth) & (self.truth <= high)
         return np.where(np.isnan(low).all(0), np.nan, inside.mean(0))
 
-    def to_arviz(self) -> Any:
-        """Return the estimates of the fits that converged as draws of one chain, in the group that ArviZ plots.
-
-        They are draws of the estimate over repetitions of the experiment, and not of a posterior. It is InferenceData
-        for ArviZ up to 0.23, and a DataTree for later versions.
-
-        Raises
-        ------
-        ImportError
-            If ArviZ or xarray is not installed.
-
-        See Also
-        --------
-        MonteCarlo.to_pandas, MonteCarlo.to_xarray
-
-        Examples
-        --------
-        >>> import warnings
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-
-        >>> study = sf.monte_carlo(heater_problem(), 20, theta=[2.5, 0.4])
-        >>> with warnings.catch_warnings():
-        ...     warnings.simplefilter("ignore")  # ArviZ 0.23 warns of its next version
-        ...     draws = study.to_arviz()
-        >>> draws.posterior["k"].dims
-        ('chain', 'draw')
-        """
-        return self._collect_draws("Monte Carlo", "truth", self.truth)
-
 
 def monte_carlo(
     problem: Problem,
