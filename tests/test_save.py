@@ -290,10 +290,6 @@ def array(dtype, shape, values):
         (("fit", "hessian_kind"), "\ud800", "fit.hessian_kind is not what was written"),
         (("fit", "active"), [BOUND | {"kind": "bound"}], 'fit.active[0].kind is not what was written; got "bound"'),
         (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects is not what was"),
-            ("fit", "reason"),
-            {"kind": "jump", "subjects": "mu", "figures": {}},
-            "fit.reason.subjects is not what was written",
-        ),
         (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
     ],
 )

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Self, get_origin, get_type_hints, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.batch.chunks import Work, read_arrays, run_chunks, write_arrays
+from switchfit.batch.chunks import read_arrays, run_chunks, write_arrays
 from switchfit.batch.study import list_places, replace_intervals
 from switchfit.batch.verdict import (
     count_priors,
@@ -456,7 +456,7 @@ class LongRun(NamedTuple):
         return cls(client, folder, callback, time.perf_counter())
 
 
-def repeat(problem: Problem, work: Work, count: int, title: str, how: LongRun) -> dict[str, Any]:
+def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) -> dict[str, Any]:
     """Do `count` runs with a bar on the terminal: the fields of `Fits`.
 
     Parameters

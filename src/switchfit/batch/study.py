@@ -3,8 +3,6 @@
 What is said of a fit beyond its end is the same in every study, and in a batch of logs: fits are done again that need
 it, and pieces of profiles are added, and how well each fit explains its data.
 
-Cost, gradient and Hessian of many fits at once, each with its own data: for the intervals of many estimates.
-
 Intervals of transition times across sample times, of many fits: as of `switchfit.uncertainty.walks`.
 
 Where a sample lies near a transition time, or a kink holds it, the pieces of its profile are found while the fit's data
@@ -20,34 +18,15 @@ happen anywhere, and from there on their guards.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any
+from functools import cache, cached_property, partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.program import (
-    CHUNK,
-    Chunk,
-    Inputs,
-    Layout,
-    Limits,
-    Varying,
-    choose_chunk_size,
-    choose_layout,
-    compile_for_layout,
-    compile_once,
-    count_chunks_together,
-    fit_chunk,
-    give_data,
-    pad_fits,
-)
+from switchfit.batch.program import Batch, Chunk, Limits, Varying, choose_chunk_size, count_chunks_together
 from switchfit.batch.verdict import (
     EXPLAINED_BADLY,
     count_priors,
@@ -66,7 +45,6 @@ from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.strategy.starts import End, fit_briefly
 from switchfit.uncertainty.walks import (
@@ -84,114 +62,6 @@ from switchfit.uncertainty.walks import (
     list_walks,
     trace_walks,
 )
-
-EVALUATIONS = 256
-"""Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
-
-UNDEFINED = (ValueError, ArithmeticError, np.linalg.LinAlgError)
-"""What a model raises where it is undefined."""
-
-
-class Evaluations:
-    """Cost, gradient and Hessian of any fits of a call with their own data, many at a time.
-
-    Parameters
-    ----------
-    problem : Problem
-    meshes : one an experiment
-    varying : Varying
-    room : int
-        As of `fit_chunk`.
-    redone : (R,) bool
-        Fits that were done again, on meshes of their own.
-    build_own : callable
-        Returns the evaluator of such a fit.
-
-    Attributes
-    ----------
-    quick : bool
-        Whether machine code evaluates the others, in one program; otherwise they are evaluated one by one.
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        meshes: Sequence[Mesh],
-        varying: Varying,
-        room: int,
-        redone: NDArray[np.bool_],
-        build_own: Callable[[int], Evaluator],
-    ) -> None:
-        self.varying, self.room, self.redone, self.build_own = varying, max(room, CHUNK), redone, build_own
-        self.evaluator = Evaluator(problem, meshes=meshes)
-        self.base = tuple(self.evaluator.arguments)
-        self.layout = choose_layout(self.evaluator, varying.places)
-        self.quick = self.layout.natively
-        self.own: dict[int, Evaluator] = {}
-
-    def __call__(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
-        """Return costs, gradients and Hessians at thetas (n, d), to one side (n,) of breakpoints.
-
-        `fits` (n,) says whose data are taken. NaN where the model is undefined.
-        """
-        n, d = thetas.shape
-        at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
-        alone = self.redone[fits] | (not self.quick)
-        together = np.flatnonzero(~alone)
-        for first in range(0, len(together), EVALUATIONS):
-            call = together[first : first + EVALUATIONS]
-            for all_, found in zip(at, self._run(fits[call], thetas[call], sides[call]), strict=True):
-                all_[call] = found
-        for s in np.flatnonzero(alone).tolist():
-            with suppress(*UNDEFINED):
-                here = self._prepare(int(fits[s]))(thetas[s], int(sides[s]))
-                at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
-        return at
-
-    def _prepare(self, k: int) -> Evaluator:
-        """Return an evaluator with the data of the k-th fit."""
-        if not self.redone[k]:
-            give_data(self.evaluator, self.base, self.varying, k)
-            return self.evaluator
-        if k not in self.own:
-            self.own[k] = self.build_own(k)
-        return self.own[k]
-
-    def _run(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
-        with use_float64():
-            padded = (pad_fits(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float)))
-            given = Inputs.of(self.evaluator, self.layout), self._values, *padded, len(fits)
-            with compile_once(self.layout, given):
-                found = _evaluate_fits(*given, layout=self.layout)
-        return tuple(np.asarray(each)[: len(fits)] for each in found)
-
-    @cached_property
-    def _values(self) -> tuple[jax.Array, ...]:
-        """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of the program."""
-        return tuple(jnp.asarray(pad_fits(value, self.room)) for value in self.varying.values)
-
-
-@compile_for_layout
-def _evaluate_fits(
-    inputs: Inputs,
-    values: tuple[jax.Array, ...],
-    fits: jax.Array,
-    thetas: jax.Array,
-    sides: jax.Array,
-    count: jax.Array,
-    *,
-    layout: Layout,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return cost, gradient and Hessian of the first `count` fits at their thetas."""
-    n, d = thetas.shape
-
-    def one(s: jax.Array, found: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        new = inputs.evaluate(layout, [value[fits[s]] for value in values], thetas[s], sides[s])
-        return tuple(all_.at[s].set(each) for all_, each in zip(found, new, strict=True))  # type: ignore[return-value]
-
-    empty = jnp.zeros(n), jnp.zeros((n, d)), jnp.zeros((n, d, d))
-    return lax.fori_loop(0, count, one, empty)
-
 
 MOST_SAMPLES = 5
 """With more samples than that within an interval one parabola is taken: their kinks begin to average out, and the
@@ -221,9 +91,7 @@ def make_no_pieces(problem: Problem, count: int) -> FloatArray:
     return np.full((count, len(list_places(problem)), 2, MOST_KEPT, PIECE), np.nan)
 
 
-def trace_chunk(
-    chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], prepare: Callable[[], Evaluations]
-) -> FloatArray:
+def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], batch: Batch) -> FloatArray:
     """Return the pieces of the profiles of a chunk's transition times: (R, T, 2, `MOST_KEPT`, 5).
 
     Parameters
@@ -231,8 +99,8 @@ def trace_chunk(
     chunk : Chunk
     groups : list of (Problem, (n,) int)
         Problems with the bounds and sample times of some fits.
-    prepare : callable
-        What evaluates the chunk's fits; asked for where any fit needs it.
+    batch : Batch
+        Which evaluates the chunk's fits.
     """
     found, converged = make_no_pieces(groups[0][0], len(chunk.cost)), has_converged(chunk.status)
     if not found.shape[1]:
@@ -242,13 +110,14 @@ def trace_chunk(
         return found
     fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
     smooth = chunk.status[fits] != AT_KINK
-    shared = prepare()
-    if not shared.quick:  # an evaluation of its own has to be compiled: for kinks alone, where there is nothing else
+    if (
+        not batch.layout.natively
+    ):  # an evaluation of its own has to be compiled: for kinks alone, where there is nothing else
         kept = ~smooth
         fits, rows, walks, smooth = fits[kept], rows[kept], Walks(*(each[kept] for each in walks)), smooth[kept]
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
-        return shared(fits[which], thetas, walks.side[which])
+        return batch.evaluate(fits[which], thetas, walks.side[which])
 
     start = Derivatives(chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits])
     pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)
@@ -506,17 +375,17 @@ class Study:
     def __call__(self, runs: range) -> Arrays:
         """Return the fits of some of the runs."""
         data, errors = self.stack_data(runs)
-        starts = self.list_starts(runs)
-        chunk = fit_chunk(self.problem, self.meshes, data, starts, self.limits, room=self.room, retry=self.retry)
+        batch = Batch(self.problem, self.meshes, data, self.limits, self.room)
+        chunk = batch.fit(self.list_starts(runs), retry=self.retry)
         for k, error in errors.items():
             chunk.clear_fit(k, error)
-        return self.finish_fits(chunk, runs, data) if self.is_finished else self.describe_fits(chunk, runs)
+        return self.finish_fits(chunk, runs, batch) if self.is_finished else self.describe_fits(chunk, runs)
 
     def list_starts(self, runs: range) -> FloatArray:
         """Return where some of the runs begin: (R, d)."""
         return self.starts[runs.start : runs.stop] if len(self.starts) > 1 else self.starts.repeat(len(runs), axis=0)
 
-    def finish_fits(self, chunk: Chunk, runs: range, data: Varying) -> Arrays:
+    def finish_fits(self, chunk: Chunk, runs: range, batch: Batch) -> Arrays:
         """Return the arrays of fits, of which those that need it are done again, with pieces of profiles."""
 
         def problem_of(k: int) -> Problem:
@@ -528,10 +397,14 @@ class Study:
             redo_doubted(chunk, problem_of, self.list_starts(runs), self.measure_variation(runs), self.limits)
         if any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
             return self.describe_fits(chunk, runs)
-        redone = find_replaced(before, chunk), lambda k: Evaluator(problem_of(k), chunk.theta[k])
-        prepare = partial(Evaluations, self.problem, self.meshes, data, self.room, *redone)
-        pieces = trace_chunk(chunk, self.group_fits(runs), prepare)
+        for k in np.flatnonzero(find_replaced(before, chunk)).tolist():
+            batch.own[k] = cache(partial(self._build_own, runs[k], chunk.theta[k]))
+        pieces = trace_chunk(chunk, self.group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
+
+    def _build_own(self, run: int, theta: FloatArray) -> Evaluator:
+        """Return the evaluator of a fit that was done again."""
+        return Evaluator(self.problem_of(run), theta)
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
         """Return the arrays of fits as they are, without pieces of profiles."""
