@@ -17,7 +17,7 @@ happen anywhere, and from there on their guards.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 
@@ -26,7 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.program import Batch, Chunk, Limits, Varying, choose_chunk_size, count_chunks_together
+from switchfit.batch.program import (
+    UNDEFINED,
+    Batch,
+    Chunk,
+    Limits,
+    Varying,
+    choose_chunk_size,
+    count_chunks_together,
+)
 from switchfit.batch.verdict import (
     EXPLAINED_BADLY,
     count_priors,
@@ -188,86 +196,6 @@ def replace_intervals(
     return found
 
 
-def redo_unresolved(
-    chunk: Chunk, problem_of: Callable[[int], Problem], meshes: Sequence[Mesh] | None, limits: Limits
-) -> None:
-    """Replace fits whose integration error is too large by those that `estimate` finds.
-
-    Of fits that share meshes, those that failed are looked at. A mode that is active elsewhere than where the meshes
-    were refined may find cells there that are far too long for it: what stops the optimiser is then the mesh and not
-    the model. A fit that fails again is left as it was.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        It is written to.
-    problem_of : callable
-        The problem of the k-th fit of the chunk, with its own data.
-    meshes : sequence of Mesh, optional
-        Those that all fits share; None if each has the meshes of its first guess.
-    limits : Limits
-    """
-    failed = ~has_converged(chunk.status)
-    looked_at = (chunk.status != Status.ERROR.name) & (failed | (meshes is None))
-    for k in np.flatnonzero(looked_at).tolist():
-        theta = chunk.theta[k]
-        try:
-            problem = problem_of(k)
-            if _is_resolved(problem, meshes, theta, chunk.cost[k]):
-                continue
-            again = fit_locally(problem, start=theta, **limits._asdict())
-        except Exception as error:
-            if not failed[k]:
-                chunk.set_error(k, error)
-            continue  # a fit from this end fails too: the first one stays, and is listed as failed
-        if again.status.successful or not failed[k]:
-            replace_fit(chunk, k, again)
-
-
-def redo_doubted(
-    chunk: Chunk,
-    problem_of: Callable[[int], Problem],
-    starts: FloatArray,
-    variation: FloatArray | float,
-    limits: Limits,
-) -> None:
-    """Replace fits that did not converge, lost modes or are far from their data by better ones, where there are any;
-    only of problems with guards or terminal constraints, which the compiled program does not take.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        It is written to.
-    problem_of : callable
-        The problem of the k-th fit of the chunk, with its own data.
-    starts : (R, d)
-        Where each of them begins.
-    variation : float or (R,)
-        As of `describe_ends`.
-    limits : Limits
-    """
-    totals = np.broadcast_to(np.asarray(variation, dtype=float), len(starts))
-    for k in range(len(starts)):
-        try:
-            problem = problem_of(k)
-        except Exception:  # the problem cannot be built, and the fit is listed as failed
-            continue
-        guarded = any(structure.guarded for structure in problem.structures)
-        for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
-            if not _is_doubted(problem, chunk, k, float(totals[k])):
-                break
-            try:
-                end = find(problem, starts[k])
-                if end.failed:
-                    continue
-                again = fit_locally(problem, start=end.theta, **limits._asdict())
-            except (ValueError, ArithmeticError, np.linalg.LinAlgError):  # nothing better from this start
-                continue
-            before = chunk.cost[k] if has_converged(chunk.status)[k] else np.inf
-            if again.status.successful and again.cost < before:
-                replace_fit(chunk, k, again)
-
-
 def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:
     """Return where a fit ends whose transitions may happen anywhere, and one on the guards from there."""
     free = fit_briefly(replace(problem, system=replace(problem.system, guards={})), start)
@@ -387,20 +315,66 @@ class Study:
 
     def finish_fits(self, chunk: Chunk, runs: range, batch: Batch) -> Arrays:
         """Return the arrays of fits, of which those that need it are done again, with pieces of profiles."""
-
-        def problem_of(k: int) -> Problem:
-            return self.problem_of(runs[k])
-
         before = chunk.theta.copy()
-        redo_unresolved(chunk, problem_of, self.meshes if self.shares_problem else None, self.limits)
+        self._redo_unresolved(chunk, runs)
         if self.problem.constraint_names:
-            redo_doubted(chunk, problem_of, self.list_starts(runs), self.measure_variation(runs), self.limits)
+            self._redo_doubted(chunk, runs)
         if any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
             return self.describe_fits(chunk, runs)
         for k in np.flatnonzero(find_replaced(before, chunk)).tolist():
             batch.own[k] = cache(partial(self._build_own, runs[k], chunk.theta[k]))
         pieces = trace_chunk(chunk, self.group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
+
+    def _redo_unresolved(self, chunk: Chunk, runs: range) -> None:
+        """Replace fits whose integration error is too large by those that `estimate` finds.
+
+        Of fits that share meshes, those that failed are looked at. A mode that is active elsewhere than where the
+        meshes were refined may find cells there that are far too long for it: what stops the optimiser is then the mesh
+        and not the model. A fit that fails again is left as it was.
+        """
+        failed = ~has_converged(chunk.status)
+        looked_at = (chunk.status != Status.ERROR.name) & (failed | (not self.shares_problem))
+        for k in np.flatnonzero(looked_at).tolist():
+            theta = chunk.theta[k]
+            try:
+                problem = self.problem_of(runs[k])
+                if _is_resolved(problem, self.meshes if self.shares_problem else None, theta, chunk.cost[k]):
+                    continue
+                again = fit_locally(problem, start=theta, **self.limits._asdict())
+            except Exception as error:
+                if not failed[k]:
+                    chunk.set_error(k, error)
+                continue  # a fit from this end fails too: the first one stays, and is listed as failed
+            if again.status.successful or not failed[k]:
+                replace_fit(chunk, k, again)
+
+    def _redo_doubted(self, chunk: Chunk, runs: range) -> None:
+        """Replace fits that did not converge, lost modes or are far from their data by better ones, if there are any.
+
+        Only of problems with guards or terminal constraints, which the compiled program does not take.
+        """
+        starts = self.list_starts(runs)
+        variations = np.broadcast_to(self.measure_variation(runs), len(runs))
+        for k, run in enumerate(runs):
+            try:
+                problem = self.problem_of(run)
+            except Exception:  # the problem cannot be built, and the fit is listed as failed
+                continue
+            guarded = any(structure.guarded for structure in problem.structures)
+            for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
+                if not _is_doubted(problem, chunk, k, float(variations[k])):
+                    break
+                try:
+                    end = find(problem, starts[k])
+                    if end.failed:
+                        continue
+                    again = fit_locally(problem, start=end.theta, **self.limits._asdict())
+                except UNDEFINED:  # nothing better from this start
+                    continue
+                before = chunk.cost[k] if has_converged(chunk.status)[k] else np.inf
+                if again.status.successful and again.cost < before:
+                    replace_fit(chunk, k, again)
 
     def _build_own(self, run: int, theta: FloatArray) -> Evaluator:
         """Return the evaluator of a fit that was done again."""
