@@ -17,7 +17,7 @@ from models import RAMP
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
-from switchfit.estimation.saved import FORMAT, VERSION, load_fit, save_fit
+from switchfit.estimation.saved import FORMAT, VERSION, load_saved, save_fit
 from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
 from switchfit.problem.unknowns import ActiveConstraint
@@ -70,7 +70,7 @@ def assert_same(a, b, where=""):
 
 def round_trip(fit: Fit, folder: Path, certificate: Certificate = CERTIFICATE) -> tuple[Fit, Certificate]:
     save_fit(fit, certificate, folder / "fit.json")
-    return load_fit(folder / "fit.json")
+    return load_saved(folder / "fit.json")[:2]
 
 
 def without_numbers() -> Fit:
@@ -191,7 +191,7 @@ def test_a_file_is_replaced_whole_and_nothing_is_left_beside_it(tmp_path):
     path = tmp_path / "fit.json"
     path.write_text("x" * 10_000_000)
     save_fit(made(), CERTIFICATE, path)
-    assert load_fit(path)[0].cost == 28.0
+    assert load_saved(path).fit.cost == 28.0
     assert os.listdir(tmp_path) == ["fit.json"]
 
 
@@ -214,7 +214,7 @@ def test_a_link_stays_one(tmp_path):
     (tmp_path / "link.json").symlink_to(tmp_path / "fit.json")
     save_fit(made(), CERTIFICATE, tmp_path / "link.json")
     assert (tmp_path / "link.json").is_symlink()
-    assert load_fit(tmp_path / "fit.json")[0].cost == 28.0
+    assert load_saved(tmp_path / "fit.json").fit.cost == 28.0
 
 
 def test_a_new_file_has_the_usual_permissions(tmp_path):
@@ -252,7 +252,7 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
     path = tmp_path / "fit.json"
     path.write_bytes(text)
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{message}"):
-        load_fit(path)
+        load_saved(path)
 
 
 BOUND = to_json(ActiveConstraint("lower bound", 0.05, "mu"), ActiveConstraint)
@@ -320,8 +320,8 @@ def test_what_is_not_as_it_was_written(change, tmp_path):
     save_fit(made(), CERTIFICATE, path)
     content = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps(content))
-    assert load_fit(path)[0].cost == 28.0, "in another layout"
+    assert load_saved(path).fit.cost == 28.0, "in another layout"
     change(content)
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="is damaged: its content is not what was written"):
-        load_fit(path)
+        load_saved(path)

@@ -26,14 +26,13 @@ from switchfit.batch.verdict import (
     find_doubts,
     has_converged,
     judge_many,
-    measure_quantile,
     measure_variance,
 )
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.faults import refuse_hidden_switches
-from switchfit.fit.result import Fit, interval
+from switchfit.fit.result import Fit, interval, measure_quantile
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem

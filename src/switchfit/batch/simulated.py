@@ -27,9 +27,6 @@ from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
 from switchfit.uncertainty.verdict import Verdict
 
-SOUND_AMONG = 3
-"""First runs among which one must be such that its noise can be drawn; what is wrong with a single one is listed."""
-
 Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
 
 
@@ -226,8 +223,7 @@ def build_study(
     limits : Limits
     """
     study = SimulatedStudy(problem, [], begin[None], limits, seed, truth, noise, simulate_clean(problem, truth))
-    study.find_sound_run(runs)
-    study.meshes, error = _build_meshes(study.problem_of(study.sound), truth, begin)
+    study.meshes, error = _build_meshes(study.problem_of(0), truth, begin)
     return study, error
 
 
@@ -303,25 +299,6 @@ class SimulatedStudy(Study):
     noise: Any
     clean: Values
 
-    def find_sound_run(self, count: int) -> None:
-        """Find a run whose noise can be drawn; raise the error of the first run if none of the first few can."""
-        tried = range(min(count, SOUND_AMONG))
-        _, errors = self._draw_runs(tried)
-        if len(errors) == len(tried):
-            raise errors[0]
-        self.sound = min(set(tried) - set(errors))
-
-    def _draw_runs(self, runs: Iterable[int]) -> tuple[list[Values], dict[int, Exception]]:
-        """Return the values of some runs, and the errors of those whose noise cannot be drawn, by their places."""
-        drawn, errors = [], {}
-        for place, run in enumerate(runs):
-            try:
-                drawn.append(self.draw_run(run))
-            except Exception as error:  # listed: it must not end the other runs
-                drawn.append(self.clean)
-                errors[place] = error
-        return drawn, errors
-
     def draw_run(self, run: int) -> Values:
         """Return the values of one run."""
         rng, drawn = np.random.default_rng([self.seed, run]), {}
@@ -374,7 +351,13 @@ class SimulatedStudy(Study):
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return the data of some runs, and the errors of those whose noise cannot be drawn, by their places."""
-        drawn, errors = self._draw_runs(runs)
+        drawn, errors = [], {}
+        for place, run in enumerate(runs):
+            try:
+                drawn.append(self.draw_run(run))
+            except Exception as error:  # listed: it must not end the other runs
+                drawn.append(self.clean)
+                errors[place] = error
         return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
 
     def measure_variation(self, runs: range) -> float:
@@ -383,7 +366,7 @@ class SimulatedStudy(Study):
 
     @cached_property
     def _variation(self) -> float:
-        return float(measure_variation(self.problem_of(self.sound)).sum())
+        return float(measure_variation(self.problem_of(0)).sum())
 
     def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""

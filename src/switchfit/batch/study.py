@@ -42,7 +42,6 @@ from switchfit.batch.verdict import (
     describe_ends,
     find_doubts,
     has_converged,
-    measure_quantile,
     measure_variance,
 )
 from switchfit.discretization.mesh import Arguments, Mesh, build_arguments
@@ -51,6 +50,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
+from switchfit.fit.result import measure_quantile
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -259,7 +259,6 @@ class Study:
     shares_problem = True  # whether bounds, sample times and meshes are those of `problem`
     retry = True  # whether a fit that strayed is fitted from its start too
     is_finished = True  # whether fits are done again that need it, and get pieces
-    sound = 0  # a run whose data can be made
 
     @property
     def size(self) -> int:
@@ -269,7 +268,7 @@ class Study:
     @cached_property
     def most_chunks(self) -> int:
         """Neighbouring chunks that one call may take."""
-        return count_chunks_together(self.problem, self.meshes, self.stack_data([self.sound])[0])
+        return count_chunks_together(self.problem, self.meshes, self.stack_data([0])[0])
 
     @property
     def room(self) -> int:
@@ -392,7 +391,7 @@ class Study:
 
     def fingerprint(self) -> str:
         """Return a digest of everything that a result depends on."""
-        unknowns, data = self.problem.unknowns, self.stack_data([self.sound])[0]  # stands for all runs
+        unknowns, data = self.problem.unknowns, self.stack_data([0])[0]  # run 0 stands for all
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves(self.arguments)
         shared = [np.asarray(leaf) for place, leaf in enumerate(leaves) if place not in data.places]

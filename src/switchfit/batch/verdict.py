@@ -96,13 +96,6 @@ def measure_variance(cost: FloatArray, freedom: NDArray[np.int64], sigma_known: 
     return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
 
 
-def measure_quantile(level: float, freedom: NDArray[np.int64], sigma_known: bool | None) -> FloatArray:
-    """Return the two-sided quantile of each fit, as of `Fit.quantile`: (R,)."""
-    tail = 0.5 + level / 2
-    found = special.stdtrit(freedom, tail) if sigma_known is False else special.ndtri(tail)
-    return np.broadcast_to(found, freedom.shape)
-
-
 MINOR = 0.01
 """Share of a study's fits that may have failed, or ended at a bound or with a collapsed mode, without a doubt about its
 standard deviations and 95 % intervals."""

@@ -261,17 +261,6 @@ class SavedFit(NamedTuple):
     provenance: Provenance | None
 
 
-def load_fit(path: Path) -> tuple[Fit, Certificate]:
-    """Return the fit and the certificate of a file, see `load_saved`.
-
-    Parameters
-    ----------
-    path : Path
-    """
-    saved = load_saved(path)
-    return saved.fit, saved.certificate
-
-
 def load_saved(path: Path) -> SavedFit:
     """Read what `save_fit` wrote; every field is equal, and arrays have the same bits, dtype and shape.
 

@@ -327,8 +327,8 @@ class TimeProfile:
     above: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Termination):
     """Result of an estimation; d unknowns in the order of `theta_names`.
 
     Attributes
@@ -429,23 +429,16 @@ class Fit:
     parameters: Values
     parameter_units: Mapping[str, str]
     fixed: tuple[str, ...]
-    cost: float
     gradient: FloatArray
     hessian: FloatArray
-    optimality: float
-    iterations: int
     evaluations: int
-    status: Status
     history: tuple[IterationRecord, ...]
-    active: tuple[ActiveConstraint, ...]
-    kinks: tuple[Kink, ...]
     free_basis: FloatArray
     trajectories: tuple[Trajectory, ...]
     comparisons: tuple[tuple[Comparison, ...], ...]
     sigma_known: bool | None
     integration_error: float
     hessian_kind: str
-    tolerance: float
     seconds: float
     constraints: tuple[tuple[str, float, float], ...] = ()
     saved_gauss_newton: FloatArray | None = None
@@ -455,17 +448,11 @@ class Fit:
     least_squares: bool = True
     engine: Engine | None = None
     integration_error_of: str = "J"
-    idle: tuple[str, ...] = ()
-    unread: tuple[str, ...] = ()
-    absent: tuple[str, ...] = ()
-    earlier_iterations: int = 0
-    smallest_eigenvalue: float = np.nan
-    flat_direction: tuple[tuple[str, float], ...] = ()
-    violated: tuple[tuple[str, float], ...] = ()
-    reason: Issue | None = None
     starts: tuple[int, int, int] | None = None
     steps: tuple[Step, ...] = ()
     initial_cost: float = np.nan
+
+    __eq__, __hash__ = object.__eq__, object.__hash__
 
     def __post_init__(self) -> None:
         plain = {name: float(v) if np.ndim(v) == 0 else np.asarray(v) for name, v in self.parameters.items()}
@@ -690,10 +677,7 @@ class Fit:
         >>> round(fit.quantile(0.95), 2)
         1.96
         """
-        level = as_level(level)
-        tail = 0.5 + level / 2
-        freedom = max(self.freedom, 1)
-        return float(special.stdtrit(freedom, tail) if self.sigma_known is False else special.ndtri(tail))
+        return float(measure_quantile(as_level(level), max(self.freedom, 1), self.sigma_known))
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
@@ -730,6 +714,12 @@ class Fit:
         log = np.isin(self.theta_names, self.log_scaled)
         low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
+
+
+def measure_quantile(level: float, freedom: Any, sigma_known: bool | None) -> Any:
+    """Return the two-sided quantiles of fits with these degrees of freedom, as of `Fit.quantile`: (R,)."""
+    tail = 0.5 + level / 2
+    return special.stdtrit(freedom, tail) if sigma_known is False else np.full(np.shape(freedom), special.ndtri(tail))
 
 
 def correlation_of(covariance: FloatArray) -> FloatArray:
