@@ -49,6 +49,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.unknowns import Variables
 from switchfit.runtime.cache import use_compilation_cache
+from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.walks import Derivatives
 
 CHUNK = 64
@@ -658,7 +659,7 @@ def _is_raised_in_callback(error: BaseException) -> bool:
 
 def describe_failure(error: BaseException) -> str:
     """Return the message of a fit that ended with an error, on one line."""
-    return str(Termination.of_error(describe_error(error)))
+    return str(Termination(Status.ERROR, reason=Issue("error", (describe_error(error),))))
 
 
 def describe_error(error: BaseException) -> str:

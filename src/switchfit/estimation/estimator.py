@@ -1,7 +1,4 @@
-"""The result of a fit, with methods that need the model: intervals, predictions, validation, files.
-
-Figures of an estimate as its methods; `switchfit.report` draws them.
-"""
+"""The result of a fit, with methods that need the model: intervals, predictions, validation, figures, files."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args, overload
 
 from numpy.typing import ArrayLike
 
@@ -54,162 +51,6 @@ if TYPE_CHECKING:
     import xarray
 
 
-class FitFigures(Fit):
-    """A fit whose methods draw it."""
-
-    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
-        """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
-
-        Parameters
-        ----------
-        bands : bool
-            Whether to draw confidence and prediction bands of the fitted values, which need the model and a covariance.
-            The first ones of a model take a second to compile.
-        level : float, between 0 and 1
-            Level of the bands.
-
-        See Also
-        --------
-        Estimate.plot_residuals, Estimate.predict
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> figure = fit.plot(bands=False)
-        >>> len(figure.axes)
-        2
-        """
-        return draw_figure(self, bands=bands, level=level)
-
-    @property
-    def residuals(self) -> ResidualDiagnostics:
-        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
-        return diagnose(self)
-
-    def plot_residuals(self) -> Figure:
-        """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
-
-        See Also
-        --------
-        Estimate.residuals, Estimate.plot
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> len(fit.plot_residuals().axes)
-        3
-        """
-        return draw_figure(self.residuals)
-
-    @overload
-    def plot_convergence(self, *, ax: None = ...) -> Figure: ...
-    @overload
-    def plot_convergence(self, *, ax: Axes) -> Axes: ...
-    def plot_convergence(self, *, ax: Axes | None = None) -> Axes | Figure:
-        """Draw the optimality against iteration on a logarithmic scale, with the tolerance.
-
-        Parameters
-        ----------
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> fit.plot_convergence().axes[0].get_xlabel()
-        'iteration'
-        """
-        return draw_figure(self, what="convergence", ax=ax)
-
-    @overload
-    def plot_timeline(self, *, level: float = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot_timeline(self, *, level: float = ..., ax: Axes) -> Axes: ...
-    def plot_timeline(self, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
-        """Draw which mode is active when, a row for each experiment, with intervals of the transition times.
-
-        Parameters
-        ----------
-        level : float, between 0 and 1
-            Of the intervals.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> [text.get_text() for text in fit.plot_timeline().axes[0].texts]
-        ['on', 'off']
-        """
-        return draw_figure(self, what="timeline", level=level, ax=ax)
-
-    @overload
-    def plot_plane(
-        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: None = ...
-    ) -> Figure: ...
-    @overload
-    def plot_plane(self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: Axes) -> Axes: ...
-    def plot_plane(
-        self,
-        *,
-        channels: tuple[str, str] | None = None,
-        experiment: int = 0,
-        ax: Axes | None = None,
-    ) -> Axes | Figure:
-        """Draw the path in the plane where two positions are measured.
-
-        Parameters
-        ----------
-        channels : (str, str), optional
-            Names of the two positions; left out, they are told by names such as X and Y or east and north.
-        experiment : int
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        Raises
-        ------
-        ValueError
-            If no two channels are positions in a plane, or those that are named do not exist.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> try:  # a drive with two positions has such a figure, a room with one thermometer has none
-        ...     fit.plot_plane()
-        ... except ValueError as error:
-        ...     print(str(error).partition(";")[0])
-        no two channels of the same data are positions in a plane by their names
-        """
-        return draw_figure(self, what="plane", channels=channels, experiment=experiment, ax=ax)
-
-
 TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
 TABLES = get_args(TableKind)
 
@@ -218,7 +59,7 @@ MOST_SENSITIVITIES = 2**28
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(FitFigures, Tabular, Displayed):
+class Estimate(Fit, Tabular, Displayed):
     """Result of `estimate`: everything in `Fit`, with methods that need the model. Print it for the report.
 
     Attributes
@@ -455,12 +296,9 @@ class Estimate(FitFigures, Tabular, Displayed):
             raise ValueError(
                 "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
             )
-        if self.evaluator is not None:
-            return self.evaluator
-        if "_refined" not in self.__dict__:  # of a loaded estimate, whose meshes are not saved
-            self.__dict__["_refined"] = Evaluator(self.problem, self.theta)
-        refined: Evaluator = self.__dict__["_refined"]
-        return refined
+        if self.evaluator is None:  # of a loaded estimate, whose meshes are not saved
+            object.__setattr__(self, "evaluator", Evaluator(self.problem, self.theta))
+        return cast(Evaluator, self.evaluator)
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return intervals of all unknowns, cut off at the bounds: (d, 2).
@@ -610,6 +448,158 @@ class Estimate(FitFigures, Tabular, Displayed):
     def identifiability(self) -> Identifiability:
         """Which combinations of the unknowns the data determine badly, with J evaluated there."""
         return identifiability(self)
+
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
+        """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
+
+        Parameters
+        ----------
+        bands : bool
+            Whether to draw confidence and prediction bands of the fitted values, which need the model and a covariance.
+            The first ones of a model take a second to compile.
+        level : float, between 0 and 1
+            Level of the bands.
+
+        See Also
+        --------
+        Estimate.plot_residuals, Estimate.predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> figure = fit.plot(bands=False)
+        >>> len(figure.axes)
+        2
+        """
+        return draw_figure(self, bands=bands, level=level)
+
+    @property
+    def residuals(self) -> ResidualDiagnostics:
+        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
+        return diagnose(self)
+
+    def plot_residuals(self) -> Figure:
+        """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
+
+        See Also
+        --------
+        Estimate.residuals, Estimate.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.plot_residuals().axes)
+        3
+        """
+        return draw_figure(self.residuals)
+
+    @overload
+    def plot_convergence(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot_convergence(self, *, ax: Axes) -> Axes: ...
+    def plot_convergence(self, *, ax: Axes | None = None) -> Axes | Figure:
+        """Draw the optimality against iteration on a logarithmic scale, with the tolerance.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.plot_convergence().axes[0].get_xlabel()
+        'iteration'
+        """
+        return draw_figure(self, what="convergence", ax=ax)
+
+    @overload
+    def plot_timeline(self, *, level: float = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot_timeline(self, *, level: float = ..., ax: Axes) -> Axes: ...
+    def plot_timeline(self, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+        """Draw which mode is active when, a row for each experiment, with intervals of the transition times.
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            Of the intervals.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [text.get_text() for text in fit.plot_timeline().axes[0].texts]
+        ['on', 'off']
+        """
+        return draw_figure(self, what="timeline", level=level, ax=ax)
+
+    @overload
+    def plot_plane(
+        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: None = ...
+    ) -> Figure: ...
+    @overload
+    def plot_plane(self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: Axes) -> Axes: ...
+    def plot_plane(
+        self,
+        *,
+        channels: tuple[str, str] | None = None,
+        experiment: int = 0,
+        ax: Axes | None = None,
+    ) -> Axes | Figure:
+        """Draw the path in the plane where two positions are measured.
+
+        Parameters
+        ----------
+        channels : (str, str), optional
+            Names of the two positions; left out, they are told by names such as X and Y or east and north.
+        experiment : int
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        Raises
+        ------
+        ValueError
+            If no two channels are positions in a plane, or those that are named do not exist.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> try:  # a drive with two positions has such a figure, a room with one thermometer has none
+        ...     fit.plot_plane()
+        ... except ValueError as error:
+        ...     print(str(error).partition(";")[0])
+        no two channels of the same data are positions in a plane by their names
+        """
+        return draw_figure(self, what="plane", channels=channels, experiment=experiment, ax=ax)
 
     def save(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it.

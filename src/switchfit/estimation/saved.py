@@ -19,7 +19,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -162,17 +162,14 @@ def digest_data(fit: Fit) -> tuple[FileDigest, ...]:
     ----------
     fit : Fit
     """
-    return tuple(_digest_each(fit))
-
-
-def _digest_each(fit: Fit) -> Iterator[FileDigest]:
-    single = len(fit.comparisons) == 1
+    found, single = [], len(fit.comparisons) == 1
     for run, comparisons in zip(fit.run_names, fit.comparisons, strict=True):
         for comparison in comparisons:
             if comparison.kind == "measurements":
                 columns = np.column_stack([comparison.times, comparison.measured]).astype("<f8")
                 label = ", ".join(comparison.names) if single else f"{run}: {', '.join(comparison.names)}"
-                yield digest_bytes(label, np.ascontiguousarray(columns).tobytes())
+                found.append(digest_bytes(label, np.ascontiguousarray(columns).tobytes()))
+    return tuple(found)
 
 
 def find_versions() -> dict[str, str]:

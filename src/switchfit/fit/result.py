@@ -123,22 +123,6 @@ class Termination(Printed):
     unread: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()
 
-    @classmethod
-    def of_error(cls, text: str) -> Termination:
-        """Return the termination of a fit that ended with an error, whose message is `text`.
-
-        See Also
-        --------
-        Termination
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> sf.Termination.of_error("the log is empty").status.name
-        'ERROR'
-        """
-        return cls(Status.ERROR, reason=Issue("error", (text,)))
-
 
 def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termination:
     """Return how a fit ended, from the optimizer's result.
@@ -817,37 +801,6 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     return np.asarray(inverse)
 
 
-class FreeCurvature(NamedTuple):
-    """The Hessian on the directions that constraints and kinks leave free.
-
-    Attributes
-    ----------
-    smallest : float
-        Its smallest eigenvalue; NaN if nothing is free.
-    scaled : (k,)
-        Eigenvalues, ascending, with the unknowns scaled to unit curvature each.
-    weakest : tuple of str
-        Unknowns with the largest components in the direction of the smallest of them.
-    """
-
-    smallest: float
-    scaled: FloatArray
-    weakest: tuple[str, ...]
-
-
-@one_thread()
-def free_curvature(fit: Fit, without: Sequence[str] = ()) -> FreeCurvature:
-    """Return how well a fit's unknowns, but for those in `without`, are determined, from its exact Hessian."""
-    Z = _leave_out(fit.free_basis, np.isin(fit.theta_names, without))
-    if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
-        return FreeCurvature(np.nan, np.zeros(0), ())
-    spectrum = compute_scaled_spectrum(fit.hessian, Z)
-    weight = np.abs(spectrum.vectors[:, 0])
-    strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
-    smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
-    return FreeCurvature(smallest, spectrum.values, tuple(fit.theta_names[i] for i in strong))
-
-
 def list_without_effect(fit: Fit) -> tuple[str, ...]:
     """Return the free parameters and initial states on which J does not depend, to second order.
 
@@ -858,15 +811,6 @@ def list_without_effect(fit: Fit) -> tuple[str, ...]:
     flat |= np.isin(fit.theta_names, (*fit.unread, *fit.absent))
     flat &= np.abs(fit.free_basis).max(axis=1, initial=0.0) > PART
     return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
-
-
-def _leave_out(Z: FloatArray, dropped: NDArray[np.bool_]) -> FloatArray:
-    """Return an orthonormal basis of the directions of Z (d, k) in which none of the dropped unknowns moves: (d, m)."""
-    if not dropped.any() or not Z.shape[1]:
-        return Z
-    _, sizes, across = np.linalg.svd(Z[dropped])
-    kept = np.append(sizes, np.zeros(len(across) - len(sizes))) < PART
-    return np.asarray(Z @ across[kept].T)
 
 
 class ScaledSpectrum(NamedTuple):

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
 from switchfit.fit.faults import refuse_hidden_switches
-from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum, free_curvature
+from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum
 from switchfit.fit.trajectory import compare
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
@@ -758,8 +758,8 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     -------
     Certificate
     """
-    found = analyse_solution(fit, None)
-    scaled = found.eigenvalues
+    found, Z = analyse_solution(fit, None), fit.free_basis
+    scaled, is_known = found.eigenvalues, Z.shape[1] > 0 and np.isfinite(fit.hessian).all()
     gaps = (np.nan, np.nan)
     orders: tuple[float, ...] = (np.nan,) * 3
     if evaluator is not None:
@@ -769,7 +769,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     smallest = float(scaled[0]) if len(scaled) else np.nan
     return Certificate(
         optimality=fit.optimality,
-        smallest_eigenvalue=free_curvature(fit).smallest,
+        smallest_eigenvalue=float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0]) if is_known else np.nan,
         smallest_scaled_eigenvalue=smallest,
         condition_number=found.condition_number if len(scaled) else np.inf,
         worst_unknowns=found.directions[0].names if found.directions else (),
