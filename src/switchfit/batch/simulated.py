@@ -20,7 +20,7 @@ from switchfit.discretization.mesh import Mesh, split_by_cell
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_near_guards
-from switchfit.fit.trajectory import compare
+from switchfit.fit.trajectory import compare, replace_values
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, require_estimable
@@ -343,11 +343,7 @@ class SimulatedStudy(Study):
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
-        data = [list(experiment.data) for experiment in self.problem.experiments]
-        for (e, k), values in self.draw_run(run).items():
-            data[e][k] = _replace_values(data[e][k], values)
-        runs = [replace(run, data=own) for run, own in zip(self.problem.experiments, data, strict=True)]
-        return replace(self.problem, experiments=runs)
+        return replace_values(self.problem, self.draw_run(run))
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return the data of some runs, and the errors of those whose noise cannot be drawn, by their places."""
@@ -392,21 +388,6 @@ class SimulatedStudy(Study):
                         changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
                     channel += q
         return Varying(tuple(changed), tuple(changed.values()))
-
-
-def _replace_values(item: Any, values: FloatArray) -> Any:
-    """Return the same kind of data with other values; missing ones stay missing."""
-    if isinstance(item, Measurements):
-        return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
-    measured = item.samples[1]
-    return ReferenceSignal.from_samples(
-        item.samples[0],
-        np.where(np.isnan(measured), np.nan, values),
-        observe=item.observe,
-        lowpass_hz=item.lowpass_hz,
-        weights=item.weights,
-        names=item.names,
-    )
 
 
 def _find_cells(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:

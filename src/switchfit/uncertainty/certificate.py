@@ -29,7 +29,7 @@ from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
 from switchfit.fit.faults import refuse_hidden_switches
 from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum
-from switchfit.fit.trajectory import compare
+from switchfit.fit.trajectory import compare, replace_values
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.inspection import find_unread
@@ -518,8 +518,8 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         # The likelihood ratio 2 (J - J_0) / scale is at the square of the quantile there.
         rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
     subject = fit.theta_names, fit.theta_units, fit.is_time
-    about = Identifiability(*subject, rise, meaning, "solution", fit.cost)
-    about = replace(about, idle=fit.idle, unread=fit.unread, absent=fit.absent)
+    silent = {"idle": fit.idle, "unread": fit.unread, "absent": fit.absent}
+    about = Identifiability(*subject, rise, meaning, "solution", fit.cost, **silent)
     cost = None if evaluator is None else _limit_cost(evaluator, fit.theta)
     return analyse(about, fit.hessian, fit.free_basis, fit.theta, cost)
 
@@ -533,7 +533,9 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     meaning: Meaning
     base = np.nan
     if all(isinstance(item, Measurements) for item in items):
-        clean = _drop_noise(problem, own)
+        comparisons = compare(problem, theta, own.simulate(theta))[1]
+        fitted = {(e, k): found.fitted for e, run in enumerate(comparisons) for k, found in enumerate(run)}
+        clean = replace_values(problem, fitted)
         evaluator = Evaluator(clean, meshes=own.meshes)
         # If sigma is a parameter, J has no minimum without noise; its expected Hessian is the Gauss-Newton matrix.
         hessian = evaluator(theta, matrix="exact" if problem.is_least_squares else "gauss-newton").hessian
@@ -549,20 +551,6 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     subject = unknowns.names, unknowns.units, unknowns.is_time
     about = Identifiability(*subject, rise, meaning, "first guess", base, **find_unread(problem)._asdict())
     return analyse(about, hessian, np.eye(len(theta)), theta, _limit_cost(evaluator, theta))
-
-
-def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
-    """Return the problem with measured values replaced by those simulated at its first guess; missing ones stay so."""
-    theta = problem.initial_theta
-    comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
-    experiments = []
-    for experiment, found in zip(problem.experiments, comparisons, strict=True):
-        data = [
-            replace(item, values=np.where(np.isnan(item.values), np.nan, comparison.fitted))
-            for item, comparison in zip(experiment.data, found, strict=True)
-        ]
-        experiments.append(replace(experiment, data=data))
-    return replace(problem, experiments=experiments)
 
 
 def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Callable[[FloatArray], float]:

@@ -137,18 +137,7 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
     """
     run = runs_of(problem)[e]
     engine = engine_of(run, run.build_arguments(mesh), mesh)
-    return build_sensitivity(problem, e, engine.simulate(*run.vectors(theta), tangents=True))
-
-
-def build_sensitivity(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:
-    """Return the sensitivity of experiment e from a simulation with derivatives.
-
-    Parameters
-    ----------
-    problem : Problem
-    e : int, from 0
-    simulation : Simulation
-    """
+    simulation = engine.simulate(*run.vectors(theta), tangents=True)
     return Sensitivity(simulation, problem.places[e], len(problem.theta_names))
 
 
