@@ -518,8 +518,8 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         # The likelihood ratio 2 (J - J_0) / scale is at the square of the quantile there.
         rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
     subject = fit.theta_names, fit.theta_units, fit.is_time
-    silent = {"idle": fit.idle, "unread": fit.unread, "absent": fit.absent}
-    about = Identifiability(*subject, rise, meaning, "solution", fit.cost, **silent)
+    about = Identifiability(*subject, rise, meaning, "solution", fit.cost)
+    about = replace(about, idle=fit.idle, unread=fit.unread, absent=fit.absent)
     cost = None if evaluator is None else _limit_cost(evaluator, fit.theta)
     return analyse(about, fit.hessian, fit.free_basis, fit.theta, cost)
 
