@@ -49,65 +49,8 @@ FORMAT = "switchfit fits"
 VERSION = 1
 
 
-def save_fits(fits: Any, path: Path) -> None:
-    """Write fits to a file, whole or not at all.
-
-    Parameters
-    ----------
-    fits : Fits
-        Or of a class derived from it.
-    path : Path
-        An existing file is replaced.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an existing one is then left as it was.
-    """
-    kind = type(fits)
-    arrays, rest = _split_fields(kind)
-    content = {"format": FORMAT, "version": VERSION, "kind": kind.__name__, "fits": to_json(fits, rest)}
-    if "best" in get_type_hints(kind):
-        content["best"] = None if fits.best is None else describe_best(fits.best)
-    header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
-    whole = {name: getattr(fits, name) for name in arrays} | {"header": header}
-    write_arrays(whole, path, np.savez_compressed)
-
-
-def load_fits(kind: type[Any], path: Path) -> Any:
-    """Read what `save_fits` wrote; every field is equal, and arrays have the same bits, dtype and shape.
-
-    Parameters
-    ----------
-    kind : type
-        `Fits` or a class derived from it: the file must hold fits of that class, or of one derived from it.
-    path : Path
-
-    Raises
-    ------
-    OSError
-        If there is no such file (FileNotFoundError) or it cannot be read.
-    ValueError
-        If it was not written by `save_fits`, is of another version, holds another kind of fits, or is damaged.
-    """
-    arrays, content = _read_archive(path)
-    version, name = content.get("version"), content.get("kind")
-    if version != VERSION:
-        raise ValueError(
-            f"{path} holds fits in version {version!r} of their format; this switchfit reads version {VERSION}. Read "
-            "it with the switchfit that wrote it."
-        )
-    kinds = {each.__name__: each for each in (kind, *kind.__subclasses__())}
-    if name not in kinds:
-        raise ValueError(f"{path} holds the kind of fits {name!r}, not {kind.__name__}: sf.Fits.load reads every kind.")
-    try:
-        return _build_fits(kinds[name], arrays, content)
-    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-        raise ValueError(f"{path} is damaged: {error}.") from error
-
-
 def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the arrays of a file and its header; ValueError if it was not written by `save_fits` as it is."""
+    """Return the arrays of a file and its header; ValueError if it was not written by `Fits.save` as it is."""
     arrays, reason = read_arrays(path)
     if arrays and reason:
         raise ValueError(f"{path} is damaged: {reason}.")
@@ -123,6 +66,7 @@ def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 
 def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[str, Any]) -> Any:
+    """Return fits of a kind from the content of a file."""
     declared, rest = _split_fields(kind)
     if missing := sorted(set(declared) ^ set(arrays)):
         what = "lacks the array" if missing[0] in declared else "has the unknown array"
@@ -397,7 +341,13 @@ class Fits(Tabular, Displayed):
         >>> bool((loaded.theta == fits.theta).all())
         True
         """
-        save_fits(self, as_path(path, "path"))
+        kind, file = type(self), as_path(path, "path")
+        arrays, rest = _split_fields(kind)
+        content = {"format": FORMAT, "version": VERSION, "kind": kind.__name__, "fits": to_json(self, rest)}
+        if isinstance(best := getattr(self, "best", None), Estimate):
+            content["best"] = describe_best(best)
+        header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
+        write_arrays({name: getattr(self, name) for name in arrays} | {"header": header}, file, np.savez_compressed)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -425,7 +375,23 @@ class Fits(Tabular, Displayed):
         >>> type(loaded).__name__, loaded.best.status.name
         ('Multistart', 'CONVERGED')
         """
-        return load_fits(cls, as_path(path, "path"))
+        file = as_path(path, "path")
+        arrays, content = _read_archive(file)
+        version, name = content.get("version"), content.get("kind")
+        if version != VERSION:
+            raise ValueError(
+                f"{file} holds fits in version {version!r} of their format; this switchfit reads version {VERSION}. "
+                "Read it with the switchfit that wrote it."
+            )
+        kinds = {each.__name__: each for each in (cls, *cls.__subclasses__())}
+        if name not in kinds:
+            raise ValueError(
+                f"{file} holds the kind of fits {name!r}, not {cls.__name__}: sf.Fits.load reads every kind."
+            )
+        try:
+            return _build_fits(kinds[name], arrays, content)
+        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+            raise ValueError(f"{file} is damaged: {error}.") from error
 
 
 class LongRun(NamedTuple):
@@ -473,11 +439,8 @@ def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) ->
         For a problem with a switch that is hidden in a function, with which no fit could be right.
     """
     _refuse_hidden_switches(problem)
-    progress, end = show_progress(how.callback, title)
-    try:
+    with show_progress(how.callback, title) as progress:
         runs, arrays = run_chunks(work, count, client=how.client, folder=how.folder, progress=progress)
-    finally:
-        end()
     known, priors, unknowns = problem.is_sigma_known, count_priors(problem), problem.unknowns
     variance = measure_variance(arrays["cost"], arrays["samples"] + priors - arrays["free"], known)
     return arrays | {

@@ -642,20 +642,18 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     index = fit.theta_names.index(name)
     runs = [e for e, place in list_transitions(evaluator.problem) if place == index]  # that of a transition time
     times = list_sample_times(evaluator.problem, fit.theta, runs[0]) if runs else np.zeros(0)
-    report, end = show_progress(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
-    try:
+    with show_progress(callback, f"Profile of {name}") as report:
         # Of as many fits as a profile usually takes.
         trace.should_stop = lambda: bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
-        for side in (-1, 1):
-            trace.march(side, threshold)
-        trace.add_kinks(times, threshold)
-        trace.find_regions(threshold)  # its points too are there from now on: tables, figure and repr agree
-    except KeyboardInterrupt:
-        trace.interrupted = True
-    finally:
-        end()
-        trace.should_stop = lambda: False
+        try:
+            for side in (-1, 1):
+                trace.march(side, threshold)
+            trace.add_kinks(times, threshold)
+            trace.find_regions(threshold)  # its points too are there from now on: tables, figure and repr agree
+        except KeyboardInterrupt:
+            trace.interrupted = True
+    trace.should_stop = lambda: False
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
 

@@ -127,6 +127,8 @@ def _find_weakest(fit: Fit) -> tuple[float, tuple[str, ...]]:
     none, and the unknowns with the largest components in its direction.
     """
     found = analyse_solution(fit, None)
+    if flat := tuple(name for name in found.without if name not in list_without_effect(fit)):  # transition times
+        return 0.0, flat[:NAMED]
     return (float(found.eigenvalues[0]), found.directions[0].names[:NAMED]) if found.directions else (np.inf, ())
 
 
