@@ -242,9 +242,9 @@ def test_a_folder_that_is_not_there(tmp_path):
         (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 8"),
-        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 8"),
-        (b'{"format": "switchfit fit", "version": 8}', "is damaged: its content is not what was written"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 9"),
+        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 9"),
+        (b'{"format": "switchfit fit", "version": 9}', "is damaged: its content is not what was written"),
         (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )

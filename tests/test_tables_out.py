@@ -310,8 +310,8 @@ def test_fits_of_another_version_or_kind(studies, tmp_path, monkeypatch):
     studies["MonteCarlo"].save(path)
     with pytest.raises(ValueError, match=r"holds the kind of fits 'MonteCarlo', not Bootstrap: sf\.Fits\.load reads"):
         sf.Bootstrap.load(path)
-    monkeypatch.setattr(saved, "VERSION", 2)
-    with pytest.raises(ValueError, match="holds fits in version 1 of their format; this switchfit reads version 2"):
+    monkeypatch.setattr(saved, "VERSION", 3)
+    with pytest.raises(ValueError, match="holds fits in version 2 of their format; this switchfit reads version 3"):
         sf.Fits.load(path)
 
 

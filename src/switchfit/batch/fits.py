@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import read_arrays, run_chunks, write_arrays
-from switchfit.batch.study import list_places, replace_intervals
+from switchfit.batch.study import list_places
 from switchfit.batch.verdict import (
     count_priors,
     find_doubts,
@@ -44,9 +44,10 @@ from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.verdict import Verdict
+from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"
-VERSION = 1
+VERSION = 2
 
 
 def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

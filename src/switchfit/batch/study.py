@@ -63,7 +63,6 @@ from switchfit.uncertainty.walks import (
     Derivatives,
     Samples,
     Walks,
-    find_ends,
     is_any_near,
     join_walks,
     list_transitions,
@@ -168,32 +167,6 @@ def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Itera
             own = Samples(*(each[taken] for each in samples))
             walks = list_walks(problem, e, place, theta[taken], free[taken], thresholds[taken], own, MOST_KEPT)
             yield np.tile(fits[taken], 2), np.full(len(walks.place), row), walks
-
-
-def replace_intervals(
-    intervals: FloatArray, pieces: FloatArray, places: NDArray[np.intp], thresholds: FloatArray
-) -> FloatArray:
-    """Return intervals (R, d, 2) with those of transition times with samples near, or at a kink, from their pieces.
-
-    Parameters
-    ----------
-    intervals : (R, d, 2)
-        From one parabola each; NaN at a kink.
-    pieces : (R, T, 2, P, 5)
-        As of `trace_chunk`.
-    places : (T,) int
-        Where in theta they stand.
-    thresholds : (R,)
-        By how much J may exceed its minimum.
-    """
-    found = intervals.copy()
-    if not len(places):
-        return found
-    replaced = ~np.isnan(pieces[:, :, 0, 0, 0])
-    for end, side in enumerate((-1, 1)):
-        ends = find_ends(pieces[:, :, end], thresholds[:, None], side)
-        found[:, places, end] = np.where(replaced, ends, found[:, places, end])
-    return found
 
 
 def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:

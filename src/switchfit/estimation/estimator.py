@@ -8,11 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args, overload
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from switchfit.estimation.saved import Provenance, describe_python_problem, digest_data, load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import CovarianceKind, Fit, TimeProfile
+from switchfit.fit.result import CovarianceKind, Fit
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -44,7 +45,7 @@ from switchfit.uncertainty.prediction import (
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_covariance, correct_errors, diagnose
 from switchfit.uncertainty.verdict import Verdict, judge
-from switchfit.uncertainty.walks import HIGHEST_LEVEL, replace_intervals, trace_profiles
+from switchfit.uncertainty.walks import HIGHEST_LEVEL, compute_threshold, replace_intervals, trace_profiles
 
 if TYPE_CHECKING:
     import pandas
@@ -334,14 +335,15 @@ class Estimate(Fit, Tabular, Displayed):
                [0.38, 0.4 ]])
         """
         intervals = super().confidence_intervals(level, hessian=hessian)
-        return (
-            replace_intervals(self, intervals, level, self._trace_profiles(level)) if hessian == "exact" else intervals
-        )
+        if hessian != "exact":
+            return intervals
+        pieces, places = self._trace_profiles(level)
+        return replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))
 
-    def _trace_profiles(self, level: float = HIGHEST_LEVEL) -> tuple[TimeProfile, ...]:
+    def _trace_profiles(self, level: float = HIGHEST_LEVEL) -> tuple[FloatArray, NDArray[np.intp]]:
         """Return the profiles of transition times with samples near; without the model those that were saved."""
         if self.problem is None:
-            return self.saved_profiles
+            return self.saved_pieces, self.saved_piece_places
         return trace_profiles(self, self.problem, self.evaluator_at_solution(), level)
 
     def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
@@ -771,7 +773,9 @@ class Estimate(Fit, Tabular, Displayed):
         >>> fit.complete().saved_gauss_newton.shape
         (2, 2)
         """
-        return replace(self, saved_gauss_newton=self.gauss_newton, saved_profiles=self._trace_profiles())
+        pieces, places = self._trace_profiles()
+        matrix = self.gauss_newton
+        return replace(self, saved_gauss_newton=matrix, saved_pieces=pieces, saved_piece_places=places)
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:

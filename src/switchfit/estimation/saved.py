@@ -1,6 +1,6 @@
 """Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 8, "seal": "...", "fit": {...}, "certificate":
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 9, "seal": "...", "fit": {...}, "certificate":
 {...}}`` with the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of
 text, and the "transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes
 them again from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without
@@ -197,7 +197,7 @@ def describe_platform() -> str:
 
 
 FORMAT = "switchfit fit"
-VERSION = 8
+VERSION = 9
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:

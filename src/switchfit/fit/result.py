@@ -295,22 +295,6 @@ class Step:
     ended: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class TimeProfile:
-    """The profile of J over a transition time with samples near, in pieces; see `switchfit.uncertainty.walks`.
-
-    Attributes
-    ----------
-    unknown : str
-    below, above : (P, 5)
-        The pieces from the estimate downwards and upwards.
-    """
-
-    unknown: str
-    below: FloatArray
-    above: FloatArray
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Termination):
     """Result of an estimation; d unknowns in the order of `theta_names`.
@@ -360,8 +344,10 @@ class Fit(Termination):
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     saved_gauss_newton : (d, d) or None
         The Gauss-Newton matrix of the samples, if it has been evaluated.
-    saved_profiles : tuple of TimeProfile
-        Of transition times whose intervals follow from them, in a fit that was saved.
+    saved_pieces : (T, 2, P, 5)
+        Of transition times whose intervals follow from them, in a fit that was saved: as `Fits.pieces`.
+    saved_piece_places : (T,) int
+        Where in theta these transition times stand.
     priors : dict of name -> str
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
@@ -426,7 +412,8 @@ class Fit(Termination):
     seconds: float
     constraints: tuple[tuple[str, float, float], ...] = ()
     saved_gauss_newton: FloatArray | None = None
-    saved_profiles: tuple[TimeProfile, ...] = ()
+    saved_pieces: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 1, 5)))
+    saved_piece_places: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     priors: Mapping[str, str] = field(default_factory=dict)
     log_scaled: tuple[str, ...] = ()
     least_squares: bool = True
