@@ -520,7 +520,8 @@ class Fit(Termination):
     @property
     def samples(self) -> int:
         """Number of measured values that are not missing."""
-        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _is_discrete(c))
+        discrete = (c for run in self.comparisons for c in run if c.kind == "measurements")
+        return sum(int(np.isfinite(comparison.measured).sum()) for comparison in discrete)
 
     @property
     def residual_variance(self) -> float:
@@ -630,7 +631,9 @@ class Fit(Termination):
     @property
     def correlation(self) -> FloatArray:
         """Correlation matrix of theta: (d, d); NaN for unknowns that are held."""
-        return correlation_of(self.covariance)
+        errors = self.standard_errors
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.covariance / np.outer(errors, errors))
 
     def quantile(self, level: float) -> float:
         """Return the two-sided quantile: of Student's t if sigma is unknown, else of the normal distribution.
@@ -691,13 +694,6 @@ def measure_quantile(level: float, freedom: Any, sigma_known: bool | None) -> An
     """Return the two-sided quantiles of fits with these degrees of freedom, as of `Fit.quantile`: (R,)."""
     tail = 0.5 + level / 2
     return special.stdtrit(freedom, tail) if sigma_known is False else np.full(np.shape(freedom), special.ndtri(tail))
-
-
-def correlation_of(covariance: FloatArray) -> FloatArray:
-    """Return the correlations (d, d) from covariances; NaN if a variance is 0."""
-    errors = np.sqrt(np.diag(covariance))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(covariance / np.outer(errors, errors))
 
 
 class Disagreement(NamedTuple):
@@ -823,7 +819,3 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     values, vectors = np.linalg.eigh(basis.T @ (hessian * np.outer(size, size)) @ basis)
     rounding = len(values) * np.finfo(float).eps * np.abs(values).max(initial=0.0)
     return ScaledSpectrum(np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size)
-
-
-def _is_discrete(comparison: Comparison) -> bool:
-    return comparison.kind == "measurements"
