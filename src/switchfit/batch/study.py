@@ -117,9 +117,8 @@ def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], ba
         return found
     fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
     smooth = chunk.status[fits] != AT_KINK
-    if (
-        not batch.layout.natively
-    ):  # an evaluation of its own has to be compiled: for kinks alone, where there is nothing else
+    # Other evaluations have to be compiled for this: it is done for kinks alone, where there is nothing else.
+    if not batch.layout.natively:
         kept = ~smooth
         fits, rows, walks, smooth = fits[kept], rows[kept], Walks(*(each[kept] for each in walks)), smooth[kept]
 
