@@ -21,7 +21,7 @@ from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,8 +70,7 @@ def read_document(path: Path, what: str, form: str, version: int) -> dict[str, A
         If it is not valid JSON, of another format or of another version.
     """
     try:
-        text = path.read_bytes().decode()
-        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_repetition)
+        content = json.loads(path.read_bytes().decode())
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != form:
@@ -96,19 +95,6 @@ def _lay_out(value: Any, indent: str = "") -> str:
         return json.dumps(value, allow_nan=False, ensure_ascii=False)
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     return f"{opening}\n{deeper}" + f",\n{deeper}".join(entries) + f"\n{indent}{closing}"
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"it contains {name}")
-
-
-def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object; ValueError if it has a name twice."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"it has the entry {next(name for name in names if names.count(name) > 1)!r} twice")
-    return found
 
 
 # --- to JSON ----------------------------------------------------------------------------------------------------------
