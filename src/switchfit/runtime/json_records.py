@@ -13,7 +13,6 @@ does not say: files with numbers have a seal.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
@@ -30,9 +29,6 @@ from switchfit.runtime.files import write_atomically
 
 NUMBERS = ("NaN", "Infinity", "-Infinity")
 """Strings that stand for numbers."""
-
-DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
-"""Types of arrays of numbers or text, as NumPy names them in a file."""
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -205,12 +201,10 @@ def _read_plain(kind: Any, value: Any) -> Any:
 
 def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
     """Return an array of the declared type from a list of numbers, or from its dtype, shape and values."""
-    if not isinstance(value, dict):
-        array = np.array(value, dtype=np.float64)
-    elif not DTYPES.fullmatch(value["dtype"]):  # NumPy accepts more names, some of them with a warning
-        raise TypeError
-    else:
+    if isinstance(value, dict):
         array = np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])
+    else:
+        array = np.array(value, dtype=np.float64)
     if array.dtype.kind != declared.kind:
         raise TypeError
     return array
