@@ -68,10 +68,7 @@ def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[str, Any]) -> Any:
     """Return fits of a kind from the content of a file."""
-    declared, rest = _split_fields(kind)
-    if missing := sorted(set(declared) ^ set(arrays)):
-        what = "lacks the array" if missing[0] in declared else "has the unknown array"
-        raise ValueError(f"it {what} {missing[0]} for fits of the kind {kind.__name__}")
+    _, rest = _split_fields(kind)
     nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
     return kind(**arrays, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
 
@@ -391,7 +388,7 @@ class Fits(Tabular, Displayed):
             )
         try:
             return _build_fits(kinds[name], arrays, content)
-        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+        except (TypeError, ValueError, OverflowError, RecursionError, MemoryError) as error:
             raise ValueError(f"{file} is damaged: {error}.") from error
 
 
