@@ -59,6 +59,7 @@ from switchfit.uncertainty.residuals import (
     diagnose_runs,
     explain_all,
     explain_channel,
+    list_channels,
     measure_widening,
 )
 from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
@@ -313,14 +314,8 @@ class Validation(Displayed):
     @property
     def channels(self) -> dict[str, float]:
         """Fit in per cent of each channel, by its name, and that of its run if there are several."""
-        single, found = len(self.comparisons) == 1, {}
-        for run, comparisons in zip(self.run_names, self.comparisons, strict=True):
-            for comparison in comparisons:
-                for k, name in enumerate(comparison.names):
-                    if np.isfinite(comparison.measured[:, k]).any():
-                        label = name if single else f"{run} {name}"
-                        found[label] = convert_to_percent(explain_channel(comparison, k))
-        return found
+        channels = list_channels(self.comparisons, self.run_names)
+        return {label: convert_to_percent(explain_channel(comparison, k)) for label, _, comparison, k in channels}
 
     @property
     def standard_errors(self) -> FloatArray:
