@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
+from switchfit.runtime.progress import Progress
 
 
 def count_cores() -> int:
@@ -34,9 +35,6 @@ def count_cores() -> int:
 
 
 Arrays = dict[str, NDArray[Any]]
-Progress = Callable[[int, int], object]
-"""``progress(done, total)``, called after each call of the work with the runs that are done; a true value stops."""
-
 RETRIES = 3
 """Times a chunk is tried again on a Dask cluster after an error."""
 

@@ -170,9 +170,9 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     Parameters
     ----------
     problem : Problem
+        With Measurements.
     sensitivities : sequence of Sensitivity, one per experiment
     """
-    d = len(problem.theta_names)
     columns: list[tuple[NDArray[Any], ...]] = []
     for e, (experiment, found) in enumerate(zip(problem.experiments, sensitivities, strict=True)):
         first = sum(q for _, q in problem.structures[e].references)
@@ -195,9 +195,6 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
                 )
             )
             first += q
-    if not columns:
-        none = np.zeros(0, dtype=np.intp)
-        return SampleDerivatives(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, d)))
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
