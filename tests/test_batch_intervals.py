@@ -10,8 +10,7 @@ import pytest
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
 from switchfit.batch import simulated
-from switchfit.batch.program import Limits, Varying, _minimize_fits
-from switchfit.batch.study import Evaluations, _evaluate_fits
+from switchfit.batch.program import Batch, Limits, Varying, _evaluate_fits, _minimize_fits
 from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.walks import Derivatives, Walks, find_ends, trace_walks
 
@@ -222,19 +221,19 @@ def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
     problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
     thetas, sides = np.array([[1.9], [2.02], [2.1]]), np.ones(3, dtype=int)
     meshes = Evaluator(problem, truth).meshes
-    evaluations = Evaluations(problem, meshes, Varying((), ()), 0, np.zeros(3, dtype=bool), None)
-    assert evaluations.quick
-    expected = evaluations(np.arange(3), thetas, sides)
-    evaluations.quick, evaluate = False, evaluations.evaluator
+    batch = Batch(problem, meshes, Varying((), ()), Limits(1e-7, 200))
+    assert batch.layout.natively
+    expected = batch.evaluate(np.arange(3), thetas, sides)
+    evaluate = batch.evaluator
 
     def evaluate_or_raise(theta, side):
         if theta[0] == 2.02:
             raise ZeroDivisionError("undefined here")
         return evaluate(theta, side)
 
-    monkeypatch.setattr(evaluations, "evaluator", evaluate_or_raise)
-    monkeypatch.setattr("switchfit.batch.study.give_data", lambda *given: None)
-    for found, all_ in zip(evaluations(np.arange(3), thetas, sides), expected, strict=True):
+    batch.layout = replace(batch.layout, natively=False)
+    monkeypatch.setattr(batch, "_give_data", lambda k: evaluate_or_raise)
+    for found, all_ in zip(batch.evaluate(np.arange(3), thetas, sides), expected, strict=True):
         assert np.isnan(found[1]).all()
         np.testing.assert_allclose(found[[0, 2]], all_[[0, 2]], rtol=1e-12)
 

@@ -14,7 +14,7 @@ from test_report import made, several
 from test_save import CERTIFICATE, assert_same, with_everything_odd, without_numbers
 
 import switchfit as sf
-from switchfit.estimation.saved import load_fit, save_fit, write_fit
+from switchfit.estimation.saved import load_saved, save_fit, write_fit
 from switchfit.fit.result import Fit, Kink
 from switchfit.problem.unknowns import ActiveConstraint
 
@@ -136,4 +136,4 @@ def test_a_file_with_damaged_bytes_is_refused_or_the_same(count, tmp_path):
             data[a:b] = bytes(b - a)
         path.write_bytes(data)
         if not is_refused(path, number):
-            assert_same(made(), load_fit(path)[0])
+            assert_same(made(), load_saved(path).fit)

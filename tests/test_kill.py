@@ -25,12 +25,11 @@ from pathlib import Path
 import numpy as np
 import switchfit as sf
 from switchfit import cli
-from switchfit.batch import logs, study
+from switchfit.batch import study
 from switchfit.paper import noise, runner
 
 kind, folder, toss = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
-for module in (logs, study):
-    module.choose_chunk_size = lambda: 2  # many chunks, so that many moments are those of a write
+study.choose_chunk_size = lambda: 2  # many chunks, so that many moments are those of a write
 noise.QUICK_LEVELS, noise.QUICK_RUNS = (0.0, 0.25), 6
 runner.PARTS = {"lti": runner.PARTS["lti"], "noise": runner.PARTS["noise"]}
 

@@ -691,7 +691,7 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         sf.ModeSearch.load(path, problem=sf.Problem(SYSTEM, other, FREE))
     for changes, message in (
         ({"format": "switchfit fit"}, "is not a saved search"),
-        ({"version": 1}, "of version 1; this switchfit reads version 2"),
+        ({"version": 1}, "of version 1; this switchfit reads version 3"),
         ({"search": content["search"] | {"fits": "many"}}, "is damaged"),
         ({"search": content["search"] | {"modes": ["rise"]}}, "which is not in modes"),
         ({"search": content["search"] | {"starts": []}}, "must have 1 entries"),

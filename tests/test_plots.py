@@ -447,12 +447,11 @@ def test_a_notebook_shows_a_progress_bar(notebook, monkeypatch):
     ipython, shown = notebook
     monkeypatch.setattr(progress, "REDRAW", 0.001)
     seen = []
-    report, end = progress.show_progress(lambda done, total: seen.append(done), "Profile of <k>")
-    for done in (1, 2):
-        report(done, 4)
-        said = f'<progress value="{done}" max="4"></progress> Profile of &lt;k&gt;, {done}/4, 0 s left'
-        assert wait_for(said, shown)
-    end()
+    with progress.show_progress(lambda done, total: seen.append(done), "Profile of <k>") as report:
+        for done in (1, 2):
+            report(done, 4)
+            said = f'<progress value="{done}" max="4"></progress> Profile of &lt;k&gt;, {done}/4, 0 s left'
+            assert wait_for(said, shown)
     assert seen == [1, 2]
     assert shown.shown[-1] == ""
     ipython.get_ipython = lambda: None

@@ -91,18 +91,16 @@ def test_without_a_stderr_nothing_is_shown(monkeypatch, closed):
     monkeypatch.setattr(sys, "stderr", stream if closed else None)
     with show_line("begins"):
         show_detail("more")
-    report, end = show_progress(None, "runs")
-    assert not report(1, 2)
-    end()
+    with show_progress(None, "runs") as report:
+        assert not report(1, 2)
 
 
 def test_a_bar_is_drawn_where_it_is_known_how_much_there_is_to_do(monkeypatch):
     terminal = open_terminal(monkeypatch)
-    report, end = show_progress(lambda done, total: done, "runs")
-    assert report(3, 4) == 3
-    assert wait_for("runs, 3/4, 0 s left", terminal)
-    assert "━" in terminal.getvalue()
-    end()
+    with show_progress(lambda done, total: done, "runs") as report:
+        assert report(3, 4) == 3
+        assert wait_for("runs, 3/4, 0 s left", terminal)
+        assert "━" in terminal.getvalue()
 
 
 def test_what_ends_at_once_shows_nothing(monkeypatch):

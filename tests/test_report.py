@@ -294,7 +294,7 @@ ENDS = {
     ),
     "interrupted": Termination(Status.INTERRUPTED, iterations=3),
     "not finite": Termination(Status.NONFINITE_START),
-    "error": Termination.of_error("KeyError: 3."),
+    "error": Termination(sf.Status.ERROR, reason=Issue("error", ("KeyError: 3.",))),
     "at a bound": Termination(Status.CONVERGED, active=(ActiveConstraint("lower bound", 0.05, "mu"),)),
     **{f"line search: {name}": Termination(Status.LINE_SEARCH_FAILED, reason=r) for name, r in REASONS.items()},
 }

@@ -17,7 +17,7 @@ from models import RAMP
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
-from switchfit.estimation.saved import FORMAT, VERSION, load_fit, save_fit
+from switchfit.estimation.saved import FORMAT, VERSION, load_saved, save_fit
 from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
 from switchfit.problem.unknowns import ActiveConstraint
@@ -70,7 +70,7 @@ def assert_same(a, b, where=""):
 
 def round_trip(fit: Fit, folder: Path, certificate: Certificate = CERTIFICATE) -> tuple[Fit, Certificate]:
     save_fit(fit, certificate, folder / "fit.json")
-    return load_fit(folder / "fit.json")
+    return load_saved(folder / "fit.json")[:2]
 
 
 def without_numbers() -> Fit:
@@ -191,7 +191,7 @@ def test_a_file_is_replaced_whole_and_nothing_is_left_beside_it(tmp_path):
     path = tmp_path / "fit.json"
     path.write_text("x" * 10_000_000)
     save_fit(made(), CERTIFICATE, path)
-    assert load_fit(path)[0].cost == 28.0
+    assert load_saved(path).fit.cost == 28.0
     assert os.listdir(tmp_path) == ["fit.json"]
 
 
@@ -214,7 +214,7 @@ def test_a_link_stays_one(tmp_path):
     (tmp_path / "link.json").symlink_to(tmp_path / "fit.json")
     save_fit(made(), CERTIFICATE, tmp_path / "link.json")
     assert (tmp_path / "link.json").is_symlink()
-    assert load_fit(tmp_path / "fit.json")[0].cost == 28.0
+    assert load_saved(tmp_path / "fit.json").fit.cost == 28.0
 
 
 def test_a_new_file_has_the_usual_permissions(tmp_path):
@@ -237,14 +237,14 @@ def test_a_folder_that_is_not_there(tmp_path):
         (b"", "not valid JSON"),
         (b"PK\x03\x04\xff\xfe", "not valid JSON"),
         (b'{"format": "switchfit fit", "version": 4, "fit"', "not valid JSON"),
-        (b'{"format": "switchfit fit", "version": NaN}', "not valid JSON \\(it contains NaN\\)"),
+        (b'{"format": "switchfit fit", "version": NaN}', "of version nan; this switchfit reads"),
         (b"[" * 100_000, "not valid JSON"),
-        (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
+        (b'{"format": "switchfit fit", "version": 2, "version": 2}', "of version 2; this switchfit reads version 9"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 8"),
-        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 8"),
-        (b'{"format": "switchfit fit", "version": 8}', "is damaged: its content is not what was written"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 9"),
+        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 9"),
+        (b'{"format": "switchfit fit", "version": 9}', "is damaged: its content is not what was written"),
         (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )
@@ -252,7 +252,10 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
     path = tmp_path / "fit.json"
     path.write_bytes(text)
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{message}"):
-        load_fit(path)
+        load_saved(path)
+
+
+BOUND = to_json(ActiveConstraint("lower bound", 0.05, "mu"), ActiveConstraint)
 
 
 def array(dtype, shape, values):
@@ -272,21 +275,21 @@ def array(dtype, shape, values):
         (("fit", "theta"), {"dtype": "<f8", "shape": [2], "values": []}, "fit.theta is not what was written"),
         (("fit", "theta"), {"dtype": "<i8", "shape": [1], "values": [1]}, "fit.theta is not what was written"),
         (("fit", "status"), "FINE", "fit.status is not what was written"),
-        (("fit", "iterations"), 2.5, "fit.iterations must be an integer; got 2.5"),
-        (("fit", "sigma_known"), 1, "fit.sigma_known must be true or false; got 1"),
-        (("fit", "hessian_kind"), ["a"], 'fit.hessian_kind must be a string; got ["a"]'),
-        (("fit", "active"), "abc", "fit.active must be a list"),
-        (("fit", "kinks"), [["tau_1", 1.0]], 'fit.kinks[0] must be an object; got ["tau_1", 1.0]'),
-        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0] must have 3 entries; got 2"),
-        (("fit", "parameters"), [], "fit.parameters must be an object; got []"),
+        (("fit", "iterations"), 2.5, "fit.iterations is not what was written; got 2.5"),
+        (("fit", "sigma_known"), 1, "fit.sigma_known is not what was written; got 1"),
+        (("fit", "hessian_kind"), ["a"], 'fit.hessian_kind is not what was written; got ["a"]'),
+        (("fit", "active"), "abc", "fit.active is not what was written"),
+        (("fit", "kinks"), [["tau_1", 1.0]], 'fit.kinks[0] is not what was written; got ["tau_1", 1.0]'),
+        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0] is not what was written"),
+        (("fit", "parameters"), [], "fit.parameters is not what was written; got []"),
         (("fit", "history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
         (("fit", "trajectories", 0, "modes"), 3, "fit.trajectories[0].modes is not what was written; got 3"),
-        (("fit", "comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind must be a string; got null"),
-        (("fit", "colour"), "red", "fit has the unknown entry 'colour'"),
+        (("fit", "comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind is not what was written; got null"),
+        (("fit", "colour"), "red", "fit.colour is unknown"),
         (("certificate",), {}, "certificate.optimality is missing"),
-        (("fit", "hessian_kind"), "\ud800", "surrogates not allowed"),
-        (("fit", "active"), [{"kind": "bound"}], 'fit.active[0].kind is not what was written; got "bound"'),
-        (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects must be a list"),
+        (("fit", "hessian_kind"), "\ud800", "fit.hessian_kind is not what was written"),
+        (("fit", "active"), [BOUND | {"kind": "bound"}], 'fit.active[0].kind is not what was written; got "bound"'),
+        (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects is not what was"),
         (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
     ],
 )
@@ -317,8 +320,8 @@ def test_what_is_not_as_it_was_written(change, tmp_path):
     save_fit(made(), CERTIFICATE, path)
     content = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps(content))
-    assert load_fit(path)[0].cost == 28.0, "in another layout"
+    assert load_saved(path).fit.cost == 28.0, "in another layout"
     change(content)
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="is damaged: its content is not what was written"):
-        load_fit(path)
+        load_saved(path)

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.estimation.saved import load_fit, save_fit
+from switchfit.estimation.saved import load_saved, save_fit
 from switchfit.io.command_line import describe
 from switchfit.io.problem_file import load_problem
 from switchfit.report.plot import plot_comparison, plot_modes, plot_residuals, plot_state
@@ -251,7 +251,7 @@ def test_any_text_that_is_not_blank_is_a_unit(unit):
 def test_any_unit_is_saved_and_loaded(unit, tmp_path_factory):
     path = tmp_path_factory.mktemp("unit") / "fit.json"
     save_fit(made(trajectories=(in_unit(trajectory_of(), unit),)), CERTIFICATE, path)
-    assert load_fit(path)[0].trajectory.time_unit == unit
+    assert load_saved(path).fit.trajectory.time_unit == unit
 
 
 def in_unit(trajectory, unit):

@@ -10,7 +10,7 @@ from models import decay
 
 import switchfit as sf
 from switchfit.batch.program import CHUNK
-from switchfit.batch.verdict import _count_collapsed, find_elsewhere
+from switchfit.batch.verdict import FAR_AWAY, _count_collapsed, measure_distances
 from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -210,11 +210,11 @@ def test_a_study_with_more_noise_than_sigma_says_so():
 def test_an_end_in_another_minimum_is_found(study):
     theta = study.theta.copy()
     theta[17] += 30 * study.standard_deviation
-    away = replace(study, theta=theta)
-    assert np.flatnonzero(find_elsewhere(away)).tolist() == [17]
+    away, every = replace(study, theta=theta), np.ones(theta.shape[1], dtype=bool)
+    assert np.flatnonzero(measure_distances(away, every) > FAR_AWAY).tolist() == [17]
     assert away.verdict.level == "doubtful"
     assert "1 of 200 fits ended in another minimum, fit 17 farthest off" in str(away.verdict)
-    assert not find_elsewhere(study).any()
+    assert not np.any(measure_distances(study, every) > FAR_AWAY)
 
 
 @pytest.mark.parametrize(("failed", "level"), [(2, "good"), (3, "doubtful"), (99, "doubtful"), (100, "bad")])
@@ -270,7 +270,7 @@ def test_no_start_that_can_be_fitted_is_bad():
 def test_a_folder_gives_the_same_verdict(tmp_path, monkeypatch):
     problems = [room(wave(1.0)), room(), room()]
     first = sf.estimate_many(problems, folder=tmp_path)
-    monkeypatch.setattr("switchfit.batch.study.fit_chunk", None)  # nothing is fitted
+    monkeypatch.setattr("switchfit.batch.study.Batch", None)  # nothing is fitted
     again = sf.estimate_many(problems, folder=tmp_path)
     assert again.verdict == first.verdict
     np.testing.assert_array_equal(again.levels, first.levels)

@@ -22,7 +22,7 @@ from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
 from switchfit.fit.evaluator import Evaluator
-from switchfit.uncertainty.prediction import build_sensitivity, collect_sample_derivatives
+from switchfit.uncertainty.prediction import Sensitivity, collect_sample_derivatives
 
 MOST_CALLS = 300
 FTOL = 1e-12
@@ -75,7 +75,7 @@ def fit_with_least_squares(case: Case, start: np.ndarray, evaluator: Evaluator) 
             found.clear()
             theta = back @ z
             simulations = enumerate(evaluator.simulate(theta, tangents=True))
-            runs = [build_sensitivity(problem, e, simulation) for e, simulation in simulations]
+            runs = [Sensitivity(simulation, problem.places[e], len(theta)) for e, simulation in simulations]
             found[key] = collect_sample_derivatives(problem, runs)
         return found[key]
 

@@ -19,13 +19,14 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
+from switchfit.runtime.progress import Progress
 
 
 def count_cores() -> int:
@@ -34,9 +35,6 @@ def count_cores() -> int:
 
 
 Arrays = dict[str, NDArray[Any]]
-Progress = Callable[[int, int], object]
-"""``progress(done, total)``, called after each call of the work with the runs that are done; a true value stops."""
-
 RETRIES = 3
 """Times a chunk is tried again on a Dask cluster after an error."""
 
@@ -47,36 +45,18 @@ CALLS = 8
 """... as long as that leaves each core so many calls: no core shall wait long for the last one."""
 
 
-class Work(Protocol):
-    """Work that is repeated, split into chunks. For a Dask cluster it must survive pickling."""
-
-    @property
-    def size(self) -> int:
-        """Runs in a chunk."""
-        ...
-
-    @property
-    def most_chunks(self) -> int:
-        """Neighbouring chunks that one call may take: what is found for a run must not depend on that."""
-        ...
-
-    def __call__(self, runs: range) -> Arrays:
-        """Arrays with one entry for each of the runs, of one chunk or of several."""
-        ...
-
-    def fingerprint(self) -> str:
-        """Return a digest that changes with everything that a result depends on."""
-        ...
-
-
 def run_chunks(
-    work: Work, count: int, *, client: Any = None, folder: str | Path | None = None, progress: Progress | None = None
+    work: Any, count: int, *, client: Any = None, folder: str | Path | None = None, progress: Progress | None = None
 ) -> tuple[NDArray[np.intp], Arrays]:
     """Do all runs 0 .. count - 1, in chunks.
 
     Parameters
     ----------
-    work : Work
+    work : object
+        Called with a range of runs, of one chunk or of several neighbouring ones, it returns arrays with one entry for
+        each. It has the number of runs in a chunk, `size`; the most chunks that one call may take, `most_chunks`; and
+        ``fingerprint()``, a digest that changes with everything that a result depends on. For a Dask cluster it must
+        survive pickling.
     count : int
     client : dask.distributed.Client, optional
         Where the chunks are computed; in threads of this process, one a core, if left out. A chunk whose worker is
@@ -128,7 +108,7 @@ def run_chunks(
     return runs, {name: np.concatenate([results[chunk.start][name] for chunk in finished]) for name in names}
 
 
-def _run_in_threads(work: Work, chunks: list[range]) -> Generator[list[tuple[range, Arrays]]]:
+def _run_in_threads(work: Any, chunks: list[range]) -> Generator[list[tuple[range, Arrays]]]:
     """Yield chunks as they are done by threads; JAX's programs run outside Python's lock.
 
     Several chunks in one call take less of Python, for whose lock the threads wait.
@@ -161,7 +141,7 @@ def _take_neighbours(waiting: deque[range], most: int) -> list[range]:
     return taken
 
 
-def _time_call(work: Work, runs: range) -> tuple[Arrays, float]:
+def _time_call(work: Any, runs: range) -> tuple[Arrays, float]:
     """Return what the work returns, and how long it took."""
     began = time.perf_counter()
     return work(runs), time.perf_counter() - began
@@ -174,7 +154,7 @@ def _split_arrays(arrays: Arrays, chunks: list[range]) -> Iterator[tuple[range, 
         yield chunk, {name: array[first:last] for name, array in arrays.items()}
 
 
-def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Generator[list[tuple[range, Arrays]]]:
+def _run_on_cluster(work: Any, chunks: list[range], client: Any) -> Generator[list[tuple[range, Arrays]]]:
     """Yield chunks as they are done by the workers of a Dask cluster.
 
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
@@ -201,11 +181,10 @@ def _receive(blob: bytes) -> bytes:
 
 
 @functools.lru_cache(maxsize=4)
-def _unpickle(blob: bytes) -> Work:
+def _unpickle(blob: bytes) -> Any:
     import cloudpickle
 
-    work: Work = cloudpickle.loads(blob)
-    return work
+    return cloudpickle.loads(blob)
 
 
 def _run_remotely(blob: bytes, start: int, stop: int) -> Arrays:

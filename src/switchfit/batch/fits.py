@@ -19,96 +19,39 @@ from typing import Any, NamedTuple, Self, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.batch.chunks import Work, read_arrays, run_chunks, write_arrays
-from switchfit.batch.study import list_places, replace_intervals
+from switchfit.batch.chunks import read_arrays, run_chunks, write_arrays
+from switchfit.batch.study import list_places
 from switchfit.batch.verdict import (
     count_priors,
     find_doubts,
     has_converged,
     judge_many,
-    measure_quantile,
     measure_variance,
 )
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.faults import refuse_hidden_switches
-from switchfit.fit.result import Fit, interval
+from switchfit.fit.result import Fit, interval, measure_quantile
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
-from switchfit.runtime.frames import Tabular, Variable, build_arviz
+from switchfit.runtime.frames import Tabular
 from switchfit.runtime.json_records import from_json, to_json
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.verdict import Verdict
+from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"
-VERSION = 1
-
-
-def save_fits(fits: Any, path: Path) -> None:
-    """Write fits to a file, whole or not at all.
-
-    Parameters
-    ----------
-    fits : Fits
-        Or of a class derived from it.
-    path : Path
-        An existing file is replaced.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an existing one is then left as it was.
-    """
-    kind = type(fits)
-    arrays, rest = _split_fields(kind)
-    content = {"format": FORMAT, "version": VERSION, "kind": kind.__name__, "fits": to_json(fits, rest)}
-    if "best" in get_type_hints(kind):
-        content["best"] = None if fits.best is None else describe_best(fits.best)
-    header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
-    whole = {name: getattr(fits, name) for name in arrays} | {"header": header}
-    write_arrays(whole, path, np.savez_compressed)
-
-
-def load_fits(kind: type[Any], path: Path) -> Any:
-    """Read what `save_fits` wrote; every field is equal, and arrays have the same bits, dtype and shape.
-
-    Parameters
-    ----------
-    kind : type
-        `Fits` or a class derived from it: the file must hold fits of that class, or of one derived from it.
-    path : Path
-
-    Raises
-    ------
-    OSError
-        If there is no such file (FileNotFoundError) or it cannot be read.
-    ValueError
-        If it was not written by `save_fits`, is of another version, holds another kind of fits, or is damaged.
-    """
-    arrays, content = _read_archive(path)
-    version, name = content.get("version"), content.get("kind")
-    if version != VERSION:
-        raise ValueError(
-            f"{path} holds fits in version {version!r} of their format; this switchfit reads version {VERSION}. Read "
-            "it with the switchfit that wrote it."
-        )
-    kinds = {each.__name__: each for each in (kind, *kind.__subclasses__())}
-    if name not in kinds:
-        raise ValueError(f"{path} holds the kind of fits {name!r}, not {kind.__name__}: sf.Fits.load reads every kind.")
-    try:
-        return _build_fits(kinds[name], arrays, content)
-    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-        raise ValueError(f"{path} is damaged: {error}.") from error
+VERSION = 2
 
 
 def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the arrays of a file and its header; ValueError if it was not written by `save_fits` as it is."""
+    """Return the arrays of a file and its header; ValueError if it was not written by `Fits.save` as it is."""
     arrays, reason = read_arrays(path)
     if arrays and reason:
         raise ValueError(f"{path} is damaged: {reason}.")
@@ -124,10 +67,8 @@ def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 
 def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[str, Any]) -> Any:
-    declared, rest = _split_fields(kind)
-    if missing := sorted(set(declared) ^ set(arrays)):
-        what = "lacks the array" if missing[0] in declared else "has the unknown array"
-        raise ValueError(f"it {what} {missing[0]} for fits of the kind {kind.__name__}")
+    """Return fits of a kind from the content of a file."""
+    _, rest = _split_fields(kind)
     nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
     return kind(**arrays, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
 
@@ -394,7 +335,13 @@ class Fits(Tabular, Displayed):
         >>> bool((loaded.theta == fits.theta).all())
         True
         """
-        save_fits(self, as_path(path, "path"))
+        kind, file = type(self), as_path(path, "path")
+        arrays, rest = _split_fields(kind)
+        content = {"format": FORMAT, "version": VERSION, "kind": kind.__name__, "fits": to_json(self, rest)}
+        if isinstance(best := getattr(self, "best", None), Estimate):
+            content["best"] = describe_best(best)
+        header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
+        write_arrays({name: getattr(self, name) for name in arrays} | {"header": header}, file, np.savez_compressed)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -422,16 +369,23 @@ class Fits(Tabular, Displayed):
         >>> type(loaded).__name__, loaded.best.status.name
         ('Multistart', 'CONVERGED')
         """
-        return load_fits(cls, as_path(path, "path"))
-
-    def _collect_draws(self, what: str, centre_name: str, centre: FloatArray) -> Any:
-        """Return the estimates of the fits that converged as draws for ArviZ, and where they are drawn around."""
-        units = [unit if unit != "1" else "" for unit in self.theta_units]
-        named = list(zip(self.theta_names, units, strict=True))
-        good = self.theta[self.success]
-        draws = [Variable(name, good[None, :, k], ("chain", "draw"), unit) for k, (name, unit) in enumerate(named)]
-        constants = [Variable(f"{name} {centre_name}", centre[k], (), unit) for k, (name, unit) in enumerate(named)]
-        return build_arviz(draws, constants, {"inference_library": "switchfit", "draws": what})
+        file = as_path(path, "path")
+        arrays, content = _read_archive(file)
+        version, name = content.get("version"), content.get("kind")
+        if version != VERSION:
+            raise ValueError(
+                f"{file} holds fits in version {version!r} of their format; this switchfit reads version {VERSION}. "
+                "Read it with the switchfit that wrote it."
+            )
+        kinds = {each.__name__: each for each in (cls, *cls.__subclasses__())}
+        if name not in kinds:
+            raise ValueError(
+                f"{file} holds the kind of fits {name!r}, not {cls.__name__}: sf.Fits.load reads every kind."
+            )
+        try:
+            return _build_fits(kinds[name], arrays, content)
+        except (TypeError, ValueError, OverflowError, RecursionError, MemoryError) as error:
+            raise ValueError(f"{file} is damaged: {error}.") from error
 
 
 class LongRun(NamedTuple):
@@ -461,7 +415,7 @@ class LongRun(NamedTuple):
         return cls(client, folder, callback, time.perf_counter())
 
 
-def repeat(problem: Problem, work: Work, count: int, title: str, how: LongRun) -> dict[str, Any]:
+def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) -> dict[str, Any]:
     """Do `count` runs with a bar on the terminal: the fields of `Fits`.
 
     Parameters
@@ -479,11 +433,8 @@ def repeat(problem: Problem, work: Work, count: int, title: str, how: LongRun) -
         For a problem with a switch that is hidden in a function, with which no fit could be right.
     """
     _refuse_hidden_switches(problem)
-    progress, end = show_progress(how.callback, title)
-    try:
+    with show_progress(how.callback, title) as progress:
         runs, arrays = run_chunks(work, count, client=how.client, folder=how.folder, progress=progress)
-    finally:
-        end()
     known, priors, unknowns = problem.is_sigma_known, count_priors(problem), problem.unknowns
     variance = measure_variance(arrays["cost"], arrays["samples"] + priors - arrays["free"], known)
     return arrays | {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ import numpy as np
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import Fits, LongRun, list_origins, repeat
-from switchfit.batch.program import Chunk, Limits, Varying, choose_chunk_size, describe_failure
+from switchfit.batch.program import Chunk, Limits, Varying, describe_failure
 from switchfit.batch.study import CHUNK_FORMAT, Study
+from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import evaluator_of, measure_variation
 from switchfit.optimize.traced import Outcome
@@ -85,25 +86,21 @@ def estimate_many(
                 f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
                 "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
             )
-    found = repeat(first, _Logs(problems, limits), len(problems), "Logs", how)
+    starts = np.array([problem.initial_theta for problem in problems])
+    study = StudyOfLogs(first, [], starts, limits, 0, problems)
+    found = repeat(first, study, len(problems), "Logs", how)
     every = zip(*map(list_origins, problems), strict=True)
     return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})
 
 
 @dataclass
-class _Logs:
-    """The problems, for `run_chunks`."""
+class StudyOfLogs(Study):
+    """Problems of one model, each with data, guess and meshes of its own."""
 
     problems: list[Problem]
-    limits: Limits
 
-    @property
-    def size(self) -> int:
-        return choose_chunk_size()
-
-    @property
-    def most_chunks(self) -> int:
-        return 1  # the meshes of a chunk are those of one of its logs
+    shares_problem = False
+    room, most_chunks = 0, 1  # the meshes of a call are those of one of its logs
 
     def __call__(self, runs: range) -> Arrays:
         """Fits of some of the problems: those whose programs agree go together, and then back into their order."""
@@ -114,22 +111,24 @@ class _Logs:
                 groups.setdefault(_get_kind(self.problems[k]), []).append(k)
             except Exception as error:  # as where its guess cannot be integrated: listed, it must not end the others
                 errors[k] = error
-        studies = [self._gather(members) for members in groups.values()]
-        parts = [study(range(len(study.problems))) for study in studies]
+        parts = []
+        for members in groups.values():
+            meshes = evaluator_of(self.problems[members[0]]).meshes
+            parts.append(super(StudyOfLogs, self._select(members, meshes)).__call__(range(len(members))))
         order = [k for members in groups.values() for k in members]
         if errors:
             order += errors
-            parts.append(self._gather(list(errors), failed=True).list_failed(list(errors.values())))
+            parts.append(self._select(list(errors), []).list_failed(list(errors.values())))
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
-    def _gather(self, members: list[int], *, failed: bool = False) -> _StudyOfLogs:
-        """Return some of the problems as a study, without meshes if their guesses failed."""
-        problems, first = [self.problems[k] for k in members], self.problems[0 if failed else members[0]]
-        starts = np.array([problem.initial_theta for problem in problems])
-        return _StudyOfLogs(first, [] if failed else evaluator_of(first).meshes, starts, self.limits, 0, problems)
+    def _select(self, members: list[int], meshes: list[Mesh]) -> StudyOfLogs:
+        """Return some of the problems, on meshes that they share."""
+        problems = [self.problems[k] for k in members]
+        return replace(self, problem=problems[0], meshes=meshes, starts=self.starts[members], problems=problems)
 
     def fingerprint(self) -> str:
+        """Return a digest of everything that a result depends on."""
         parts: list[Any] = [CHUNK_FORMAT, "logs", len(self.problems), self.limits]
         for problem in self.problems:
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]
@@ -140,16 +139,6 @@ class _Logs:
             else:
                 parts += map(np.asarray, jax.tree.leaves(tuple(evaluator.arguments)))
         return compute_fingerprint(*parts)
-
-
-@dataclass
-class _StudyOfLogs(Study):
-    """Problems whose programs agree."""
-
-    problems: list[Problem]
-
-    shares_problem = False
-    room = 0  # no call has more than a chunk
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return all arguments of some problems."""

@@ -269,7 +269,7 @@ class LogPosterior:
         units = [unit if unit != "1" else "" for unit in self.problem.unknowns.units]
         named = enumerate(zip(self.names, units, strict=True))
         draws = [Variable(name, given[..., i], ("chain", "draw"), unit) for i, (name, unit) in named]
-        return build_arviz(draws, (), {"inference_library": "switchfit", "draws": "posterior"})
+        return build_arviz(draws, {"inference_library": "switchfit", "draws": "posterior"})
 
     @cached_property
     def _links(self) -> list[Link]:

@@ -18,10 +18,10 @@ from __future__ import annotations
 import re
 import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -49,6 +49,8 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.unknowns import Variables
 from switchfit.runtime.cache import use_compilation_cache
+from switchfit.runtime.errors import Issue
+from switchfit.uncertainty.walks import Derivatives
 
 CHUNK = 64
 """Fits of a chunk on a CPU."""
@@ -184,13 +186,6 @@ class Inputs(NamedTuple):
         return J + prior, g + slope, H + jnp.diag(curvature)
 
 
-def give_data(evaluator: Evaluator, base: tuple[Arguments, ...], varying: Varying, k: int) -> None:
-    """Replace the data of an evaluator by those of the k-th fit; `base` are the arguments of the problem itself."""
-    with use_float64():
-        values = [jnp.asarray(value[k]) for value in varying.values]
-        evaluator.replace_arguments(replace_leaves(base, varying.places, values))
-
-
 def replace_leaves(
     arguments: Sequence[Arguments], places: tuple[int, ...], values: Sequence[Any]
 ) -> tuple[Arguments, ...]:
@@ -279,6 +274,12 @@ def pad_fits(values: Any, size: int) -> FloatArray:
     array = np.asarray(values)
     return np.concatenate([array, np.repeat(array[-1:], size - len(array), axis=0)]) if len(array) < size else array
 
+
+EVALUATIONS = 256
+"""Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
+
+UNDEFINED = (ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""What a model raises where it is undefined."""
 
 LONGEST_ERROR = 500
 """Characters of an error that are listed."""
@@ -378,19 +379,8 @@ class Chunk:
         return {name: a.astype(str) if a.dtype == object else a for name, a in vars(self).items()}
 
 
-def fit_chunk(
-    problem: Problem,
-    meshes: Sequence[Mesh],
-    varying: Varying,
-    starts: FloatArray,
-    limits: Limits,
-    *,
-    room: int = 0,
-    retry: bool = True,
-) -> Chunk:
-    """Fit a problem R times.
-
-    The program of all fits has no trust region, and a step too long may lead one astray.
+class Batch:
+    """Fits of one problem on meshes that they share, each with data of its own, in compiled programs.
 
     Parameters
     ----------
@@ -398,55 +388,176 @@ def fit_chunk(
     meshes : one an experiment, the same for all fits
     varying : Varying
         What replaces the problem's own numbers, R of each.
-    starts : (R, d)
-        Feasible.
     limits : Limits
     room : int
         Most fits of any call, if that is more than a chunk: one program takes them all.
-    retry : bool
-        Whether `minimize` begins anew at the start, with the iterations that are left, where a fit ended in no strict
-        minimum; the lower cost counts. Of many starts for the same data, another one serves as well.
+
+    Attributes
+    ----------
+    own : dict of int to callable
+        What returns the evaluators of fits that were done again, on meshes of their own.
     """
-    evaluator = Evaluator(problem, meshes=meshes)
-    has_crossings = any(map(has_corners, problem.structures))
-    if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
-        outcome = Outcome.at_starts(starts, np)
-    else:
-        outcome = _run_program(evaluator, varying, starts, limits, room)
-    return _finish_rest(evaluator, varying, outcome, starts if retry else None, limits)
 
+    def __init__(
+        self, problem: Problem, meshes: Sequence[Mesh], varying: Varying, limits: Limits, room: int = 0
+    ) -> None:
+        self.evaluator = Evaluator(problem, meshes=meshes)
+        self.varying, self.limits, self.size = varying, limits, max(room, choose_chunk_size())
+        self.own: dict[int, Callable[[], Evaluator]] = {}
+        self._base = tuple(self.evaluator.arguments)
 
-def _run_program(evaluator: Evaluator, varying: Varying, starts: FloatArray, limits: Limits, room: int) -> Outcome:
-    """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""
-    layout = choose_layout(evaluator, varying.places)
-    count, size = len(starts), max(len(starts), room, choose_chunk_size())
-    unknowns = evaluator.problem.unknowns
-    variables = unknowns.variables
-    bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
-    constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(evaluator.problem.sizes))
-    with use_float64():
-        given = (
-            Inputs.of(evaluator, layout),
-            tuple(pad_fits(value, size) for value in varying.values),
-            Constraints(*map(jnp.asarray, constraints)),
-            Unscaled(variables, unknowns.lower, unknowns.upper),
-            # What it does not settle has as many iterations left for the optimiser that finishes it.
-            limits._replace(max_iterations=limits.max_iterations // 2),
-            pad_fits(variables.inward(np.asarray(starts)), size),
-            count,
-        )
-        try:
-            with compile_once(layout, given):
-                outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _minimize_fits(*given, layout=layout))
-        except Exception as error:
-            # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
-            # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
-            if not _is_raised_in_callback(error):
-                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
-            return Outcome.at_starts(starts, np)
-    # A program has one mesh for all fits: it is refused where it does not suit the first and the last of them.
-    is_sharp = layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]]))
-    return Outcome.at_starts(starts, np) if is_sharp else outcome
+    @cached_property
+    def layout(self) -> Layout:
+        """Layout of the programs."""
+        return choose_layout(self.evaluator, self.varying.places)
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return Inputs.of(self.evaluator, self.layout)
+
+    @cached_property
+    def _values(self) -> tuple[jax.Array, ...]:
+        """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of a program."""
+        return tuple(jnp.asarray(pad_fits(value, self.size)) for value in self.varying.values)
+
+    def fit(self, starts: FloatArray, *, retry: bool = True) -> Chunk:
+        """Fit all of them.
+
+        The program of all fits has no trust region, and a step too long may lead one astray.
+
+        Parameters
+        ----------
+        starts : (R, d)
+            Feasible.
+        retry : bool
+            Whether `minimize` begins anew at the start, with the iterations that are left, where a fit ended in no
+            strict minimum; the lower cost counts. Of many starts for the same data, another one serves as well.
+        """
+        problem = self.evaluator.problem
+        has_crossings = any(map(has_corners, problem.structures))
+        if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # unknown to the program
+            outcome = Outcome.at_starts(starts, np)
+        else:
+            outcome = self._run_program(starts)
+        return self._finish_rest(outcome, starts if retry else None)
+
+    def evaluate(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
+        """Return costs, gradients and Hessians at thetas (n, d), to one side (n,) of breakpoints.
+
+        `fits` (n,) says whose data are taken. NaN where the model is undefined.
+        """
+        n, d = thetas.shape
+        at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
+        alone = np.isin(fits, list(self.own)) | (not self.layout.natively)
+        together = np.flatnonzero(~alone)
+        for first in range(0, len(together), EVALUATIONS):
+            call = together[first : first + EVALUATIONS]
+            for all_, found in zip(at, self._evaluate(fits[call], thetas[call], sides[call]), strict=True):
+                all_[call] = found
+        for s in np.flatnonzero(alone).tolist():
+            k = int(fits[s])
+            with suppress(*UNDEFINED):
+                evaluator = self.own[k]() if k in self.own else self._give_data(k)
+                here = evaluator(thetas[s], int(sides[s]))
+                at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
+        return at
+
+    def _evaluate(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
+        with use_float64():
+            padded = (pad_fits(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float)))
+            given = self._inputs, self._values, *padded, len(fits)
+            with compile_once(self.layout, given):
+                found = _evaluate_fits(*given, layout=self.layout)
+        return tuple(np.asarray(each)[: len(fits)] for each in found)
+
+    def _give_data(self, k: int) -> Evaluator:
+        """Return the evaluator with the data of the k-th fit."""
+        with use_float64():
+            values = [jnp.asarray(value[k]) for value in self.varying.values]
+            self.evaluator.replace_arguments(replace_leaves(self._base, self.varying.places, values))
+        return self.evaluator
+
+    def _run_program(self, starts: FloatArray) -> Outcome:
+        """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""
+        problem, layout, limits = self.evaluator.problem, self.layout, self.limits
+        count, unknowns = len(starts), problem.unknowns
+        self.size = max(self.size, count)
+        variables = unknowns.variables
+        bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
+        constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
+        with use_float64():
+            given = (
+                self._inputs,
+                self._values,
+                Constraints(*map(jnp.asarray, constraints)),
+                Unscaled(variables, unknowns.lower, unknowns.upper),
+                # What it does not settle has as many iterations left for the optimiser that finishes it.
+                limits._replace(max_iterations=limits.max_iterations // 2),
+                pad_fits(variables.inward(np.asarray(starts)), self.size),
+                count,
+            )
+            try:
+                with compile_once(layout, given):
+                    outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _minimize_fits(*given, layout=layout))
+            except Exception as error:
+                # A function of the model that calls back into Python may raise for one fit and ends the whole program:
+                # the fits are then done one by one, and that one is listed. Any other error is a defect of the program.
+                if not _is_raised_in_callback(error):
+                    warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
+                return Outcome.at_starts(starts, np)
+        # A program has one mesh for all fits: it is refused where it does not suit the first and the last of them.
+        is_sharp = layout.natively and not all(map(Follower(self.evaluator).suits, outcome.theta[[0, -1]]))
+        return Outcome.at_starts(starts, np) if is_sharp else outcome
+
+    def _fit_on_meshes(self, k: int, start: FloatArray, limits: Limits) -> Result:
+        """Fit the data of fit k, which the evaluator has, from a start."""
+        problem, varying = self.evaluator.problem, self.varying
+
+        def build(meshes: Sequence[Mesh]) -> Evaluator:
+            return Batch(problem, meshes, varying, limits)._give_data(k)
+
+        has_own_times = len(varying.places) == len(jax.tree.leaves(self._base))
+        follower = None if has_own_times else Follower(self.evaluator, build)
+        hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
+        return minimize_cost(self.evaluator, start, hessian, *limits, follower=follower)
+
+    def _finish_rest(self, outcome: Outcome, starts: FloatArray | None) -> Chunk:
+        """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one.
+
+        What then ends in no strict minimum is fitted from its start as well, unless `starts` is None. Meshes follow,
+        unless each fit has times of its own, with which no mesh is made.
+        """
+        problem, limits, chunk = self.evaluator.problem, self.limits, Chunk.of(outcome)
+        settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
+        # Held coordinates are left out of the covariance: rows of the identity in H, zero in its inverse.
+        either = (held[:, :, None] | held[:, None, :])[settled]
+        hessians = np.where(either, np.eye(held.shape[1]), chunk.hessian[settled])
+        chunk.covariance[settled] = np.linalg.inv(hessians) * ~either
+        chunk.free[settled] -= held[settled].sum(axis=1)
+        for k in np.flatnonzero(settled & held.any(axis=1)).tolist():
+            chunk.status[k] = Status.CONVERGED_AT_KINK.name
+            chunk.message[k] = str(_describe_kink(problem, outcome, k, limits.tolerance))
+        for k in np.flatnonzero(~settled).tolist():
+            before = int(chunk.iterations[k])
+            try:
+                self._give_data(k)
+                left = limits._replace(max_iterations=limits.max_iterations - before)
+                results = [self._fit_on_meshes(k, nearest_feasible(problem.constraints, chunk.theta[k]), left)]
+                left = left._replace(max_iterations=left.max_iterations - results[0].iterations)
+                # The program has no trust region: where it led to no strict minimum, its start is tried once more with
+                # one.
+                strayed = before > 0 and not results[0].status.is_strict_minimum
+                if starts is not None and strayed and left.max_iterations > 0:
+                    results.append(self._fit_on_meshes(k, starts[k], left))
+            except Exception as error:  # of any kind: the other fits go on
+                chunk.set_error(k, error)
+                chunk.free[k] = 0
+                continue
+            best = min(results, key=lambda one: np.nan_to_num(one.cost, nan=np.inf))
+            total, evaluations = (sum(getattr(one, name) for one in results) for name in ("iterations", "evaluations"))
+            best = replace(best, iterations=total, evaluations=evaluations)
+            chunk.replace_fit(k, best, str(termination_of(replace(best, iterations=before + total), problem)))
+        return chunk
 
 
 @compile_for_layout
@@ -496,6 +607,28 @@ def _minimize_fits(
     return lax.fori_loop(0, count, one, empty)
 
 
+@compile_for_layout
+def _evaluate_fits(
+    inputs: Inputs,
+    values: tuple[jax.Array, ...],
+    fits: jax.Array,
+    thetas: jax.Array,
+    sides: jax.Array,
+    count: jax.Array,
+    *,
+    layout: Layout,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return cost, gradient and Hessian of the first `count` fits at their thetas."""
+    n, d = thetas.shape
+
+    def one(s: jax.Array, found: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        new = inputs.evaluate(layout, [value[fits[s]] for value in values], thetas[s], sides[s])
+        return tuple(all_.at[s].set(each) for all_, each in zip(found, new, strict=True))  # type: ignore[return-value]
+
+    empty = jnp.zeros(n), jnp.zeros((n, d)), jnp.zeros((n, d, d))
+    return lax.fori_loop(0, count, one, empty)
+
+
 def _list_breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
     """Return the nodes of each free transition time; these are not scaled."""
     nodes = {
@@ -526,7 +659,7 @@ def _is_raised_in_callback(error: BaseException) -> bool:
 
 def describe_failure(error: BaseException) -> str:
     """Return the message of a fit that ended with an error, on one line."""
-    return str(Termination.of_error(describe_error(error)))
+    return str(Termination(Status.ERROR, reason=Issue("error", (describe_error(error),))))
 
 
 def describe_error(error: BaseException) -> str:
@@ -555,63 +688,3 @@ def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float)
         iterations=int(outcome.iterations[k]),
         kinks=kinks,
     )
-
-
-def _fit_on_meshes(evaluator: Evaluator, varying: Varying, k: int, start: FloatArray, limits: Limits) -> Result:
-    """Fit the data of fit k, which the evaluator has, from a start."""
-
-    def build(meshes: Sequence[Mesh]) -> Evaluator:
-        fresh = Evaluator(evaluator.problem, meshes=meshes)
-        give_data(fresh, tuple(fresh.arguments), varying, k)
-        return fresh
-
-    has_own_times = len(varying.places) == len(jax.tree.leaves(tuple(evaluator.arguments)))
-    follower = None if has_own_times else Follower(evaluator, build)
-    hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
-    return minimize_cost(evaluator, start, hessian, *limits, follower=follower)
-
-
-def _finish_rest(
-    evaluator: Evaluator,
-    varying: Varying,
-    outcome: Outcome,
-    starts: FloatArray | None,
-    limits: Limits,
-) -> Chunk:
-    """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one.
-
-    What then ends in no strict minimum is fitted from its start as well, unless `starts` is None. Meshes follow, unless
-    each fit has times of its own, with which no mesh is made.
-    """
-    problem, chunk = evaluator.problem, Chunk.of(outcome)
-    settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
-    # Held coordinates are left out of the covariance: rows of the identity in H, zero in its inverse.
-    either = (held[:, :, None] | held[:, None, :])[settled]
-    hessians = np.where(either, np.eye(held.shape[1]), chunk.hessian[settled])
-    chunk.covariance[settled] = np.linalg.inv(hessians) * ~either
-    chunk.free[settled] -= held[settled].sum(axis=1)
-    for k in np.flatnonzero(settled & held.any(axis=1)).tolist():
-        chunk.status[k] = Status.CONVERGED_AT_KINK.name
-        chunk.message[k] = str(_describe_kink(problem, outcome, k, limits.tolerance))
-    constraints, base = problem.constraints, tuple(evaluator.arguments)
-    for k in np.flatnonzero(~settled).tolist():
-        before = int(chunk.iterations[k])
-        try:
-            give_data(evaluator, base, varying, k)
-            left = limits._replace(max_iterations=limits.max_iterations - before)
-            fit = partial(_fit_on_meshes, evaluator, varying, k)
-            results = [fit(nearest_feasible(constraints, chunk.theta[k]), left)]
-            left = left._replace(max_iterations=left.max_iterations - results[0].iterations)
-            # The program has no trust region: where it led to no strict minimum, its start is tried once more with one.
-            strayed = before > 0 and not results[0].status.is_strict_minimum
-            if starts is not None and strayed and left.max_iterations > 0:
-                results.append(fit(starts[k], left))
-        except Exception as error:  # of any kind: the other fits go on
-            chunk.set_error(k, error)
-            chunk.free[k] = 0
-            continue
-        best = min(results, key=lambda one: np.nan_to_num(one.cost, nan=np.inf))
-        total, evaluations = (sum(getattr(one, name) for one in results) for name in ("iterations", "evaluations"))
-        best = replace(best, iterations=total, evaluations=evaluations)
-        chunk.replace_fit(k, best, str(termination_of(replace(best, iterations=before + total), problem)))
-    return chunk

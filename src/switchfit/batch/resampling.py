@@ -156,36 +156,6 @@ class Bootstrap(Fits):
             found[k] = np.quantile(theta[:, k], special.ndtr(z0 + shifted / (1 - self.acceleration[k] * shifted)))
         return found
 
-    def to_arviz(self) -> Any:
-        """Return the estimates of the fits that converged as draws of one chain, in the group that ArviZ plots.
-
-        They are draws of the estimate over resampled data, and not of a posterior. It is InferenceData for ArviZ up
-        to 0.23, and a DataTree for later versions.
-
-        Raises
-        ------
-        ImportError
-            If ArviZ or xarray is not installed.
-
-        See Also
-        --------
-        Bootstrap.to_pandas, Bootstrap.to_xarray
-
-        Examples
-        --------
-        >>> import warnings
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-
-        >>> study = sf.bootstrap(sf.estimate(heater_problem()), 20)
-        >>> with warnings.catch_warnings():
-        ...     warnings.simplefilter("ignore")  # ArviZ 0.23 warns of its next version
-        ...     draws = study.to_arviz()
-        >>> draws.posterior["k"].dims
-        ('chain', 'draw')
-        """
-        return self._collect_draws(f"bootstrap of {self.resample}", "estimate", self.estimate)
-
 
 def bootstrap(
     estimate: Estimate,

@@ -20,15 +20,12 @@ from switchfit.discretization.mesh import Mesh, split_by_cell
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_near_guards
-from switchfit.fit.trajectory import compare
+from switchfit.fit.trajectory import compare, replace_values
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
 from switchfit.uncertainty.verdict import Verdict
-
-SOUND_AMONG = 3
-"""First runs among which one must be such that its noise can be drawn; what is wrong with a single one is listed."""
 
 Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
 
@@ -106,36 +103,6 @@ class MonteCarlo(Fits):
         low, high = np.moveaxis(self.confidence_intervals(level)[self.success], 2, 0)
         inside = (low <= self.truth) & (self.truth <= high)
         return np.where(np.isnan(low).all(0), np.nan, inside.mean(0))
-
-    def to_arviz(self) -> Any:
-        """Return the estimates of the fits that converged as draws of one chain, in the group that ArviZ plots.
-
-        They are draws of the estimate over repetitions of the experiment, and not of a posterior. It is InferenceData
-        for ArviZ up to 0.23, and a DataTree for later versions.
-
-        Raises
-        ------
-        ImportError
-            If ArviZ or xarray is not installed.
-
-        See Also
-        --------
-        MonteCarlo.to_pandas, MonteCarlo.to_xarray
-
-        Examples
-        --------
-        >>> import warnings
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-
-        >>> study = sf.monte_carlo(heater_problem(), 20, theta=[2.5, 0.4])
-        >>> with warnings.catch_warnings():
-        ...     warnings.simplefilter("ignore")  # ArviZ 0.23 warns of its next version
-        ...     draws = study.to_arviz()
-        >>> draws.posterior["k"].dims
-        ('chain', 'draw')
-        """
-        return self._collect_draws("Monte Carlo", "truth", self.truth)
 
 
 def monte_carlo(
@@ -256,8 +223,7 @@ def build_study(
     limits : Limits
     """
     study = SimulatedStudy(problem, [], begin[None], limits, seed, truth, noise, simulate_clean(problem, truth))
-    study.find_sound_run(runs)
-    study.meshes, error = _build_meshes(study.problem_of(study.sound), truth, begin)
+    study.meshes, error = _build_meshes(study.problem_of(0), truth, begin)
     return study, error
 
 
@@ -333,25 +299,6 @@ class SimulatedStudy(Study):
     noise: Any
     clean: Values
 
-    def find_sound_run(self, count: int) -> None:
-        """Find a run whose noise can be drawn; raise the error of the first run if none of the first few can."""
-        tried = range(min(count, SOUND_AMONG))
-        _, errors = self._draw_runs(tried)
-        if len(errors) == len(tried):
-            raise errors[0]
-        self.sound = min(set(tried) - set(errors))
-
-    def _draw_runs(self, runs: Iterable[int]) -> tuple[list[Values], dict[int, Exception]]:
-        """Return the values of some runs, and the errors of those whose noise cannot be drawn, by their places."""
-        drawn, errors = [], {}
-        for place, run in enumerate(runs):
-            try:
-                drawn.append(self.draw_run(run))
-            except Exception as error:  # listed: it must not end the other runs
-                drawn.append(self.clean)
-                errors[place] = error
-        return drawn, errors
-
     def draw_run(self, run: int) -> Values:
         """Return the values of one run."""
         rng, drawn = np.random.default_rng([self.seed, run]), {}
@@ -396,15 +343,17 @@ class SimulatedStudy(Study):
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
-        data = [list(experiment.data) for experiment in self.problem.experiments]
-        for (e, k), values in self.draw_run(run).items():
-            data[e][k] = _replace_values(data[e][k], values)
-        runs = [replace(run, data=own) for run, own in zip(self.problem.experiments, data, strict=True)]
-        return replace(self.problem, experiments=runs)
+        return replace_values(self.problem, self.draw_run(run))
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return the data of some runs, and the errors of those whose noise cannot be drawn, by their places."""
-        drawn, errors = self._draw_runs(runs)
+        drawn, errors = [], {}
+        for place, run in enumerate(runs):
+            try:
+                drawn.append(self.draw_run(run))
+            except Exception as error:  # listed: it must not end the other runs
+                drawn.append(self.clean)
+                errors[place] = error
         return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
 
     def measure_variation(self, runs: range) -> float:
@@ -413,7 +362,7 @@ class SimulatedStudy(Study):
 
     @cached_property
     def _variation(self) -> float:
-        return float(measure_variation(self.problem_of(self.sound)).sum())
+        return float(measure_variation(self.problem_of(0)).sum())
 
     def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
@@ -439,21 +388,6 @@ class SimulatedStudy(Study):
                         changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
                     channel += q
         return Varying(tuple(changed), tuple(changed.values()))
-
-
-def _replace_values(item: Any, values: FloatArray) -> Any:
-    """Return the same kind of data with other values; missing ones stay missing."""
-    if isinstance(item, Measurements):
-        return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
-    measured = item.samples[1]
-    return ReferenceSignal.from_samples(
-        item.samples[0],
-        np.where(np.isnan(measured), np.nan, values),
-        observe=item.observe,
-        lowpass_hz=item.lowpass_hz,
-        weights=item.weights,
-        names=item.names,
-    )
 
 
 def _find_cells(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:

@@ -3,8 +3,6 @@
 What is said of a fit beyond its end is the same in every study, and in a batch of logs: fits are done again that need
 it, and pieces of profiles are added, and how well each fit explains its data.
 
-Cost, gradient and Hessian of many fits at once, each with its own data: for the intervals of many estimates.
-
 Intervals of transition times across sample times, of many fits: as of `switchfit.uncertainty.walks`.
 
 Where a sample lies near a transition time, or a kink holds it, the pieces of its profile are found while the fit's data
@@ -19,34 +17,23 @@ happen anywhere, and from there on their guards.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any
+from functools import cache, cached_property, partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.program import (
-    CHUNK,
+    UNDEFINED,
+    Batch,
     Chunk,
-    Inputs,
-    Layout,
     Limits,
     Varying,
     choose_chunk_size,
-    choose_layout,
-    compile_for_layout,
-    compile_once,
     count_chunks_together,
-    fit_chunk,
-    give_data,
-    pad_fits,
 )
 from switchfit.batch.verdict import (
     EXPLAINED_BADLY,
@@ -55,7 +42,6 @@ from switchfit.batch.verdict import (
     describe_ends,
     find_doubts,
     has_converged,
-    measure_quantile,
     measure_variance,
 )
 from switchfit.discretization.mesh import Arguments, Mesh, build_arguments
@@ -64,9 +50,9 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
+from switchfit.fit.result import measure_quantile
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.strategy.starts import End, fit_briefly
 from switchfit.uncertainty.walks import (
@@ -77,121 +63,12 @@ from switchfit.uncertainty.walks import (
     Derivatives,
     Samples,
     Walks,
-    find_ends,
     is_any_near,
     join_walks,
     list_transitions,
     list_walks,
     trace_walks,
 )
-
-EVALUATIONS = 256
-"""Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
-
-UNDEFINED = (ValueError, ArithmeticError, np.linalg.LinAlgError)
-"""What a model raises where it is undefined."""
-
-
-class Evaluations:
-    """Cost, gradient and Hessian of any fits of a call with their own data, many at a time.
-
-    Parameters
-    ----------
-    problem : Problem
-    meshes : one an experiment
-    varying : Varying
-    room : int
-        As of `fit_chunk`.
-    redone : (R,) bool
-        Fits that were done again, on meshes of their own.
-    build_own : callable
-        Returns the evaluator of such a fit.
-
-    Attributes
-    ----------
-    quick : bool
-        Whether machine code evaluates the others, in one program; otherwise they are evaluated one by one.
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        meshes: Sequence[Mesh],
-        varying: Varying,
-        room: int,
-        redone: NDArray[np.bool_],
-        build_own: Callable[[int], Evaluator],
-    ) -> None:
-        self.varying, self.room, self.redone, self.build_own = varying, max(room, CHUNK), redone, build_own
-        self.evaluator = Evaluator(problem, meshes=meshes)
-        self.base = tuple(self.evaluator.arguments)
-        self.layout = choose_layout(self.evaluator, varying.places)
-        self.quick = self.layout.natively
-        self.own: dict[int, Evaluator] = {}
-
-    def __call__(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
-        """Return costs, gradients and Hessians at thetas (n, d), to one side (n,) of breakpoints.
-
-        `fits` (n,) says whose data are taken. NaN where the model is undefined.
-        """
-        n, d = thetas.shape
-        at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
-        alone = self.redone[fits] | (not self.quick)
-        together = np.flatnonzero(~alone)
-        for first in range(0, len(together), EVALUATIONS):
-            call = together[first : first + EVALUATIONS]
-            for all_, found in zip(at, self._run(fits[call], thetas[call], sides[call]), strict=True):
-                all_[call] = found
-        for s in np.flatnonzero(alone).tolist():
-            with suppress(*UNDEFINED):
-                here = self._prepare(int(fits[s]))(thetas[s], int(sides[s]))
-                at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
-        return at
-
-    def _prepare(self, k: int) -> Evaluator:
-        """Return an evaluator with the data of the k-th fit."""
-        if not self.redone[k]:
-            give_data(self.evaluator, self.base, self.varying, k)
-            return self.evaluator
-        if k not in self.own:
-            self.own[k] = self.build_own(k)
-        return self.own[k]
-
-    def _run(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
-        with use_float64():
-            padded = (pad_fits(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float)))
-            given = Inputs.of(self.evaluator, self.layout), self._values, *padded, len(fits)
-            with compile_once(self.layout, given):
-                found = _evaluate_fits(*given, layout=self.layout)
-        return tuple(np.asarray(each)[: len(fits)] for each in found)
-
-    @cached_property
-    def _values(self) -> tuple[jax.Array, ...]:
-        """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of the program."""
-        return tuple(jnp.asarray(pad_fits(value, self.room)) for value in self.varying.values)
-
-
-@compile_for_layout
-def _evaluate_fits(
-    inputs: Inputs,
-    values: tuple[jax.Array, ...],
-    fits: jax.Array,
-    thetas: jax.Array,
-    sides: jax.Array,
-    count: jax.Array,
-    *,
-    layout: Layout,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return cost, gradient and Hessian of the first `count` fits at their thetas."""
-    n, d = thetas.shape
-
-    def one(s: jax.Array, found: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        new = inputs.evaluate(layout, [value[fits[s]] for value in values], thetas[s], sides[s])
-        return tuple(all_.at[s].set(each) for all_, each in zip(found, new, strict=True))  # type: ignore[return-value]
-
-    empty = jnp.zeros(n), jnp.zeros((n, d)), jnp.zeros((n, d, d))
-    return lax.fori_loop(0, count, one, empty)
-
 
 MOST_SAMPLES = 5
 """With more samples than that within an interval one parabola is taken: their kinks begin to average out, and the
@@ -221,9 +98,7 @@ def make_no_pieces(problem: Problem, count: int) -> FloatArray:
     return np.full((count, len(list_places(problem)), 2, MOST_KEPT, PIECE), np.nan)
 
 
-def trace_chunk(
-    chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], prepare: Callable[[], Evaluations]
-) -> FloatArray:
+def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], batch: Batch) -> FloatArray:
     """Return the pieces of the profiles of a chunk's transition times: (R, T, 2, `MOST_KEPT`, 5).
 
     Parameters
@@ -231,8 +106,8 @@ def trace_chunk(
     chunk : Chunk
     groups : list of (Problem, (n,) int)
         Problems with the bounds and sample times of some fits.
-    prepare : callable
-        What evaluates the chunk's fits; asked for where any fit needs it.
+    batch : Batch
+        Which evaluates the chunk's fits.
     """
     found, converged = make_no_pieces(groups[0][0], len(chunk.cost)), has_converged(chunk.status)
     if not found.shape[1]:
@@ -242,13 +117,13 @@ def trace_chunk(
         return found
     fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
     smooth = chunk.status[fits] != AT_KINK
-    shared = prepare()
-    if not shared.quick:  # an evaluation of its own has to be compiled: for kinks alone, where there is nothing else
+    # Other evaluations have to be compiled for this: it is done for kinks alone, where there is nothing else.
+    if not batch.layout.natively:
         kept = ~smooth
         fits, rows, walks, smooth = fits[kept], rows[kept], Walks(*(each[kept] for each in walks)), smooth[kept]
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
-        return shared(fits[which], thetas, walks.side[which])
+        return batch.evaluate(fits[which], thetas, walks.side[which])
 
     start = Derivatives(chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits])
     pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)
@@ -291,112 +166,6 @@ def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Itera
             own = Samples(*(each[taken] for each in samples))
             walks = list_walks(problem, e, place, theta[taken], free[taken], thresholds[taken], own, MOST_KEPT)
             yield np.tile(fits[taken], 2), np.full(len(walks.place), row), walks
-
-
-def replace_intervals(
-    intervals: FloatArray, pieces: FloatArray, places: NDArray[np.intp], thresholds: FloatArray
-) -> FloatArray:
-    """Return intervals (R, d, 2) with those of transition times with samples near, or at a kink, from their pieces.
-
-    Parameters
-    ----------
-    intervals : (R, d, 2)
-        From one parabola each; NaN at a kink.
-    pieces : (R, T, 2, P, 5)
-        As of `trace_chunk`.
-    places : (T,) int
-        Where in theta they stand.
-    thresholds : (R,)
-        By how much J may exceed its minimum.
-    """
-    found = intervals.copy()
-    if not len(places):
-        return found
-    replaced = ~np.isnan(pieces[:, :, 0, 0, 0])
-    for end, side in enumerate((-1, 1)):
-        ends = find_ends(pieces[:, :, end], thresholds[:, None], side)
-        found[:, places, end] = np.where(replaced, ends, found[:, places, end])
-    return found
-
-
-def redo_unresolved(
-    chunk: Chunk, problem_of: Callable[[int], Problem], meshes: Sequence[Mesh] | None, limits: Limits
-) -> None:
-    """Replace fits whose integration error is too large by those that `estimate` finds.
-
-    Of fits that share meshes, those that failed are looked at. A mode that is active elsewhere than where the meshes
-    were refined may find cells there that are far too long for it: what stops the optimiser is then the mesh and not
-    the model. A fit that fails again is left as it was.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        It is written to.
-    problem_of : callable
-        The problem of the k-th fit of the chunk, with its own data.
-    meshes : sequence of Mesh, optional
-        Those that all fits share; None if each has the meshes of its first guess.
-    limits : Limits
-    """
-    failed = ~has_converged(chunk.status)
-    looked_at = (chunk.status != Status.ERROR.name) & (failed | (meshes is None))
-    for k in np.flatnonzero(looked_at).tolist():
-        theta = chunk.theta[k]
-        try:
-            problem = problem_of(k)
-            if _is_resolved(problem, meshes, theta, chunk.cost[k]):
-                continue
-            again = fit_locally(problem, start=theta, **limits._asdict())
-        except Exception as error:
-            if not failed[k]:
-                chunk.set_error(k, error)
-            continue  # a fit from this end fails too: the first one stays, and is listed as failed
-        if again.status.successful or not failed[k]:
-            replace_fit(chunk, k, again)
-
-
-def redo_doubted(
-    chunk: Chunk,
-    problem_of: Callable[[int], Problem],
-    starts: FloatArray,
-    variation: FloatArray | float,
-    limits: Limits,
-) -> None:
-    """Replace fits that did not converge, lost modes or are far from their data by better ones, where there are any;
-    only of problems with guards or terminal constraints, which the compiled program does not take.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        It is written to.
-    problem_of : callable
-        The problem of the k-th fit of the chunk, with its own data.
-    starts : (R, d)
-        Where each of them begins.
-    variation : float or (R,)
-        As of `describe_ends`.
-    limits : Limits
-    """
-    totals = np.broadcast_to(np.asarray(variation, dtype=float), len(starts))
-    for k in range(len(starts)):
-        try:
-            problem = problem_of(k)
-        except Exception:  # the problem cannot be built, and the fit is listed as failed
-            continue
-        guarded = any(structure.guarded for structure in problem.structures)
-        for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
-            if not _is_doubted(problem, chunk, k, float(totals[k])):
-                break
-            try:
-                end = find(problem, starts[k])
-                if end.failed:
-                    continue
-                again = fit_locally(problem, start=end.theta, **limits._asdict())
-            except (ValueError, ArithmeticError, np.linalg.LinAlgError):  # nothing better from this start
-                continue
-            before = chunk.cost[k] if has_converged(chunk.status)[k] else np.inf
-            if again.status.successful and again.cost < before:
-                replace_fit(chunk, k, again)
 
 
 def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:
@@ -462,7 +231,6 @@ class Study:
     shares_problem = True  # whether bounds, sample times and meshes are those of `problem`
     retry = True  # whether a fit that strayed is fitted from its start too
     is_finished = True  # whether fits are done again that need it, and get pieces
-    sound = 0  # a run whose data can be made
 
     @property
     def size(self) -> int:
@@ -472,7 +240,7 @@ class Study:
     @cached_property
     def most_chunks(self) -> int:
         """Neighbouring chunks that one call may take."""
-        return count_chunks_together(self.problem, self.meshes, self.stack_data([self.sound])[0])
+        return count_chunks_together(self.problem, self.meshes, self.stack_data([0])[0])
 
     @property
     def room(self) -> int:
@@ -506,32 +274,82 @@ class Study:
     def __call__(self, runs: range) -> Arrays:
         """Return the fits of some of the runs."""
         data, errors = self.stack_data(runs)
-        starts = self.list_starts(runs)
-        chunk = fit_chunk(self.problem, self.meshes, data, starts, self.limits, room=self.room, retry=self.retry)
+        batch = Batch(self.problem, self.meshes, data, self.limits, self.room)
+        chunk = batch.fit(self.list_starts(runs), retry=self.retry)
         for k, error in errors.items():
             chunk.clear_fit(k, error)
-        return self.finish_fits(chunk, runs, data) if self.is_finished else self.describe_fits(chunk, runs)
+        return self.finish_fits(chunk, runs, batch) if self.is_finished else self.describe_fits(chunk, runs)
 
     def list_starts(self, runs: range) -> FloatArray:
         """Return where some of the runs begin: (R, d)."""
         return self.starts[runs.start : runs.stop] if len(self.starts) > 1 else self.starts.repeat(len(runs), axis=0)
 
-    def finish_fits(self, chunk: Chunk, runs: range, data: Varying) -> Arrays:
+    def finish_fits(self, chunk: Chunk, runs: range, batch: Batch) -> Arrays:
         """Return the arrays of fits, of which those that need it are done again, with pieces of profiles."""
-
-        def problem_of(k: int) -> Problem:
-            return self.problem_of(runs[k])
-
         before = chunk.theta.copy()
-        redo_unresolved(chunk, problem_of, self.meshes if self.shares_problem else None, self.limits)
+        self._redo_unresolved(chunk, runs)
         if self.problem.constraint_names:
-            redo_doubted(chunk, problem_of, self.list_starts(runs), self.measure_variation(runs), self.limits)
+            self._redo_doubted(chunk, runs)
         if any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
             return self.describe_fits(chunk, runs)
-        redone = find_replaced(before, chunk), lambda k: Evaluator(problem_of(k), chunk.theta[k])
-        prepare = partial(Evaluations, self.problem, self.meshes, data, self.room, *redone)
-        pieces = trace_chunk(chunk, self.group_fits(runs), prepare)
+        for k in np.flatnonzero(find_replaced(before, chunk)).tolist():
+            batch.own[k] = cache(partial(self._build_own, runs[k], chunk.theta[k]))
+        pieces = trace_chunk(chunk, self.group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
+
+    def _redo_unresolved(self, chunk: Chunk, runs: range) -> None:
+        """Replace fits whose integration error is too large by those that `estimate` finds.
+
+        Of fits that share meshes, those that failed are looked at. A mode that is active elsewhere than where the
+        meshes were refined may find cells there that are far too long for it: what stops the optimiser is then the mesh
+        and not the model. A fit that fails again is left as it was.
+        """
+        failed = ~has_converged(chunk.status)
+        looked_at = (chunk.status != Status.ERROR.name) & (failed | (not self.shares_problem))
+        for k in np.flatnonzero(looked_at).tolist():
+            theta = chunk.theta[k]
+            try:
+                problem = self.problem_of(runs[k])
+                if _is_resolved(problem, self.meshes if self.shares_problem else None, theta, chunk.cost[k]):
+                    continue
+                again = fit_locally(problem, start=theta, **self.limits._asdict())
+            except Exception as error:
+                if not failed[k]:
+                    chunk.set_error(k, error)
+                continue  # a fit from this end fails too: the first one stays, and is listed as failed
+            if again.status.successful or not failed[k]:
+                replace_fit(chunk, k, again)
+
+    def _redo_doubted(self, chunk: Chunk, runs: range) -> None:
+        """Replace fits that did not converge, lost modes or are far from their data by better ones, if there are any.
+
+        Only of problems with guards or terminal constraints, which the compiled program does not take.
+        """
+        starts = self.list_starts(runs)
+        variations = np.broadcast_to(self.measure_variation(runs), len(runs))
+        for k, run in enumerate(runs):
+            try:
+                problem = self.problem_of(run)
+            except Exception:  # the problem cannot be built, and the fit is listed as failed
+                continue
+            guarded = any(structure.guarded for structure in problem.structures)
+            for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
+                if not _is_doubted(problem, chunk, k, float(variations[k])):
+                    break
+                try:
+                    end = find(problem, starts[k])
+                    if end.failed:
+                        continue
+                    again = fit_locally(problem, start=end.theta, **self.limits._asdict())
+                except UNDEFINED:  # nothing better from this start
+                    continue
+                before = chunk.cost[k] if has_converged(chunk.status)[k] else np.inf
+                if again.status.successful and again.cost < before:
+                    replace_fit(chunk, k, again)
+
+    def _build_own(self, run: int, theta: FloatArray) -> Evaluator:
+        """Return the evaluator of a fit that was done again."""
+        return Evaluator(self.problem_of(run), theta)
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
         """Return the arrays of fits as they are, without pieces of profiles."""
@@ -545,7 +363,7 @@ class Study:
 
     def fingerprint(self) -> str:
         """Return a digest of everything that a result depends on."""
-        unknowns, data = self.problem.unknowns, self.stack_data([self.sound])[0]  # stands for all runs
+        unknowns, data = self.problem.unknowns, self.stack_data([0])[0]  # run 0 stands for all
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
         leaves = jax.tree.leaves(self.arguments)
         shared = [np.asarray(leaf) for place, leaf in enumerate(leaves) if place not in data.places]

@@ -96,13 +96,6 @@ def measure_variance(cost: FloatArray, freedom: NDArray[np.int64], sigma_known: 
     return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
 
 
-def measure_quantile(level: float, freedom: NDArray[np.int64], sigma_known: bool | None) -> FloatArray:
-    """Return the two-sided quantile of each fit, as of `Fit.quantile`: (R,)."""
-    tail = 0.5 + level / 2
-    found = special.stdtrit(freedom, tail) if sigma_known is False else special.ndtri(tail)
-    return np.broadcast_to(found, freedom.shape)
-
-
 MINOR = 0.01
 """Share of a study's fits that may have failed, or ended at a bound or with a collapsed mode, without a doubt about its
 standard deviations and 95 % intervals."""
@@ -205,11 +198,12 @@ def judge_study(
     if failed > MINOR * R:
         level: Level = "bad" if failed >= HALF * R else "doubtful"
         found.append(Finding(level, _count(fits, Doubt("not converged", level, ~ended)), ("see failures",)))
-    elsewhere = find_elsewhere(fits, shared)
+    distances = measure_distances(fits, shared)
+    elsewhere = distances > FAR_AWAY
     if elsewhere.any():
-        names = _name_farthest(fits, elsewhere, shared)
+        farthest = str(fits.runs[int(np.argmax(distances))])
         figures = {"count": float(elsewhere.sum()), "fits": float(R)}
-        found.append(Finding("doubtful", Issue("ended elsewhere", names, figures), ("take quantiles",)))
+        found.append(Finding("doubtful", Issue("ended elsewhere", (farthest,), figures), ("take quantiles",)))
     for doubt in fits.doubts:
         many = doubt.which.sum() > MINOR * R
         if doubt.kind in ("a mode collapsed", "at bounds", "not determined") and many:
@@ -237,16 +231,16 @@ def judge_failed_starts(fits: Any) -> Verdict:
     return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
 
 
-def find_elsewhere(fits: Any, considered: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-    """Return which fits converged so far from the others that it is in another minimum: (R,).
+def measure_distances(fits: Any, considered: NDArray[np.bool_]) -> FloatArray:
+    """Return how far fits converged from the others, in spreads; 0 for those that did not converge: (R,).
 
     An unknown's deviation from the median is measured by the median of these deviations, or by the median standard
-    error, or 1e-3 of the unknown's size where most are held.
+    error, or 1e-3 of the unknown's size where most are held. Of some unknowns (d,), the largest counts.
     """
     ended = fits.success
-    away = np.zeros(len(ended), dtype=bool)
+    found = np.zeros(len(ended))
     if ended.sum() < 3:
-        return away
+        return found
     theta = fits.theta[ended]
     centre = np.median(theta, axis=0)
     deviation = np.abs(theta - centre)
@@ -254,9 +248,8 @@ def find_elsewhere(fits: Any, considered: NDArray[np.bool_] | None = None) -> ND
     usual = np.array([np.median(e[np.isfinite(e)]) if np.isfinite(e).any() else 0.0 for e in errors.T])
     spread = np.maximum(1.4826 * np.median(deviation, axis=0), usual)
     spread = np.where(spread > 0, spread, 1e-3 * np.maximum(np.abs(centre), 1e-300))
-    far = deviation > FAR_AWAY * spread
-    away[ended] = np.any(far if considered is None else far[:, considered], axis=1)
-    return away
+    found[ended] = np.max(deviation / spread * considered, axis=1)
+    return found
 
 
 def _find_smallest(H: FloatArray, free: NDArray[np.int64], status: NDArray[np.str_]) -> FloatArray:
@@ -313,11 +306,3 @@ def _find_worst(fits: Any, which: NDArray[np.bool_]) -> int:
     places = np.flatnonzero(which)
     shares = fits.explained[places]
     return int(places[0] if np.isnan(shares).all() else places[np.nanargmin(shares)])
-
-
-def _name_farthest(fits: Any, away: NDArray[np.bool_], considered: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return the number of the fit that ended farthest from the others, by its largest relative deviation."""
-    centre = np.median(fits.theta[fits.success], axis=0)
-    size = np.where(centre != 0, np.abs(centre), 1.0)
-    reach: Any = np.max(np.abs(fits.theta - centre) / size * considered, axis=1)
-    return (str(fits.runs[int(np.argmax(np.where(away, reach, -1.0)))]),)

@@ -1,7 +1,4 @@
-"""The result of a fit, with methods that need the model: intervals, predictions, validation, files.
-
-Figures of an estimate as its methods; `switchfit.report` draws them.
-"""
+"""The result of a fit, with methods that need the model: intervals, predictions, validation, figures, files."""
 
 from __future__ import annotations
 
@@ -9,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from switchfit.estimation.saved import Provenance, describe_python_problem, digest_data, load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import CovarianceKind, Fit, TimeProfile
+from switchfit.fit.result import CovarianceKind, Fit
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -47,153 +45,11 @@ from switchfit.uncertainty.prediction import (
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_covariance, correct_errors, diagnose
 from switchfit.uncertainty.verdict import Verdict, judge
-from switchfit.uncertainty.walks import HIGHEST_LEVEL, replace_intervals, trace_profiles
+from switchfit.uncertainty.walks import HIGHEST_LEVEL, compute_threshold, replace_intervals, trace_profiles
 
 if TYPE_CHECKING:
     import pandas
     import xarray
-
-
-class FitFigures(Fit):
-    """A fit whose methods draw it."""
-
-    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
-        """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
-
-        Parameters
-        ----------
-        bands : bool
-            Whether to draw confidence and prediction bands of the fitted values, which need the model and a covariance.
-            The first ones of a model take a second to compile.
-        level : float, between 0 and 1
-            Level of the bands.
-
-        See Also
-        --------
-        Estimate.plot_residuals, Estimate.predict
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> figure = fit.plot(bands=False)
-        >>> len(figure.axes)
-        2
-        """
-        return draw_figure(self, bands=bands, level=level)
-
-    @property
-    def residuals(self) -> ResidualDiagnostics:
-        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
-        return diagnose(self)
-
-    def plot_residuals(self) -> Figure:
-        """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
-
-        See Also
-        --------
-        Estimate.residuals, Estimate.plot
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> len(fit.plot_residuals().axes)
-        3
-        """
-        return draw_figure(self.residuals)
-
-    def plot_convergence(self, *, ax: Drawn | None = None) -> Drawn:
-        """Draw the optimality against iteration on a logarithmic scale, with the tolerance.
-
-        Parameters
-        ----------
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> fit.plot_convergence().axes[0].get_xlabel()
-        'iteration'
-        """
-        return draw_figure(self, what="convergence", ax=ax)
-
-    def plot_timeline(self, *, level: float = 0.95, ax: Drawn | None = None) -> Drawn:
-        """Draw which mode is active when, a row for each experiment, with intervals of the transition times.
-
-        Parameters
-        ----------
-        level : float, between 0 and 1
-            Of the intervals.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> [text.get_text() for text in fit.plot_timeline().axes[0].texts]
-        ['on', 'off']
-        """
-        return draw_figure(self, what="timeline", level=level, ax=ax)
-
-    def plot_plane(
-        self,
-        *,
-        channels: tuple[str, str] | None = None,
-        experiment: int = 0,
-        ax: Drawn | None = None,
-    ) -> Drawn:
-        """Draw the path in the plane where two positions are measured.
-
-        Parameters
-        ----------
-        channels : (str, str), optional
-            Names of the two positions; left out, they are told by names such as X and Y or east and north.
-        experiment : int
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        Raises
-        ------
-        ValueError
-            If no two channels are positions in a plane, or those that are named do not exist.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> try:  # a drive with two positions has such a figure, a room with one thermometer has none
-        ...     fit.plot_plane()
-        ... except ValueError as error:
-        ...     print(str(error).partition(";")[0])
-        no two channels of the same data are positions in a plane by their names
-        """
-        return draw_figure(self, what="plane", channels=channels, experiment=experiment, ax=ax)
 
 
 TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
@@ -204,7 +60,7 @@ MOST_SENSITIVITIES = 2**28
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(FitFigures, Tabular, Displayed):
+class Estimate(Fit, Tabular, Displayed):
     """Result of `estimate`: everything in `Fit`, with methods that need the model. Print it for the report.
 
     Attributes
@@ -441,12 +297,9 @@ class Estimate(FitFigures, Tabular, Displayed):
             raise ValueError(
                 "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
             )
-        if self.evaluator is not None:
-            return self.evaluator
-        if "_refined" not in self.__dict__:  # of a loaded estimate, whose meshes are not saved
-            self.__dict__["_refined"] = Evaluator(self.problem, self.theta)
-        refined: Evaluator = self.__dict__["_refined"]
-        return refined
+        if self.evaluator is None:  # of a loaded estimate, whose meshes are not saved
+            object.__setattr__(self, "evaluator", Evaluator(self.problem, self.theta))
+        return cast(Evaluator, self.evaluator)
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return intervals of all unknowns, cut off at the bounds: (d, 2).
@@ -482,14 +335,15 @@ class Estimate(FitFigures, Tabular, Displayed):
                [0.38, 0.4 ]])
         """
         intervals = super().confidence_intervals(level, hessian=hessian)
-        return (
-            replace_intervals(self, intervals, level, self._trace_profiles(level)) if hessian == "exact" else intervals
-        )
+        if hessian != "exact":
+            return intervals
+        pieces, places = self._trace_profiles(level)
+        return replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))
 
-    def _trace_profiles(self, level: float = HIGHEST_LEVEL) -> tuple[TimeProfile, ...]:
+    def _trace_profiles(self, level: float = HIGHEST_LEVEL) -> tuple[FloatArray, NDArray[np.intp]]:
         """Return the profiles of transition times with samples near; without the model those that were saved."""
         if self.problem is None:
-            return self.saved_profiles
+            return self.saved_pieces, self.saved_piece_places
         return trace_profiles(self, self.problem, self.evaluator_at_solution(), level)
 
     def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
@@ -596,6 +450,144 @@ class Estimate(FitFigures, Tabular, Displayed):
     def identifiability(self) -> Identifiability:
         """Which combinations of the unknowns the data determine badly, with J evaluated there."""
         return identifiability(self)
+
+    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
+        """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
+
+        Parameters
+        ----------
+        bands : bool
+            Whether to draw confidence and prediction bands of the fitted values, which need the model and a covariance.
+            The first ones of a model take a second to compile.
+        level : float, between 0 and 1
+            Level of the bands.
+
+        See Also
+        --------
+        Estimate.plot_residuals, Estimate.predict
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> figure = fit.plot(bands=False)
+        >>> len(figure.axes)
+        2
+        """
+        return draw_figure(self, bands=bands, level=level)
+
+    @property
+    def residuals(self) -> ResidualDiagnostics:
+        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
+        return diagnose(self)
+
+    def plot_residuals(self) -> Figure:
+        """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
+
+        See Also
+        --------
+        Estimate.residuals, Estimate.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.plot_residuals().axes)
+        3
+        """
+        return draw_figure(self.residuals)
+
+    def plot_convergence(self, *, ax: Drawn | None = None) -> Drawn:
+        """Draw the optimality against iteration on a logarithmic scale, with the tolerance.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.plot_convergence().axes[0].get_xlabel()
+        'iteration'
+        """
+        return draw_figure(self, what="convergence", ax=ax)
+
+    def plot_timeline(self, *, level: float = 0.95, ax: Drawn | None = None) -> Drawn:
+        """Draw which mode is active when, a row for each experiment, with intervals of the transition times.
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            Of the intervals.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [text.get_text() for text in fit.plot_timeline().axes[0].texts]
+        ['on', 'off']
+        """
+        return draw_figure(self, what="timeline", level=level, ax=ax)
+
+    def plot_plane(
+        self,
+        *,
+        channels: tuple[str, str] | None = None,
+        experiment: int = 0,
+        ax: Drawn | None = None,
+    ) -> Drawn:
+        """Draw the path in the plane where two positions are measured.
+
+        Parameters
+        ----------
+        channels : (str, str), optional
+            Names of the two positions; left out, they are told by names such as X and Y or east and north.
+        experiment : int
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        Raises
+        ------
+        ValueError
+            If no two channels are positions in a plane, or those that are named do not exist.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> try:  # a drive with two positions has such a figure, a room with one thermometer has none
+        ...     fit.plot_plane()
+        ... except ValueError as error:
+        ...     print(str(error).partition(";")[0])
+        no two channels of the same data are positions in a plane by their names
+        """
+        return draw_figure(self, what="plane", channels=channels, experiment=experiment, ax=ax)
 
     def save(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write everything but the model to a JSON file, atomically; `load` reads it.
@@ -767,7 +759,9 @@ class Estimate(FitFigures, Tabular, Displayed):
         >>> fit.complete().saved_gauss_newton.shape
         (2, 2)
         """
-        return replace(self, saved_gauss_newton=self.gauss_newton, saved_profiles=self._trace_profiles())
+        pieces, places = self._trace_profiles()
+        matrix = self.gauss_newton
+        return replace(self, saved_gauss_newton=matrix, saved_pieces=pieces, saved_piece_places=places)
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:

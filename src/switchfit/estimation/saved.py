@@ -1,6 +1,6 @@
 """Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 8, "seal": "...", "fit": {...}, "certificate":
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 9, "seal": "...", "fit": {...}, "certificate":
 {...}}`` with the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of
 text, and the "transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes
 them again from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without
@@ -19,7 +19,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -162,17 +162,14 @@ def digest_data(fit: Fit) -> tuple[FileDigest, ...]:
     ----------
     fit : Fit
     """
-    return tuple(_digest_each(fit))
-
-
-def _digest_each(fit: Fit) -> Iterator[FileDigest]:
-    single = len(fit.comparisons) == 1
+    found, single = [], len(fit.comparisons) == 1
     for run, comparisons in zip(fit.run_names, fit.comparisons, strict=True):
         for comparison in comparisons:
             if comparison.kind == "measurements":
                 columns = np.column_stack([comparison.times, comparison.measured]).astype("<f8")
                 label = ", ".join(comparison.names) if single else f"{run}: {', '.join(comparison.names)}"
-                yield digest_bytes(label, np.ascontiguousarray(columns).tobytes())
+                found.append(digest_bytes(label, np.ascontiguousarray(columns).tobytes()))
+    return tuple(found)
 
 
 def find_versions() -> dict[str, str]:
@@ -200,7 +197,7 @@ def describe_platform() -> str:
 
 
 FORMAT = "switchfit fit"
-VERSION = 8
+VERSION = 9
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:
@@ -259,17 +256,6 @@ class SavedFit(NamedTuple):
     fit: Fit
     certificate: Certificate
     provenance: Provenance | None
-
-
-def load_fit(path: Path) -> tuple[Fit, Certificate]:
-    """Return the fit and the certificate of a file, see `load_saved`.
-
-    Parameters
-    ----------
-    path : Path
-    """
-    saved = load_saved(path)
-    return saved.fit, saved.certificate
 
 
 def load_saved(path: Path) -> SavedFit:

@@ -32,7 +32,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,13 +60,6 @@ COST = "J"
 """Name of the cost among the outputs."""
 
 
-class IntegrationError(NamedTuple):
-    """Relative integration error of one output: J, a guard or a terminal constraint."""
-
-    error: float
-    output: str
-
-
 def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: float) -> float:
     """Return the change of J by halving all steps, relative to the size of J."""
     size = max(abs(fine_cost), PERFECT_FIT * abs(first_cost), problem.smallest_cost)
@@ -79,8 +72,8 @@ def worst_error(
     cost: float,
     first_cost: float,
     constraints: Sequence[float],
-) -> IntegrationError:
-    """Return the output of a problem with the largest relative integration error.
+) -> tuple[float, str]:
+    """Return the largest relative integration error of the outputs of a problem, and the output that has it.
 
     Parameters
     ----------
@@ -93,17 +86,19 @@ def worst_error(
 
     Returns
     -------
-    IntegrationError
-        NaN counts as the largest error.
+    error : float
+        NaN counts as the largest.
+    output : str
+        J, or a guard or terminal constraint.
     """
     problem = fine.evaluator.problem
-    errors: list[IntegrationError] = []
+    errors: list[tuple[float, str]] = []
     if problem.constraint_names:
         values, scales = constraint_values(fine.evaluator, fine.theta, fine.simulations)
         changes = np.abs(values - constraints) / np.where(scales > 0, scales, 1.0)
-        errors += map(IntegrationError, changes.tolist(), problem.constraint_names)
-    errors = [IntegrationError(cost_error(problem, fine.cost, cost, first_cost), COST), *errors]
-    return max(errors, key=lambda found: np.inf if np.isnan(found.error) else found.error)
+        errors += zip(changes.tolist(), problem.constraint_names, strict=True)
+    errors = [(cost_error(problem, fine.cost, cost, first_cost), COST), *errors]
+    return max(errors, key=lambda found: np.inf if np.isnan(found[0]) else found[0])
 
 
 def constraint_values(

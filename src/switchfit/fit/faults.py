@@ -23,6 +23,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.inspection import find_comparisons, find_undefined
+from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError, Issue
 
 
@@ -179,15 +180,20 @@ def refuse_hidden_switches(
         )
 
 
-def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float, matrix: Matrix) -> bool:
-    """Return whether the cost changes with unknown i while its derivative is 0 at the changed values too."""
-    unknowns = evaluator.problem.unknowns
-    lower, upper = unknowns.lower[i], unknowns.upper[i]
+def list_changes(problem: Problem, theta: FloatArray, i: int, changes: Sequence[float]) -> Iterator[FloatArray]:
+    """Yield theta with unknown i changed by parts of its size, or of the range between its bounds if it is 0."""
+    lower, upper = problem.unknowns.lower[i], problem.unknowns.upper[i]
     size = abs(theta[i]) or (upper - lower if np.isfinite(upper - lower) else 1.0)
-    differs = False
-    for change in CHANGES:
+    for change in changes:
         moved = theta.copy()
         moved[i] = np.clip(theta[i] + change * size, lower, upper)
+        yield moved
+
+
+def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float, matrix: Matrix) -> bool:
+    """Return whether the cost changes with unknown i while its derivative is 0 at the changed values too."""
+    differs = False
+    for moved in list_changes(evaluator.problem, theta, i, CHANGES):
         there = evaluator(moved, matrix=matrix)
         if not np.isfinite(there.cost):
             continue

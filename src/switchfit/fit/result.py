@@ -123,22 +123,6 @@ class Termination(Printed):
     unread: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()
 
-    @classmethod
-    def of_error(cls, text: str) -> Termination:
-        """Return the termination of a fit that ended with an error, whose message is `text`.
-
-        See Also
-        --------
-        Termination
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> sf.Termination.of_error("the log is empty").status.name
-        'ERROR'
-        """
-        return cls(Status.ERROR, reason=Issue("error", (text,)))
-
 
 def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termination:
     """Return how a fit ended, from the optimizer's result.
@@ -311,24 +295,8 @@ class Step:
     ended: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class TimeProfile:
-    """The profile of J over a transition time with samples near, in pieces; see `switchfit.uncertainty.walks`.
-
-    Attributes
-    ----------
-    unknown : str
-    below, above : (P, 5)
-        The pieces from the estimate downwards and upwards.
-    """
-
-    unknown: str
-    below: FloatArray
-    above: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Termination):
     """Result of an estimation; d unknowns in the order of `theta_names`.
 
     Attributes
@@ -376,8 +344,10 @@ class Fit:
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     saved_gauss_newton : (d, d) or None
         The Gauss-Newton matrix of the samples, if it has been evaluated.
-    saved_profiles : tuple of TimeProfile
-        Of transition times whose intervals follow from them, in a fit that was saved.
+    saved_pieces : (T, 2, P, 5)
+        Of transition times whose intervals follow from them, in a fit that was saved: as `Fits.pieces`.
+    saved_piece_places : (T,) int
+        Where in theta these transition times stand.
     priors : dict of name -> str
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
@@ -429,43 +399,31 @@ class Fit:
     parameters: Values
     parameter_units: Mapping[str, str]
     fixed: tuple[str, ...]
-    cost: float
     gradient: FloatArray
     hessian: FloatArray
-    optimality: float
-    iterations: int
     evaluations: int
-    status: Status
     history: tuple[IterationRecord, ...]
-    active: tuple[ActiveConstraint, ...]
-    kinks: tuple[Kink, ...]
     free_basis: FloatArray
     trajectories: tuple[Trajectory, ...]
     comparisons: tuple[tuple[Comparison, ...], ...]
     sigma_known: bool | None
     integration_error: float
     hessian_kind: str
-    tolerance: float
     seconds: float
     constraints: tuple[tuple[str, float, float], ...] = ()
     saved_gauss_newton: FloatArray | None = None
-    saved_profiles: tuple[TimeProfile, ...] = ()
+    saved_pieces: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 1, 5)))
+    saved_piece_places: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     priors: Mapping[str, str] = field(default_factory=dict)
     log_scaled: tuple[str, ...] = ()
     least_squares: bool = True
     engine: Engine | None = None
     integration_error_of: str = "J"
-    idle: tuple[str, ...] = ()
-    unread: tuple[str, ...] = ()
-    absent: tuple[str, ...] = ()
-    earlier_iterations: int = 0
-    smallest_eigenvalue: float = np.nan
-    flat_direction: tuple[tuple[str, float], ...] = ()
-    violated: tuple[tuple[str, float], ...] = ()
-    reason: Issue | None = None
     starts: tuple[int, int, int] | None = None
     steps: tuple[Step, ...] = ()
     initial_cost: float = np.nan
+
+    __eq__, __hash__ = object.__eq__, object.__hash__
 
     def __post_init__(self) -> None:
         plain = {name: float(v) if np.ndim(v) == 0 else np.asarray(v) for name, v in self.parameters.items()}
@@ -562,7 +520,8 @@ class Fit:
     @property
     def samples(self) -> int:
         """Number of measured values that are not missing."""
-        return sum(int(np.isfinite(c.measured).sum()) for run in self.comparisons for c in run if _is_discrete(c))
+        discrete = (c for run in self.comparisons for c in run if c.kind == "measurements")
+        return sum(int(np.isfinite(comparison.measured).sum()) for comparison in discrete)
 
     @property
     def residual_variance(self) -> float:
@@ -672,7 +631,9 @@ class Fit:
     @property
     def correlation(self) -> FloatArray:
         """Correlation matrix of theta: (d, d); NaN for unknowns that are held."""
-        return correlation_of(self.covariance)
+        errors = self.standard_errors
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.covariance / np.outer(errors, errors))
 
     def quantile(self, level: float) -> float:
         """Return the two-sided quantile: of Student's t if sigma is unknown, else of the normal distribution.
@@ -690,10 +651,7 @@ class Fit:
         >>> round(fit.quantile(0.95), 2)
         1.96
         """
-        level = as_level(level)
-        tail = 0.5 + level / 2
-        freedom = max(self.freedom, 1)
-        return float(special.stdtrit(freedom, tail) if self.sigma_known is False else special.ndtri(tail))
+        return float(measure_quantile(as_level(level), max(self.freedom, 1), self.sigma_known))
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
@@ -732,11 +690,10 @@ class Fit:
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
 
 
-def correlation_of(covariance: FloatArray) -> FloatArray:
-    """Return the correlations (d, d) from covariances; NaN if a variance is 0."""
-    errors = np.sqrt(np.diag(covariance))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(covariance / np.outer(errors, errors))
+def measure_quantile(level: float, freedom: Any, sigma_known: bool | None) -> Any:
+    """Return the two-sided quantiles of fits with these degrees of freedom, as of `Fit.quantile`: (R,)."""
+    tail = 0.5 + level / 2
+    return special.stdtrit(freedom, tail) if sigma_known is False else np.full(np.shape(freedom), special.ndtri(tail))
 
 
 class Disagreement(NamedTuple):
@@ -827,37 +784,6 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     return np.asarray(inverse)
 
 
-class FreeCurvature(NamedTuple):
-    """The Hessian on the directions that constraints and kinks leave free.
-
-    Attributes
-    ----------
-    smallest : float
-        Its smallest eigenvalue; NaN if nothing is free.
-    scaled : (k,)
-        Eigenvalues, ascending, with the unknowns scaled to unit curvature each.
-    weakest : tuple of str
-        Unknowns with the largest components in the direction of the smallest of them.
-    """
-
-    smallest: float
-    scaled: FloatArray
-    weakest: tuple[str, ...]
-
-
-@one_thread()
-def free_curvature(fit: Fit, without: Sequence[str] = ()) -> FreeCurvature:
-    """Return how well a fit's unknowns, but for those in `without`, are determined, from its exact Hessian."""
-    Z = _leave_out(fit.free_basis, np.isin(fit.theta_names, without))
-    if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
-        return FreeCurvature(np.nan, np.zeros(0), ())
-    spectrum = compute_scaled_spectrum(fit.hessian, Z)
-    weight = np.abs(spectrum.vectors[:, 0])
-    strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
-    smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
-    return FreeCurvature(smallest, spectrum.values, tuple(fit.theta_names[i] for i in strong))
-
-
 def list_without_effect(fit: Fit) -> tuple[str, ...]:
     """Return the free parameters and initial states on which J does not depend, to second order.
 
@@ -868,15 +794,6 @@ def list_without_effect(fit: Fit) -> tuple[str, ...]:
     flat |= np.isin(fit.theta_names, (*fit.unread, *fit.absent))
     flat &= np.abs(fit.free_basis).max(axis=1, initial=0.0) > PART
     return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
-
-
-def _leave_out(Z: FloatArray, dropped: NDArray[np.bool_]) -> FloatArray:
-    """Return an orthonormal basis of the directions of Z (d, k) in which none of the dropped unknowns moves: (d, m)."""
-    if not dropped.any() or not Z.shape[1]:
-        return Z
-    _, sizes, across = np.linalg.svd(Z[dropped])
-    kept = np.append(sizes, np.zeros(len(across) - len(sizes))) < PART
-    return np.asarray(Z @ across[kept].T)
 
 
 class ScaledSpectrum(NamedTuple):
@@ -902,7 +819,3 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     values, vectors = np.linalg.eigh(basis.T @ (hessian * np.outer(size, size)) @ basis)
     rounding = len(values) * np.finfo(float).eps * np.abs(values).max(initial=0.0)
     return ScaledSpectrum(np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size)
-
-
-def _is_discrete(comparison: Comparison) -> bool:
-    return comparison.kind == "measurements"

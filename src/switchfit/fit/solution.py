@@ -21,7 +21,7 @@ from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.faults import refuse_hidden_switches
+from switchfit.fit.faults import list_changes, refuse_hidden_switches
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
 from switchfit.optimize.algebra import EPS
 from switchfit.optimize.arrow import Arrow
@@ -145,18 +145,11 @@ def _list_parameters(problem: Problem) -> list[int]:
 
 def _is_idle(evaluator: Evaluator, theta: FloatArray, opened: FloatArray, i: int) -> bool:
     """Return whether parameter i has no effect on J at theta, but has one where the collapsed modes last a little."""
-    unknowns = evaluator.problem.unknowns
-    low, high = unknowns.lower[i], unknowns.upper[i]
-    size = abs(theta[i]) or (high - low if np.isfinite(high - low) else 1.0)
 
     def has_effect(at: FloatArray) -> bool:
         base = evaluator.cost(at)
-        for change in CHANGES:
-            moved = at.copy()
-            moved[i] = np.clip(at[i] + change * size, low, high)
-            if not abs(evaluator.cost(moved) - base) <= NO_EFFECT * abs(base):
-                return True
-        return False
+        moved = map(evaluator.cost, list_changes(evaluator.problem, at, i, CHANGES))
+        return any(not abs(cost - base) <= NO_EFFECT * abs(base) for cost in moved)
 
     return not has_effect(theta) and has_effect(opened)
 

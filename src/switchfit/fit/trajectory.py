@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -312,6 +312,37 @@ def compare(
     trajectories = tuple(_build_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
     pairs = enumerate(zip(simulations, trajectories, strict=True))
     return trajectories, tuple(_build_comparisons(problem, e, theta, *pair) for e, pair in pairs)
+
+
+def replace_values(problem: Problem, values: Mapping[tuple[int, int], FloatArray]) -> Problem:
+    """Return the problem with other values of some of its data; missing ones stay missing.
+
+    Parameters
+    ----------
+    problem : Problem
+    values : mapping of (int, int) to (K, q) array
+        By the experiment, and the place among its data.
+    """
+    data = [list(run.data) for run in problem.experiments]
+    for (e, k), own in values.items():
+        data[e][k] = _replace_values(data[e][k], own)
+    runs = [replace(run, data=items) for run, items in zip(problem.experiments, data, strict=True)]
+    return replace(problem, experiments=runs)
+
+
+def _replace_values(item: Any, values: FloatArray) -> Any:
+    """Return the same kind of data with other values."""
+    if isinstance(item, Measurements):
+        return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
+    times, measured = item.samples
+    return ReferenceSignal.from_samples(
+        times,
+        np.where(np.isnan(measured), np.nan, values),
+        observe=item.observe,
+        lowpass_hz=item.lowpass_hz,
+        weights=item.weights,
+        names=item.names,
+    )
 
 
 def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:

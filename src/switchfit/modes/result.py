@@ -239,7 +239,7 @@ class Certifier:
 
 
 FORMAT = "switchfit modes"
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ import numpy as np
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
-from switchfit.fit.result import free_curvature
 from switchfit.fit.trajectory import Trajectory, simulate
 from switchfit.models.magic_formula import MAGIC_FORMULA, magic_formula
 from switchfit.models.skid_steer import skid_steer
@@ -25,6 +24,7 @@ from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.problem import Problem
 from switchfit.runtime.presentation import Axes
 from switchfit.runtime.presentation import Figure as Figure
+from switchfit.uncertainty.certificate import analyse_solution, certify
 
 Found = dict[str, Any]
 Say = Callable[[str], None]
@@ -237,14 +237,14 @@ def summary(fit: Estimate) -> dict[str, Any]:
     """Return the result of a fit, with the second-order sufficient conditions, as plain numbers."""
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    curvature = free_curvature(fit)
+    smallest, scaled = certify(fit, None).smallest_eigenvalue, analyse_solution(fit, None).eigenvalues
     return {
         "theta": dict(zip(fit.theta_names, fit.theta.tolist(), strict=True)),
         "cost": fit.cost,
         "gradient_norm": fit.optimality,
         "iterations": fit.iterations,
         "status": fit.status.name,
-        "smallest_eigenvalue": curvature.smallest,
-        "scaled_eigenvalues": curvature.scaled.tolist(),
-        "sufficient": bool(fit.status.successful and curvature.smallest > 0),
+        "smallest_eigenvalue": smallest,
+        "scaled_eigenvalues": scaled.tolist(),
+        "sufficient": bool(fit.status.successful and smallest > 0),
     }

@@ -11,21 +11,12 @@ from pathlib import Path
 
 from switchfit.runtime.errors import InputError
 
-try:
-    import fcntl
-except ImportError:  # Windows, where a file that another process has open cannot be deleted
-    fcntl = None  # type: ignore[assignment]
-
 PREFIX, SUFFIX = ".switchfit-", ".tmp"
 """Prefix and suffix of the names of temporary files."""
-ATTEMPTS = 100
 
 
 def write_atomically(content: str | bytes, path: Path, *, sync: bool = True) -> None:
     """Write a temporary file in the folder of `path`, then rename it to `path`; text as UTF-8.
-
-    Temporary files of killed processes in the same folder are deleted first. A file that is being written is locked,
-    and the lock ends with its process, so that files of running processes are not deleted.
 
     Parameters
     ----------
@@ -44,51 +35,19 @@ def write_atomically(content: str | bytes, path: Path, *, sync: bool = True) -> 
         path.write_bytes(data)  # a device or a pipe, which cannot be replaced
         return
     path = path.resolve()  # write the target of a link; the link remains
-    try:
-        _delete_abandoned(path.parent)
-        for attempt in range(ATTEMPTS):
-            try:
-                return _write(data, path, sync)
-            except FileNotFoundError:
-                # Another process saw the temporary file before it was locked, and deleted it.
-                if attempt == ATTEMPTS - 1 or not path.parent.is_dir():
-                    raise
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-def _write(data: bytes, path: Path, sync: bool) -> None:
     temporary = path.with_name(f"{PREFIX}{secrets.token_hex(8)}{SUFFIX}")
     try:
         with temporary.open("xb") as file:
-            if fcntl is not None:
-                with contextlib.suppress(OSError):  # a file system without locks
-                    fcntl.flock(file, fcntl.LOCK_EX)
             file.write(data)
             file.flush()
             if sync:
                 os.fsync(file.fileno())
-            if fcntl is not None:
-                temporary.replace(path)  # while locked
-        if fcntl is None:
-            temporary.replace(path)
+        temporary.replace(path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _delete_abandoned(folder: Path) -> None:
-    """Delete the temporary files in a folder that no process is writing."""
-    found = []
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        found = [entry.path for entry in entries if entry.name.startswith(PREFIX) and entry.name.endswith(SUFFIX)]
-    for name in found:
-        with contextlib.suppress(OSError):  # locked, or deleted in the meantime
-            if fcntl is None:
-                os.unlink(name)
-                continue
-            with open(name, "r+b") as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                os.unlink(name)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def is_regular(path: Path) -> bool:

@@ -234,15 +234,13 @@ def _make_attributes(unit: str) -> dict[str, str]:
     return {"units": unit} if unit else {}
 
 
-def build_arviz(draws: Iterable[Variable], constants: Iterable[Variable], attributes: Mapping[str, str]) -> Any:
+def build_arviz(draws: Iterable[Variable], attributes: Mapping[str, str]) -> Any:
     """Return draws as ArviZ takes them: InferenceData up to its version 0.23, a DataTree of xarray since 1.0.
 
     Parameters
     ----------
     draws : iterable of Variable
-        Of the group "posterior": with dimensions ("chain", "draw").
-    constants : iterable of Variable
-        Of the group "constant_data", without dimensions.
+        With dimensions ("chain", "draw").
     attributes : mapping of str to str
         What the draws are.
 
@@ -252,16 +250,10 @@ def build_arviz(draws: Iterable[Variable], constants: Iterable[Variable], attrib
         If ArviZ or xarray is not installed.
     """
     xarray, arviz = _import_library("xarray", "draws for ArviZ"), _import_library("arviz", "draws for ArviZ")
-    posterior, data = (
-        {variable.name: (variable.dimensions, variable.values, _make_attributes(variable.unit)) for variable in group}
-        for group in (draws, constants)
-    )
+    posterior = {each.name: (each.dimensions, each.values, _make_attributes(each.unit)) for each in draws}
     chains, size = next((np.shape(values) for _, values, _ in posterior.values()), (0, 0))
     places = {"chain": np.arange(chains), "draw": np.arange(size)}
-    groups = {
-        "posterior": xarray.Dataset(posterior, places, dict(attributes)),
-        "constant_data": xarray.Dataset(data, attrs=dict(attributes)),
-    }
+    groups = {"posterior": xarray.Dataset(posterior, places, dict(attributes))}
     if hasattr(arviz, "InferenceData"):
         return arviz.InferenceData(**groups)
     return xarray.DataTree.from_dict(groups)

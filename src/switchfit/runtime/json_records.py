@@ -13,15 +13,14 @@ does not say: files with numbers have a seal.
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +29,6 @@ from switchfit.runtime.files import write_atomically
 
 NUMBERS = ("NaN", "Infinity", "-Infinity")
 """Strings that stand for numbers."""
-
-DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
-"""Types of arrays of numbers or text, as NumPy names them in a file."""
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -70,8 +66,7 @@ def read_document(path: Path, what: str, form: str, version: int) -> dict[str, A
         If it is not valid JSON, of another format or of another version.
     """
     try:
-        text = path.read_bytes().decode()
-        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_repetition)
+        content = json.loads(path.read_bytes().decode())
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != form:
@@ -96,19 +91,6 @@ def _lay_out(value: Any, indent: str = "") -> str:
         return json.dumps(value, allow_nan=False, ensure_ascii=False)
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     return f"{opening}\n{deeper}" + f",\n{deeper}".join(entries) + f"\n{indent}{closing}"
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"it contains {name}")
-
-
-def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object; ValueError if it has a name twice."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"it has the entry {next(name for name in names if names.count(name) > 1)!r} twice")
-    return found
 
 
 # --- to JSON ----------------------------------------------------------------------------------------------------------
@@ -160,44 +142,26 @@ def from_json(kind: Any, content: Any, where: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (UnionType, Union):
         return _read_either(inner, content, where)
-    if is_dataclass(kind):
+    if is_dataclass(kind) and isinstance(content, dict):
         return _read_record(kind, content, where)
-    with _name_place(where):
-        if origin is tuple:
-            entries = list(content) if isinstance(content, tuple) else _require_type(content, list)
-            kinds = inner[:1] * len(entries) if inner[-1] is Ellipsis else inner
-            if len(entries) != len(kinds):
-                raise ValueError(f"must have {len(kinds)} entries; got {len(entries)}")
-        elif isinstance(origin, type) and issubclass(origin, Mapping):
-            entries = _require_type(content, dict)
-        else:
-            return _read_plain(kind, content)
-    if isinstance(entries, dict):
-        return {name: from_json(inner[1], entry, f"{where}.{name}") for name, entry in entries.items()}
-    return tuple(from_json(kinds[k], entry, f"{where}[{k}]") for k, entry in enumerate(entries))
+    if origin is tuple and isinstance(content, list):
+        kinds = inner[:1] * len(content) if inner[-1] is Ellipsis else inner
+        if len(content) == len(kinds):
+            return tuple(from_json(kinds[k], entry, f"{where}[{k}]") for k, entry in enumerate(content))
+    if isinstance(origin, type) and issubclass(origin, Mapping) and isinstance(content, dict):
+        return {name: from_json(inner[1], entry, f"{where}.{name}") for name, entry in content.items()}
+    with suppress(Exception):  # whatever is wrong with it
+        return _read_plain(kind, content)
+    raise ValueError(f"{where} is not what was written; got {shorten_json(content)}")
 
 
-@contextmanager
-def _name_place(where: str) -> Iterator[None]:
-    """Return a context in which errors get the path of the entry that they are about."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{where} {error}") from error
-
-
-def _read_record(kind: Any, content: Any, where: str) -> Any:
+def _read_record(kind: Any, content: dict[str, Any], where: str) -> Any:
     """Return a dataclass from the fields of an object."""
-    hints, values = _get_hints(kind), {}
-    with _name_place(where):
-        if unknown := [name for name in _require_type(content, dict) if name not in hints]:
-            raise ValueError(f"has the unknown entry {unknown[0]!r}")
-    for name, hint in hints.items():
-        if name not in content:
-            raise ValueError(f"{where}.{name} is missing")
-        values[name] = from_json(hint, content[name], f"{where}.{name}")
-    with _name_place(where):
-        return kind(**values)
+    hints = _get_hints(kind)
+    for name in (*hints, *content):
+        if name not in content or name not in hints:
+            raise ValueError(f"{where}.{name} is {'unknown' if name in content else 'missing'}")
+    return kind(**{name: from_json(hint, content[name], f"{where}.{name}") for name, hint in hints.items()})
 
 
 def _read_either(kinds: tuple[Any, ...], content: Any, where: str) -> Any:
@@ -219,42 +183,31 @@ def _get_hints(kind: Any) -> dict[str, Any]:
 
 
 def _read_plain(kind: Any, value: Any) -> Any:
-    """Return a number, a text, an array or a member of an enumeration."""
-    if get_origin(kind) is Literal and value in get_args(kind):
-        return value
-    if kind in (int, str, bool):
-        return _require_type(value, kind)
-    with suppress(Exception):  # whatever is wrong with it
-        if get_origin(kind) is np.ndarray:
-            return _read_array(np.dtype(get_args(get_args(kind)[1])[0]), value)
-        if issubclass(kind, Enum):
-            return kind[value]
-        if type(value) in (int, float) or value in NUMBERS:
-            return float(value)
-    raise ValueError(f"is not what was written; got {shorten_json(value)}")
+    """Return a number, a text, an array or a member of an enumeration; an error of any kind for anything else."""
+    if get_origin(kind) is np.ndarray:
+        return _read_array(np.dtype(get_args(get_args(kind)[1])[0]), value)
+    if get_origin(kind) is Literal:
+        return get_args(kind)[get_args(kind).index(value)]
+    if issubclass(kind, Enum):
+        return kind[value]
+    if kind is float and (type(value) is int or value in NUMBERS):
+        return float(value)
+    if type(value) is not kind:
+        raise TypeError
+    if kind is str:
+        value.encode()  # JSON can hold half of a surrogate pair, UTF-8 cannot
+    return value
 
 
 def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
     """Return an array of the declared type from a list of numbers, or from its dtype, shape and values."""
-    if not isinstance(value, dict):
-        array = np.array(value, dtype=np.float64)
-    elif not DTYPES.fullmatch(value["dtype"]):  # NumPy accepts more names, some of them with a warning
-        raise TypeError
-    else:
+    if isinstance(value, dict):
         array = np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])
+    else:
+        array = np.array(value, dtype=np.float64)
     if array.dtype.kind != declared.kind:
         raise TypeError
     return array
-
-
-def _require_type(value: Any, kind: type) -> Any:
-    """Return `value`; ValueError unless its type is exactly `kind`."""
-    if type(value) is not kind:
-        words = {list: "a list", dict: "an object", str: "a string", int: "an integer", bool: "true or false"}
-        raise ValueError(f"must be {words[kind]}; got {shorten_json(value)}")
-    if isinstance(value, str):
-        value.encode()  # JSON can hold half of a surrogate pair, UTF-8 cannot
-    return value
 
 
 def shorten_json(value: Any) -> str:

@@ -145,32 +145,6 @@ class Line:
         return row
 
 
-def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
-    """Return the callback of a long run, which calls the user's and draws a bar on a terminal or in a notebook.
-
-    Parameters
-    ----------
-    callback : callable, optional
-    title : str
-        Title of the bar.
-
-    Returns
-    -------
-    report : callable ``(done, total)``
-    end : callable without arguments
-        Removes the bar.
-    """
-    line = Line(title)
-    if is_terminal(sys.stderr) or is_notebook():
-        line.start()
-
-    def report(done: int, total: int) -> object:
-        line.done, line.total = done, total
-        return callback is not None and callback(done, total)
-
-    return report, line.end
-
-
 _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
 
 
@@ -190,6 +164,25 @@ def show_line(text: str) -> Iterator[Line]:
     finally:
         _current.reset(token)
         line.end()
+
+
+@contextmanager
+def show_progress(callback: Progress | None, title: str) -> Iterator[Progress]:
+    """Return a context that yields the callback of a long run, which calls the user's and draws a bar as `show_line`.
+
+    Parameters
+    ----------
+    callback : callable, optional
+    title : str
+        Title of the bar.
+    """
+    with show_line(title) as line:
+
+        def report(done: int, total: int) -> object:
+            line.done, line.total = done, total
+            return callback is not None and callback(done, total)
+
+        yield report
 
 
 def show_detail(detail: str, cost: float = math.inf) -> None:

@@ -38,16 +38,6 @@ from switchfit.runtime import special
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 
 
-def count_unknowns(fit: Estimate) -> int:
-    """Return the number of unknowns of a model, k: of theta, less its equality constraints, and an unknown variance.
-
-    Parameters
-    ----------
-    fit : Estimate
-    """
-    return len(fit.theta) - len(fit.constraints) + (fit.sigma_known is False)
-
-
 def find_improper_scale(problem: Problem) -> float | None:
     """Return the scale of a Cauchy loss that is no density, as its integral is infinite; None if there is none.
 
@@ -273,7 +263,8 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
     problems = [fit.evaluator_at_solution().problem for fit in fits]
     _check_data(labels, problems)
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
-    unknowns = np.array([count_unknowns(fit) for fit in fits])
+    # k: all of theta, less its equality constraints, and an unknown variance.
+    unknowns = np.array([len(fit.theta) - len(fit.constraints) + (fit.sigma_known is False) for fit in fits])
     count = sum(item.count for item in problems[0].measurements)
     return ModelComparison(labels, count, unknowns, likelihoods, tuple(fits))
 

@@ -59,31 +59,13 @@ from switchfit.uncertainty.residuals import (
     diagnose_runs,
     explain_all,
     explain_channel,
+    list_channels,
     measure_widening,
 )
 from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
 
 NEGLIGIBLE = 1e-10
 """Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
-
-
-class Whitened(NamedTuple):
-    """Residuals whose correlation was removed, in the units of the data, and what follows from them.
-
-    Attributes
-    ----------
-    residuals : list of lists of arrays, as the comparisons
-    chi_square : float
-    freedom : int
-        Its degrees of freedom.
-    covariance : (d, d)
-        Of theta of the other run.
-    """
-
-    residuals: list[list[FloatArray]]
-    chi_square: float
-    freedom: int
-    covariance: FloatArray
 
 
 def whiten_residuals(
@@ -94,11 +76,12 @@ def whiten_residuals(
     kept: Mapping[str, int],
     refit: Estimate | None,
     noise: float,
-) -> Whitened:
-    """Return the residuals with the correlation removed that the error of the parameters makes.
+) -> tuple[list[list[FloatArray]], float, int, FloatArray]:
+    """Return residuals without the correlation that the error of the parameters makes, and what follows from them.
 
-    Where the noise or the covariance of the fit is unknown, a loss is robust, or a delay is a parameter, the residuals
-    as they are, and NaN for chi-square and covariance.
+    They are in the units of the data, as the comparisons; then come chi-square, its degrees of freedom, and the
+    covariance of theta of the other run, (d, d). Where the noise or the covariance of the fit is unknown, a loss is
+    robust, or a delay is a parameter, the residuals as they are, and NaN for chi-square and covariance.
 
     Parameters
     ----------
@@ -129,7 +112,7 @@ def whiten_residuals(
     # Residuals over sigma are then no normal numbers, or their derivatives are not known. A sigma may be a parameter.
     robust = any(item.loss != "linear" for item in problem.measurements) or problem.estimates_delays
     if robust or problem.is_sigma_known is None or not (np.isfinite(C).all() and np.isfinite(noise)):
-        return Whitened(found, np.nan, freedom, np.full((d, d), np.nan))
+        return found, np.nan, freedom, np.full((d, d), np.nan)
     samples = collect_sample_derivatives(problem, sensitivities)
     X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
     if refit is not None and refit.priors:
@@ -149,7 +132,7 @@ def whiten_residuals(
         if np.isfinite(exact).all():
             alone = np.zeros((d, d))
             alone[np.ix_(where, where)] = exact
-    return Whitened(found, float(z @ z), freedom, follow @ follow.T + alone)
+    return found, float(z @ z), freedom, follow @ follow.T + alone
 
 
 def _remove_error(
@@ -331,14 +314,8 @@ class Validation(Displayed):
     @property
     def channels(self) -> dict[str, float]:
         """Fit in per cent of each channel, by its name, and that of its run if there are several."""
-        single, found = len(self.comparisons) == 1, {}
-        for run, comparisons in zip(self.run_names, self.comparisons, strict=True):
-            for comparison in comparisons:
-                for k, name in enumerate(comparison.names):
-                    if np.isfinite(comparison.measured[:, k]).any():
-                        label = name if single else f"{run} {name}"
-                        found[label] = convert_to_percent(explain_channel(comparison, k))
-        return found
+        channels = list_channels(self.comparisons, self.run_names)
+        return {label: convert_to_percent(explain_channel(comparison, k)) for label, _, comparison, k in channels}
 
     @property
     def standard_errors(self) -> FloatArray:
@@ -483,9 +460,10 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
     noise = _choose_noise(estimate, problem)
     whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, found, noise)
+    residuals, chi_square, freedom, covariance = whitened
     judged = [
         [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
-        for run, shown in zip(comparisons, whitened.residuals, strict=True)
+        for run, shown in zip(comparisons, residuals, strict=True)
     ]
     diagnostics = diagnose_runs(judged, problem.run_names, trajectories)
     return Validation(
@@ -494,13 +472,13 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
         theta_names=problem.theta_names,
         theta=theta,
         kept=tuple(kept),
-        covariance=whitened.covariance,
+        covariance=covariance,
         refit=found,
         run_names=problem.run_names,
         trajectories=trajectories,
         comparisons=comparisons,
-        chi_square=whitened.chi_square,
-        freedom=whitened.freedom,
+        chi_square=chi_square,
+        freedom=freedom,
         sigma_known=problem.is_sigma_known,
         residual_variance=noise**2,
         residuals=diagnostics,

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,8 +28,8 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
 from switchfit.fit.faults import refuse_hidden_switches
-from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum, free_curvature
-from switchfit.fit.trajectory import compare
+from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum
+from switchfit.fit.trajectory import compare, replace_values
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.inspection import find_unread
@@ -50,39 +50,6 @@ twice too long for Omega, which then grows without bound (LuGre friction: a gap 
 """
 
 
-class TaylorTable(NamedTuple):
-    """Remainders of J along a direction: steps (S,), remainders (S, 3), observed orders (S - 1, 3), and theta (d,)."""
-
-    steps: FloatArray
-    remainders: FloatArray
-    orders: FloatArray
-    theta: FloatArray
-
-
-def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
-    """Return remainders of J with its gradient and Hessian along a random direction, near theta but off the nodes."""
-    at = _move_off_nodes(evaluator, theta)
-    base = evaluator(at)
-    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
-    largest = _find_room(evaluator, at, direction)
-    steps: FloatArray = largest * 0.5 ** np.arange(8.0)
-    remainders = np.array([_compute_remainders(evaluator, base, at, h, direction) for h in steps])
-    rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
-    return TaylorTable(steps, remainders, orders, at)
-
-
-def estimate_orders(orders: FloatArray) -> tuple[float, ...]:
-    """Return the median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
-    return tuple(_take_median(orders[:, k]) for k in range(3))
-
-
-def are_orders_right(observed: tuple[float, ...]) -> bool:
-    """Return whether the orders are at least 1, 2, 3 within 0.25, or not observable because of rounding."""
-    return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
-
-
 @dataclass(frozen=True, eq=False)
 class DerivativeCheck(Printed):
     """Taylor table and gaps between the methods; print it.
@@ -95,16 +62,16 @@ class DerivativeCheck(Printed):
         ``|J(theta + h v) - J|``, the same minus ``h g.v``, and the same minus ``h^2/2 v'Hv``.
     orders : (S - 1, 3) array
         Observed orders in h, which are 1, 2 and 3 if J, g and H are right; NaN where a remainder is rounding.
+    theta : (d,) array
+    stiff : bool
+        With the stiff solver, the gaps are reported but do not count: the paper's adjoints have boundary layers of
+        their own at transitions and samples, which a mesh refined for the state does not resolve.
     gradient_gap, hessian_gap : float
         Relative gap between the paper's equations (6)-(17) and the discretized cost's exact derivatives; infinite if
         the paper's equations overflow, NaN if not checked.
     gradient_gap_halved, hessian_gap_halved : float
         The same with every step halved: smaller by ``2**order`` of the integrator, down to rounding. A large gap that
         closes here was integration error of the paper's adjoints, not a wrong derivative.
-    theta : (d,) array
-    stiff : bool
-        With the stiff solver, the gaps are reported but do not count: the paper's adjoints have boundary layers of
-        their own at transitions and samples, which a mesh refined for the state does not resolve.
 
     See Also
     --------
@@ -126,12 +93,12 @@ class DerivativeCheck(Printed):
     steps: FloatArray
     remainders: FloatArray
     orders: FloatArray
-    gradient_gap: float
-    hessian_gap: float
-    gradient_gap_halved: float
-    hessian_gap_halved: float
     theta: FloatArray
     stiff: bool
+    gradient_gap: float = np.nan
+    hessian_gap: float = np.nan
+    gradient_gap_halved: float = np.nan
+    hessian_gap_halved: float = np.nan
 
     def __repr__(self) -> str:
         orders = ", ".join(f"{order:.2f}" for order in self.observed_orders)
@@ -140,7 +107,8 @@ class DerivativeCheck(Printed):
     @property
     def observed_orders(self) -> tuple[float, ...]:
         """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
-        return estimate_orders(self.orders)
+        finite = [order[np.isfinite(order)] for order in self.orders.T]
+        return tuple(float(np.median(each)) if len(each) else np.nan for each in finite)
 
     @property
     def passed(self) -> bool:
@@ -214,15 +182,38 @@ def check_derivatives(
     at = problem.check_theta(theta)
     # The mesh of the first guess may be far too coarse elsewhere, and integration error would look like wrong adjoints.
     evaluator = evaluator_of(problem) if theta is None else Evaluator(problem, at)
-    table = build_taylor_table(evaluator, at, seed=seed)
-    at = table.theta
-    gaps = halved = np.nan, np.nan
-    if as_flag(paper, "paper"):
-        fine = evaluator.halved
-        gaps, halved = measure_derivative_gap(evaluator.pad_like(fine), at), measure_derivative_gap(fine, at)
-    return DerivativeCheck(
-        table.steps, table.remainders, table.orders, *gaps, *halved, at, evaluator.takes_implicit_steps
+    found = build_taylor_table(evaluator, at, seed=seed)
+    if not as_flag(paper, "paper"):
+        return found
+    fine = evaluator.halved
+    gaps = (measure_derivative_gap(each, found.theta) for each in (evaluator.pad_like(fine), fine))
+    (gradient, hessian), (gradient_halved, hessian_halved) = gaps
+    return replace(
+        found,
+        gradient_gap=gradient,
+        hessian_gap=hessian,
+        gradient_gap_halved=gradient_halved,
+        hessian_gap_halved=hessian_halved,
     )
+
+
+def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> DerivativeCheck:
+    """Return remainders of J with its gradient and Hessian along a random direction, near theta but off the nodes."""
+    at = _move_off_nodes(evaluator, theta)
+    base = evaluator(at)
+    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
+    largest = _find_room(evaluator, at, direction)
+    steps: FloatArray = largest * 0.5 ** np.arange(8.0)
+    remainders = np.array([_compute_remainders(evaluator, base, at, h, direction) for h in steps])
+    rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
+    return DerivativeCheck(steps, remainders, orders, at, evaluator.takes_implicit_steps)
+
+
+def are_orders_right(observed: tuple[float, ...]) -> bool:
+    """Return whether the orders are at least 1, 2, 3 within 0.25, or not observable because of rounding."""
+    return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
 
 
 def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
@@ -311,11 +302,6 @@ def _compute_remainders(
     first = zeroth - h * base.gradient @ direction
     second = first - 0.5 * h**2 * direction @ base.hessian @ direction
     return abs(zeroth), abs(float(first)), abs(float(second))
-
-
-def _take_median(orders: FloatArray) -> float:
-    finite = orders[np.isfinite(orders)]
-    return float(np.median(finite)) if len(finite) else np.nan
 
 
 WEAK = 0.05
@@ -547,7 +533,9 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     meaning: Meaning
     base = np.nan
     if all(isinstance(item, Measurements) for item in items):
-        clean = _drop_noise(problem, own)
+        comparisons = compare(problem, theta, own.simulate(theta))[1]
+        fitted = {(e, k): found.fitted for e, run in enumerate(comparisons) for k, found in enumerate(run)}
+        clean = replace_values(problem, fitted)
         evaluator = Evaluator(clean, meshes=own.meshes)
         # If sigma is a parameter, J has no minimum without noise; its expected Hessian is the Gauss-Newton matrix.
         hessian = evaluator(theta, matrix="exact" if problem.is_least_squares else "gauss-newton").hessian
@@ -563,20 +551,6 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     subject = unknowns.names, unknowns.units, unknowns.is_time
     about = Identifiability(*subject, rise, meaning, "first guess", base, **find_unread(problem)._asdict())
     return analyse(about, hessian, np.eye(len(theta)), theta, _limit_cost(evaluator, theta))
-
-
-def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
-    """Return the problem with measured values replaced by those simulated at its first guess; missing ones stay so."""
-    theta = problem.initial_theta
-    comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
-    experiments = []
-    for experiment, found in zip(problem.experiments, comparisons, strict=True):
-        data = [
-            replace(item, values=np.where(np.isnan(item.values), np.nan, comparison.fitted))
-            for item, comparison in zip(experiment.data, found, strict=True)
-        ]
-        experiments.append(replace(experiment, data=data))
-    return replace(problem, experiments=experiments)
 
 
 def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Callable[[FloatArray], float]:
@@ -772,18 +746,18 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     -------
     Certificate
     """
-    found = analyse_solution(fit, None)
-    scaled = found.eigenvalues
+    found, Z = analyse_solution(fit, None), fit.free_basis
+    scaled, is_known = found.eigenvalues, Z.shape[1] > 0 and np.isfinite(fit.hessian).all()
     gaps = (np.nan, np.nan)
     orders: tuple[float, ...] = (np.nan,) * 3
     if evaluator is not None:
         gaps = measure_closing_gap(evaluator, fit.theta)
-        orders = estimate_orders(build_taylor_table(evaluator, fit.theta).orders)
+        orders = build_taylor_table(evaluator, fit.theta).observed_orders
     stiff = evaluator is not None and evaluator.takes_implicit_steps
     smallest = float(scaled[0]) if len(scaled) else np.nan
     return Certificate(
         optimality=fit.optimality,
-        smallest_eigenvalue=free_curvature(fit).smallest,
+        smallest_eigenvalue=float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0]) if is_known else np.nan,
         smallest_scaled_eigenvalue=smallest,
         condition_number=found.condition_number if len(scaled) else np.inf,
         worst_unknowns=found.directions[0].names if found.directions else (),

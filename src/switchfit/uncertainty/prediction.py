@@ -137,18 +137,7 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
     """
     run = runs_of(problem)[e]
     engine = engine_of(run, run.build_arguments(mesh), mesh)
-    return build_sensitivity(problem, e, engine.simulate(*run.vectors(theta), tangents=True))
-
-
-def build_sensitivity(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:
-    """Return the sensitivity of experiment e from a simulation with derivatives.
-
-    Parameters
-    ----------
-    problem : Problem
-    e : int, from 0
-    simulation : Simulation
-    """
+    simulation = engine.simulate(*run.vectors(theta), tangents=True)
     return Sensitivity(simulation, problem.places[e], len(problem.theta_names))
 
 
@@ -181,9 +170,9 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     Parameters
     ----------
     problem : Problem
+        With Measurements.
     sensitivities : sequence of Sensitivity, one per experiment
     """
-    d = len(problem.theta_names)
     columns: list[tuple[NDArray[Any], ...]] = []
     for e, (experiment, found) in enumerate(zip(problem.experiments, sensitivities, strict=True)):
         first = sum(q for _, q in problem.structures[e].references)
@@ -206,9 +195,6 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
                 )
             )
             first += q
-    if not columns:
-        none = np.zeros(0, dtype=np.intp)
-        return SampleDerivatives(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, d)))
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 

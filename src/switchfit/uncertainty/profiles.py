@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -50,13 +50,18 @@ from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_flag, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.residuals import measure_widening
-from switchfit.uncertainty.walks import Derivatives, eliminate_others, find_first_root, list_sample_times
+from switchfit.uncertainty.walks import (
+    Derivatives,
+    eliminate_others,
+    find_first_root,
+    list_sample_times,
+    list_transitions,
+)
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
 STEPS = 5
@@ -631,27 +636,22 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     check_has_profile(fit)
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
-    times = _list_kinks(evaluator.problem, fit.theta, index)
-    report, end = show_progress(callback, f"Profile of {name}")
+    runs = [e for e, place in list_transitions(evaluator.problem) if place == index]  # that of a transition time
+    times = list_sample_times(evaluator.problem, fit.theta, runs[0]) if runs else np.zeros(0)
     trace = Trace(fit, evaluator, index)
-    try:
-        trace.should_stop = partial(_wrap_callback, report, trace)
-        for side in (-1, 1):
-            trace.march(side, threshold)
-        trace.add_kinks(times, threshold)
-        trace.find_regions(threshold)  # its points too are there from now on: tables, figure and repr agree
-    except KeyboardInterrupt:
-        trace.interrupted = True
-    finally:
-        end()
-        trace.should_stop = lambda: False
+    with show_progress(callback, f"Profile of {name}") as report:
+        # Of as many fits as a profile usually takes.
+        trace.should_stop = lambda: bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
+        try:
+            for side in (-1, 1):
+                trace.march(side, threshold)
+            trace.add_kinks(times, threshold)
+            trace.find_regions(threshold)  # its points too are there from now on: tables, figure and repr agree
+        except KeyboardInterrupt:
+            trace.interrupted = True
+    trace.should_stop = lambda: False
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
-
-
-def _wrap_callback(report: Progress, trace: Trace) -> bool:
-    """Report how many fits are done, of as many as a profile usually takes; return whether to stop."""
-    return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
 
 
 def check_has_profile(fit: Fit) -> None:
@@ -669,11 +669,3 @@ def check_has_profile(fit: Fit) -> None:
         raise ValueError(
             f"sigma is unknown and {fit.samples} values are too few to estimate it along with the unknowns."
         )
-
-
-def _list_kinks(problem: Problem, theta: FloatArray, index: int) -> FloatArray:
-    """Return the sample times of the run of which this unknown is a transition time; empty for a parameter."""
-    for e, where in enumerate(problem.unknowns.times):
-        if index in where:
-            return list_sample_times(problem, theta, e)
-    return np.zeros(0)

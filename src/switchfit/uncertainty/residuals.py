@@ -32,7 +32,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -252,16 +252,30 @@ def diagnose_runs(
         Number of unknowns that were fitted, for each sample; 0 for residuals of a prediction.
     """
     channels, labels = [], []
+    for label, e, comparison, k in list_channels(runs, names):
+        if comparison.kind == "measurements":
+            run = trajectories[e]
+            channels.append(diagnose_channel(comparison, k, e, run.time_unit, run.origin, unknowns=unknowns))
+            labels.append(label)
+    return ResidualDiagnostics(tuple(channels), tuple(labels))
+
+
+def list_channels(
+    runs: Sequence[Sequence[Comparison]], names: Sequence[str]
+) -> Iterator[tuple[str, int, Comparison, int]]:
+    """Yield the label of each channel with values, its experiment, and its comparison with its place there.
+
+    Parameters
+    ----------
+    runs : sequence of sequences of Comparison, one for each experiment
+    names : sequence of str, one for each experiment
+        Part of the labels if there are several.
+    """
     for e, comparisons in enumerate(runs):
         for comparison in comparisons:
-            if comparison.kind != "measurements":
-                continue
-            run = trajectories[e]
             for k, name in enumerate(comparison.names):
-                if np.isfinite(comparison.measured[:, k]).sum() > 0:
-                    channels.append(diagnose_channel(comparison, k, e, run.time_unit, run.origin, unknowns=unknowns))
-                    labels.append(name if len(runs) == 1 else f"{names[e]} {name}")
-    return ResidualDiagnostics(tuple(channels), tuple(labels))
+                if np.isfinite(comparison.measured[:, k]).any():
+                    yield name if len(runs) == 1 else f"{names[e]} {name}", e, comparison, k
 
 
 def correct_errors(fit: Fit) -> FloatArray:
@@ -544,34 +558,30 @@ def measure_quality(fit: Fit) -> Quality:
     fit : Fit
     """
     diagnosed = iter(diagnose(fit).channels)
-    single, is_given = len(fit.comparisons) == 1, fit.sigma_known is True
+    is_given = fit.sigma_known is True
     channels: list[ChannelQuality] = []
-    for e, run in enumerate(fit.comparisons):
-        for comparison in run:
-            for k, name in enumerate(comparison.names):
-                if not np.isfinite(comparison.measured[:, k]).any():
-                    continue
-                residuals = next(diagnosed) if comparison.kind == "measurements" else None
-                squares, spread, _ = _sum_squares(comparison, k)
-                if not np.isfinite(squares):
-                    continue
-                explained = 1 - squares / spread if spread > 0 else np.nan
-                tests = {}
-                if residuals is not None and not 1 - explained < NO_RESIDUALS:
-                    tests = _test_residuals(comparison, k, residuals, is_given)
-                channels.append(
-                    ChannelQuality(
-                        label=name if single else f"{fit.run_names[e]} {name}",
-                        experiment=e,
-                        kind=comparison.kind,
-                        count=int(np.isfinite(comparison.measured[:, k]).sum()),
-                        explained=explained,
-                        chi_square=_compute_chi_square(comparison, k),
-                        tests=tests,
-                        size=residuals.rms if is_given and residuals is not None else 1.0,
-                        widening=1.0 if residuals is None else residuals.widening,
-                    )
-                )
+    for label, e, comparison, k in list_channels(fit.comparisons, fit.run_names):
+        residuals = next(diagnosed) if comparison.kind == "measurements" else None
+        squares, spread, _ = _sum_squares(comparison, k)
+        if not np.isfinite(squares):
+            continue
+        explained = 1 - squares / spread if spread > 0 else np.nan
+        tests = {}
+        if residuals is not None and not 1 - explained < NO_RESIDUALS:
+            tests = _test_residuals(comparison, k, residuals, is_given)
+        channels.append(
+            ChannelQuality(
+                label=label,
+                experiment=e,
+                kind=comparison.kind,
+                count=int(np.isfinite(comparison.measured[:, k]).sum()),
+                explained=explained,
+                chi_square=_compute_chi_square(comparison, k),
+                tests=tests,
+                size=residuals.rms if is_given and residuals is not None else 1.0,
+                widening=1.0 if residuals is None else residuals.widening,
+            )
+        )
     chi_square, known = np.nan, False
     found = [len(channels) * channel.probability for channel in channels if channel.tests]
     if is_given and np.isfinite(fit.residual_variance):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.fit.result import Fit, disagreement, free_curvature, list_without_effect
+from switchfit.fit.result import NAMED, Fit, disagreement, list_without_effect
 from switchfit.optimize import Status
 from switchfit.problem.inspection import name_whole_parameters
 from switchfit.runtime import special
@@ -32,7 +32,7 @@ from switchfit.uncertainty.answers import (
     Numbers,
     find_doubts,
 )
-from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate, certify
+from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate, analyse_solution, certify
 from switchfit.uncertainty.residuals import Quality, diagnose, measure_quality
 
 UNSEEN = 100.0
@@ -117,9 +117,19 @@ def find_without_effect(fit: Fit) -> Iterator[Issue]:
 
 def _find_undetermined(fit: Fit) -> Iterator[Issue]:
     """Find a direction along which the cost hardly changes, of the unknowns on which it depends."""
-    curvature = free_curvature(fit, list_without_effect(fit))
-    if len(curvature.scaled) and abs(smallest := float(curvature.scaled[0])) < BARELY_DETERMINED:
-        yield Issue("hardly determined", curvature.weakest, {"eigenvalue": smallest})
+    smallest, names = _find_weakest(fit)
+    if abs(smallest) < BARELY_DETERMINED:
+        yield Issue("hardly determined", names, {"eigenvalue": smallest})
+
+
+def _find_weakest(fit: Fit) -> tuple[float, tuple[str, ...]]:
+    """Return the smallest eigenvalue of the scaled Hessian of the free unknowns with an effect, infinite if there are
+    none, and the unknowns with the largest components in its direction.
+    """
+    found = analyse_solution(fit, None)
+    if flat := tuple(name for name in found.without if name not in list_without_effect(fit)):  # transition times
+        return 0.0, flat[:NAMED]
+    return (float(found.eigenvalues[0]), found.directions[0].names[:NAMED]) if found.directions else (np.inf, ())
 
 
 def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
@@ -138,9 +148,8 @@ def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
     elif fit.sigma_known is False and fit.samples <= k:
         yield Issue("no errors: too few samples", figures={"samples": float(fit.samples), "unknowns": float(k)})
     else:
-        smallest = float(np.min(free_curvature(fit, without).scaled, initial=np.inf))
         names = () if missing.all() else tuple(np.array(fit.theta_names, dtype=object)[missing].tolist())
-        yield Issue("no errors: not positive definite", names, {"eigenvalue": smallest})
+        yield Issue("no errors: not positive definite", names, {"eigenvalue": _find_weakest(fit)[0]})
 
 
 def _check_noise(fit: Fit) -> Iterator[Issue]:
@@ -281,13 +290,12 @@ def _list_numbers(fit: Fit, quality: Quality | None) -> Numbers:
     ended = Numbers(np.array([fit.status.successful]), fit.integration_error, lower, tried, agreeing)
     if quality is None:
         return ended
-    without = list_without_effect(fit)
-    is_flat = fit.status is Status.SINGULAR and not without
+    is_flat = fit.status is Status.SINGULAR and not list_without_effect(fit)
     found = replace(
         ended,
         collapsed=fit.status is Status.COLLAPSED or any(c.position is not None for c in fit.active),
         at_bounds=len(list_held(fit)) if any(fit.comparisons) else 0,
-        smallest=0.0 if is_flat else min(free_curvature(fit, without).scaled, default=np.inf),
+        smallest=0.0 if is_flat else _find_weakest(fit)[0],
     )
     if not quality.channels:
         return found
@@ -361,9 +369,8 @@ def _explain(fit: Fit, quality: Quality | None, doubt: Doubt) -> Iterator[Findin
     elif kind == "at bounds":
         yield Finding(level, Issue(kind, list_held(fit)), ("move the bound",))
     elif kind == "not determined":
-        curvature = free_curvature(fit, list_without_effect(fit))
-        weakest = curvature.weakest or tuple(name for name, _ in fit.flat_direction)
-        smallest = float(curvature.scaled[0]) if len(curvature.scaled) else np.inf
+        smallest, names = _find_weakest(fit)
+        weakest = names or tuple(name for name, _ in fit.flat_direction)
         yield Finding(level, Issue(kind, weakest, {"eigenvalue": smallest}), (FIX,))
     elif kind == "integration error":
         reason = Issue(kind, (fit.integration_error_of,), {"error": fit.integration_error})

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, TimeProfile
+from switchfit.fit.result import Fit
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 
@@ -375,31 +375,40 @@ HIGHEST_LEVEL = 0.99
 """Pieces are traced up to the end of an interval of this level, whatever lower level is asked for."""
 
 
-def replace_intervals(fit: Fit, intervals: FloatArray, level: float, profiles: Sequence[TimeProfile]) -> FloatArray:
-    """Return intervals (d, 2) with those of transition times that have pieces from these.
+def replace_intervals(
+    intervals: FloatArray, pieces: FloatArray, places: NDArray[np.intp], thresholds: FloatArray
+) -> FloatArray:
+    """Return intervals (..., d, 2) with those of transition times with samples near, or at a kink, from their pieces.
 
     Parameters
     ----------
-    fit : Fit
-    intervals : (d, 2)
-    level : float
-    profiles : sequence of TimeProfile
+    intervals : (..., d, 2)
+        From one parabola each; NaN at a kink.
+    pieces : (..., T, 2, P, 5)
+        To both sides, NaN after the last.
+    places : (T,) int
+        Where in theta they stand.
+    thresholds : (...)
+        By how much J may exceed its minimum.
     """
-    found, threshold = intervals.copy(), _compute_threshold(fit, level)
-    if threshold is not None:
-        for profile in profiles:
-            k = fit.theta_names.index(profile.unknown)
-            found[k, 0] = find_ends(profile.below, np.array(threshold), -1)
-            found[k, 1] = find_ends(profile.above, np.array(threshold), 1)
+    found = intervals.copy()
+    if not len(places):
+        return found
+    replaced = ~np.isnan(pieces[..., 0, 0, 0])
+    for end, side in enumerate((-1, 1)):
+        ends = find_ends(pieces[..., end, :, :], thresholds[..., None], side)
+        found[..., places, end] = np.where(replaced, ends, found[..., places, end])
     return found
 
 
 def trace_profiles(
     fit: Fit, problem: Problem, evaluator: Evaluator, level: float = HIGHEST_LEVEL
-) -> tuple[TimeProfile, ...]:
-    """Return the profiles of transition times with samples near, or at a kink, up to the ends of intervals of a level.
+) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Return the pieces of the profiles of transition times with samples near, or at a kink: (T, 2, P, 5); and where in
+    theta these times stand: (T,).
 
-    None of a model with thin layers, whose J is rough on one mesh: the mesh would have to be made anew at every step.
+    They go up to the ends of intervals of a level. A model with thin layers has none, as its J is rough on one mesh:
+    the mesh would have to be made anew at every step.
 
     Parameters
     ----------
@@ -408,22 +417,23 @@ def trace_profiles(
     evaluator : Evaluator
     level : float
     """
-    highest = _compute_threshold(fit, max(level, HIGHEST_LEVEL))
-    if highest is None or fit.constraints or len(problem.experiments) > MOST_RUNS:
-        return ()
+    nothing = fit.saved_pieces[:0], fit.saved_piece_places[:0]
+    highest = compute_threshold(fit, max(level, HIGHEST_LEVEL))
+    if np.isnan(highest) or fit.constraints or len(problem.experiments) > MOST_RUNS:
+        return nothing
     if any(mesh.has_layers for mesh in evaluator.meshes):
-        return ()
+        return nothing
     movable, kinks = _find_movable(fit), {kink.unknown for kink in fit.kinks}
-    at, names = fit.theta[None], []
+    at, places = fit.theta[None], []
     ways: list[Walks] = []
     for e, k in list_transitions(problem):
         samples = Samples.of(problem, at, e)
         near = is_any_near(samples, at[:, k], fit.standard_errors[k : k + 1])[0]
         if fit.theta_names[k] in kinks or (movable[k] and near):
             ways.append(list_walks(problem, e, k, at, movable[None], np.array([highest]), samples, MOST_PIECES))
-            names.append(fit.theta_names[k])
+            places.append(k)
     if not ways:
-        return ()
+        return nothing
     walks, follower = join_walks(ways), Follower(evaluator.halved)  # its meshes suit the estimate alone
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
@@ -433,19 +443,20 @@ def trace_profiles(
     count = len(walks.place)
     start = Derivatives(*(np.array([each] * count) for each in (fit.cost, fit.gradient, fit.hessian)))
     smooth = np.zeros(count, dtype=bool)
-    pieces = trace_walks(walks, start, smooth, evaluate, MOST_PIECES + MOST_HALVINGS + 1)
-    sides = [found[~np.isnan(found[:, 0])] for found in pieces]
-    profiles = [TimeProfile(name, *sides[2 * i : 2 * i + 2]) for i, name in enumerate(names)]
-    return tuple(profile for profile in profiles if len(profile.below) and len(profile.above))
+    most = MOST_PIECES + MOST_HALVINGS + 1
+    pieces = trace_walks(walks, start, smooth, evaluate, most).reshape(-1, 2, most, PIECE)
+    known = ~np.isnan(pieces[..., 0])
+    complete = known[:, :, 0].all(axis=1)
+    return pieces[complete, :, : int(known.sum(axis=2).max())], np.array(places)[complete]
 
 
-def _compute_threshold(fit: Fit, level: float) -> float | None:
+def compute_threshold(fit: Fit, level: float) -> float:
     """Return by how much J may exceed its minimum: half the squared quantile, times the residual variance.
 
-    None for a fit without a noise model, or one that did not converge.
+    NaN for a fit without a noise model, or one that did not converge.
     """
     if fit.sigma_known is None or not fit.status.successful:
-        return None
+        return np.nan
     scale = 1.0 if fit.sigma_known else 2.0 * fit.cost / max(fit.freedom, 1)
     return 0.5 * fit.quantile(level) ** 2 * scale
 
