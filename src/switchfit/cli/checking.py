@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,36 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.terminal import (
-    NOT_CONVERGED,
-    Debug,
-    FigureFormat,
-    Json,
-    ProblemPath,
-    Quiet,
-    Verbose,
-    fail,
-    fail_for_refused,
-    is_verbose,
-    load,
-    make_folder,
-    option,
-    output_folder,
-    print_json,
-    print_list,
-    print_note,
-    print_text,
-    report_errors,
-    write_figure,
-    write_file,
-)
+from switchfit.cli.terminal import option, output_folder
 
 if TYPE_CHECKING:
     from switchfit.fit.trajectory import Trajectory
 
 
 def check(
-    problem: ProblemPath,
+    problem: terminal.ProblemPath,
     no_run: Annotated[
         bool, typer.Option("--no-run", help="Read the problem file and its data; run no Python file that it names.")
     ] = False,
@@ -49,10 +26,10 @@ def check(
         bool,
         typer.Option("--full", help="List all runs and unknowns, and compare with the paper's equations too: seconds."),
     ] = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    debug: Debug = False,
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    verbose: terminal.Verbose = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Check a problem without fitting it.
 
@@ -61,31 +38,35 @@ def check(
 
     Exit code 0: the derivatives are right. 1: they are not. 2: the input is wrong.
     """
-    with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
         if no_run:
             _check_files(problem, full)
             return
-        loaded = load(problem)
+        from switchfit.io.problem_file import load_problem
+
+        loaded = load_problem(problem)
         import switchfit as sf
         from switchfit.fit.evaluator import evaluator_of
         from switchfit.io.command_line import describe, describe_steps, summarize_check
         from switchfit.report.uncertainty import write_orders
 
-        print_text(f"{describe(loaded.problem, full=full)}\n")
-        print_list("Logs", loaded.issues)
-        print_text(f"{describe_steps(loaded.problem, full=full)}\n")
+        terminal.print_text(f"{describe(loaded.problem, full=full)}\n")
+        terminal.print_list("Logs", loaded.issues)
+        terminal.print_text(f"{describe_steps(loaded.problem, full=full)}\n")
         evaluator = evaluator_of(loaded.problem)
-        if is_verbose():
-            print_note(evaluator.engine)
+        if terminal.is_verbose():
+            terminal.print_note(evaluator.engine)
         derivatives = sf.check_derivatives(loaded.problem, paper=full)
         short = f"Derivatives of J along a random direction\n  {write_orders(derivatives)}"
-        print_text(f"{derivatives if full else short}\n")
+        terminal.print_text(f"{derivatives if full else short}\n")
         found = sf.identifiability(loaded.problem)
-        print_text(found)
-        print_json(summarize_check(evaluator, derivatives, found) | {"issues": [str(issue) for issue in loaded.issues]})
-        fail_for_refused(loaded.issues)
+        terminal.print_text(found)
+        terminal.print_json(
+            summarize_check(evaluator, derivatives, found) | {"issues": [str(issue) for issue in loaded.issues]}
+        )
+        terminal.fail_for_refused(loaded.issues)
         if not derivatives.passed:
-            raise typer.Exit(NOT_CONVERGED)
+            raise typer.Exit(terminal.NOT_CONVERGED)
 
 
 def _check_files(problem: Path, full: bool) -> None:
@@ -96,12 +77,12 @@ def _check_files(problem: Path, full: bool) -> None:
     from switchfit.io.command_line import describe_experiments
 
     if runs.experiments:
-        print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
-        print_list("Logs", runs.issues)
-    print_text("No Python file was run: modes, states, functions and names of parameters are not checked.")
+        terminal.print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
+        terminal.print_list("Logs", runs.issues)
+    terminal.print_text("No Python file was run: modes, states, functions and names of parameters are not checked.")
     names = [run.name for run in runs.experiments]
-    print_json({"runs": names, "issues": [str(issue) for issue in runs.issues]})
-    fail_for_refused(runs.issues)
+    terminal.print_json({"runs": names, "issues": [str(issue) for issue in runs.issues]})
+    terminal.fail_for_refused(runs.issues)
 
 
 OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
@@ -116,12 +97,12 @@ Times = Annotated[
 
 
 def simulate(
-    problem: ProblemPath,
+    problem: terminal.ProblemPath,
     out: OutputFile = None,
     times: Times = "",
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Integrate the model at the first guess.
 
@@ -130,21 +111,23 @@ def simulate(
     the experiment.
     """
     if out is None and not json:
-        fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
-    with report_errors(debug, json=json, quiet=quiet):
-        loaded = load(problem)
+        terminal.fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
+    with terminal.report_errors(debug, json=json, quiet=quiet):
+        from switchfit.io.problem_file import load_problem
+
+        loaded = load_problem(problem)
         import switchfit as sf
         from switchfit.io.command_line import choose_times, tabulate_trajectory
 
         given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
         runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
         names = loaded.problem.run_names
-        print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
+        terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
         if out is None:
             return
         table = _write_table(names, runs)
-        make_folder(out.parent)
-        write_file(out, table)
+        terminal.make_folder(out.parent)
+        terminal.write_file(out, table)
 
 
 def _write_table(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
@@ -187,7 +170,7 @@ Seed = Annotated[int | None, option(metavar="NUMBER", help="Of these. Default: 0
 
 
 def design(
-    problem: ProblemPath,
+    problem: terminal.ProblemPath,
     out: OutputFolder = None,
     criterion: Criterion = None,
     names: Names = None,
@@ -195,11 +178,11 @@ def design(
     sensors: Sensors = None,
     starts: Starts = None,
     seed: Seed = None,
-    figures: FigureFormat = "png",
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    debug: Debug = False,
+    figures: terminal.FigureFormat = "png",
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    verbose: terminal.Verbose = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Find the experiment that will determine unknowns best.
 
@@ -210,33 +193,32 @@ def design(
     Exit code 0: all unknowns that count can be estimated with the design. 1: some cannot. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        loaded = load(problem)
+        from switchfit.io.problem_file import load_problem
+
+        loaded = load_problem(problem)
         import switchfit as sf
         from switchfit.io.command_line import summarize_design
 
         terminal.make_folder(out)
-        print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
-        given: dict[str, Any] = {"criterion": criterion, "samples": samples, "sensors": sensors, "starts": starts}
-        given |= {"seed": seed, "names": None if names is None else [name.strip() for name in names.split(",")]}
+        terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
+        listed = None if names is None else [name.strip() for name in names.split(",")]
+        numbers = {"samples": samples, "sensors": sensors, "starts": starts, "seed": seed}
         table = loaded.contents.design
         settings = {} if table is None else table.model_dump(exclude_none=True)
-        plan = sf.design(loaded.problem, **settings | {key: value for key, value in given.items() if value is not None})
+        settings |= terminal.select_given(criterion=criterion, names=listed, **numbers)
+        plan = sf.design(loaded.problem, **settings)
         terminal.print_text(plan)
         terminal.print_json(summarize_design(plan) | {"out": out})
         if out is not None:
             _write(plan, out, figures)
-        fail_for_refused(loaded.issues)
+        terminal.fail_for_refused(loaded.issues)
         if lost := [name for name in plan.names if name in plan.undetermined]:
             terminal.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
 
 
 def _write(plan: Any, folder: Path, figures: str) -> None:
     """Write table, design and figure, and the input and the samples as CSV."""
-    os.environ.setdefault("MPLBACKEND", "Agg")
-    terminal.write_file(folder / "design.txt", f"{plan}\n")
-    with terminal.explain_write_errors(folder / "design.json") as path:
-        plan.save(path)
-    write_figure(plan, folder / f"design.{figures}")
+    terminal.write_result(plan, folder / "design", figures, saved=True)
     knots = plan.problem.experiments[plan.experiment].inputs
     if knots is not None:
         rows = zip(knots.times, *plan.inputs.values(), strict=True)

@@ -12,20 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.terminal import (
-    Debug,
-    FigureFormat,
-    Folder,
-    Json,
-    Quiet,
-    SavedPath,
-    argument,
-    fail_for_refused,
-    option,
-    output_folder,
-    print_list,
-    write_figure,
-)
+from switchfit.cli.terminal import argument, option, output_folder
 
 OtherRun = Annotated[
     Path,
@@ -37,14 +24,14 @@ ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comp
 
 
 def validate(
-    saved: SavedPath,
+    saved: terminal.SavedPath,
     other: OtherRun,
     out: ValidationFolder = None,
-    folder: Folder = None,
-    figures: FigureFormat = "png",
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
+    folder: terminal.Folder = None,
+    figures: terminal.FigureFormat = "png",
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Check whether the parameters of a fit hold for another run.
 
@@ -67,11 +54,11 @@ def validate(
         loaded = load_other_run(saved, given, other, folder)
         terminal.make_folder(out)
         changes = [] if given is None else list_changed_files(given, loaded, models_only=True)
-        print_list("Changed since", changes)
-        print_list("Logs", loaded.issues)
+        terminal.print_list("Changed since", changes)
+        terminal.print_list("Logs", loaded.issues)
         found = estimate.validate(loaded.problem)
         _show(found, summarize_validation(found) | {"changes": changes, "out": out}, out, "validation", figures)
-        fail_for_refused(loaded.issues)
+        terminal.fail_for_refused(loaded.issues)
         if found.verdict.level == "bad":
             terminal.end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
 
@@ -79,11 +66,11 @@ def validate(
 def compare(
     saved: SavedPaths,
     out: ComparisonFolder = None,
-    folder: Folder = None,
-    figures: FigureFormat = "png",
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
+    folder: terminal.Folder = None,
+    figures: terminal.FigureFormat = "png",
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Compare models that were fitted to the same data.
 
@@ -113,7 +100,7 @@ def compare(
             estimates.append(estimate)
             if estimate.provenance is not None:
                 changes += [f"{name}: {change}" for change in list_changed_files(estimate.provenance, loaded)]
-        print_list("Changed since", changes)
+        terminal.print_list("Changed since", changes)
         found = sf.compare(estimates, names=names)
         _show(found, summarize_comparison(found) | {"changes": changes, "out": out}, out, "comparison", figures)
         failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
@@ -127,19 +114,17 @@ def _show(found: Any, summary: dict[str, Any], folder: Path | None, name: str, f
     """Print a result, and write its text and its figure into a folder."""
     terminal.print_text(found)
     if folder is not None:
-        os.environ.setdefault("MPLBACKEND", "Agg")
-        terminal.write_file(folder / f"{name}.txt", f"{found}\n")
-        write_figure(found, folder / f"{name}.{figures}")
+        terminal.write_result(found, folder / name, figures)
         terminal.print_note(f"written to {folder}")
     terminal.print_json(summary)
 
 
 def rerun(
-    saved: SavedPath,
-    folder: Folder = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
+    saved: terminal.SavedPath,
+    folder: terminal.Folder = None,
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Fit again what a saved estimate was made from, and compare the answers.
 
@@ -155,7 +140,7 @@ def rerun(
         from switchfit.io.rerun import compare_fits, prepare_rerun
 
         prepared = prepare_rerun(saved, folder)
-        print_list("Changed since", prepared.changes)
+        terminal.print_list("Changed since", prepared.changes)
         estimate = estimate_problem(prepared.loaded, prepared.loaded.options, prepare_figures=False)
         answers = compare_fits(prepared, estimate)
         terminal.print_text(answers.text)
@@ -176,7 +161,7 @@ def paper(
     out: PaperFolder = Path("paper"),
     quick: Quick = False,
     only: Part = None,
-    debug: Debug = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Reproduce the paper's experiments and figures.
 
@@ -186,14 +171,12 @@ def paper(
     os.environ.setdefault("MPLBACKEND", "Agg")
     with terminal.report_errors(debug):
         from switchfit.paper import TABLE, run
-        from switchfit.runtime.errors import InputError
 
         terminal.make_folder(out)
         try:
-            run(out, quick=quick, only=only, say=terminal.print_note)
+            with terminal.explain_write_errors(out):
+                run(out, quick=quick, only=only, say=terminal.print_note)
         except KeyboardInterrupt:
             terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
-        except OSError as error:
-            raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
         terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
         terminal.print_note(f"written to {out}")

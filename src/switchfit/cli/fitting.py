@@ -12,19 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.terminal import (
-    Debug,
-    FigureFormat,
-    Json,
-    Quiet,
-    Verbose,
-    argument,
-    fail_for_refused,
-    load,
-    option,
-    output_folder,
-    write_figure,
-)
+from switchfit.cli.terminal import argument, option, output_folder
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
@@ -84,14 +72,14 @@ def fit(
     hessian: HessianKind = None,
     tolerance: Tolerance = None,
     max_iterations: MaxIterations = None,
-    figures: FigureFormat = "png",
+    figures: terminal.FigureFormat = "png",
     no_figures: NoFigures = False,
     certificate: WithCertificate = False,
     full: Full = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    debug: Debug = False,
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    verbose: terminal.Verbose = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Estimate transition times and parameters, and report.
 
@@ -105,14 +93,13 @@ def fit(
     folder stands for the logs in it. A log that cannot be used is reported, and the next one is fitted; the exit code
     is that of the worst.
     """
-    given = {
-        "strategy": strategy,
-        "time_budget": time_budget,
-        "hessian": hessian,
-        "tolerance": tolerance,
-        "max_iterations": max_iterations,
-    }
-    overrides = {key: value for key, value in given.items() if value is not None}
+    overrides = terminal.select_given(
+        strategy=strategy,
+        time_budget=time_budget,
+        hessian=hessian,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+    )
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
     if model is not None:
@@ -124,7 +111,9 @@ def fit(
     if len(problem) != 1 or table is not None:
         terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        loaded = load(problem[0])
+        from switchfit.io.problem_file import load_problem
+
+        loaded = load_problem(problem[0])
         terminal.make_folder(out)
         options = loaded.options | overrides
         estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
@@ -133,7 +122,7 @@ def fit(
         from switchfit.report.formats import add_dates
 
         terminal.print_json(summarize_estimate(estimate) | {"out": out})
-        fail_for_refused(loaded.issues)
+        terminal.fail_for_refused(loaded.issues)
         if not estimate.status.successful:
             terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
         if not estimate.success:
@@ -215,7 +204,7 @@ def write_estimate(
     with terminal.explain_write_errors(folder / "estimate.json") as path:
         _save(estimate, path, provenance, complete=output.certificate)
     if output.figures:
-        write_figure(estimate, folder / f"fit.{output.figures}")
+        terminal.write_figure(estimate, folder / f"fit.{output.figures}")
         _write_page(estimate, provenance, folder / "report.html")
     terminal.print_note(f"written to {folder}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,20 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.terminal import (
-    Debug,
-    FigureFormat,
-    Json,
-    ProblemPath,
-    Quiet,
-    Verbose,
-    fail_for_refused,
-    option,
-    output_folder,
-    print_list,
-    read_pairs,
-    write_figure,
-)
+from switchfit.cli.terminal import option, output_folder
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
@@ -62,7 +48,7 @@ Full = Annotated[bool, typer.Option("--full", help="Also print the report of the
 
 
 def modes(
-    problem: ProblemPath,
+    problem: terminal.ProblemPath,
     out: OutputFolder = None,
     max_switches: MaxSwitches = 8,
     criterion: Criterion = "bic",
@@ -73,12 +59,12 @@ def modes(
     first: FirstModes = None,
     last: LastModes = None,
     min_duration: MinDuration = None,
-    figures: FigureFormat = "png",
+    figures: terminal.FigureFormat = "png",
     full: Full = False,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    debug: Debug = False,
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    verbose: terminal.Verbose = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Find which modes were active, in which order, and when.
 
@@ -90,12 +76,8 @@ def modes(
     fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        given: dict[str, Any] = {
-            "library": _split(library),
-            "first": _split(first),
-            "last": _split(last),
-            "min_duration": None if min_duration is None else _read_duration(min_duration),
-        }
+        shortest = None if min_duration is None else _read_duration(min_duration)
+        given = {"library": _split(library), "first": _split(first), "last": _split(last), "min_duration": shortest}
         settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
         settings |= {"criterion": criterion, "switch_cost": switch_cost}
         from switchfit.io.problem_file import load_problem
@@ -104,9 +86,8 @@ def modes(
         from switchfit.io.command_line import summarize_modes
 
         terminal.make_folder(out)
-        print_list("Logs", loaded.issues)
-        chosen = loaded.library | {key: value for key, value in given.items() if value is not None}
-        search = _search(loaded, chosen | settings)
+        terminal.print_list("Logs", loaded.issues)
+        search = _search(loaded, loaded.library | terminal.select_given(**given) | settings)
         terminal.print_text(search)
         if full and search.best is not None:
             from switchfit.runtime.presentation import format_text
@@ -114,7 +95,7 @@ def modes(
             terminal.print_text(f"\n{format_text(search.best, full=True, files={})}")
         best = None if out is None else _write(search, loaded, out, figures)
         terminal.print_json(summarize_modes(search) | {"out": out, "problem_file": best})
-        fail_for_refused(loaded.issues)
+        terminal.fail_for_refused(loaded.issues)
         if search.status.name == "NO_SUCCESSION":
             terminal.fail(search.message)
         if search.status.name not in USABLE:
@@ -132,7 +113,7 @@ def _read_duration(given: str) -> float | dict[str, float]:
     """Return a number, or those in ``A=0.5,B=1``."""
     with suppress(ValueError):
         return float(given)
-    return dict(read_pairs(given, "--min-duration", "a number, or MODE=NUMBER,MODE=NUMBER", float))
+    return dict(terminal.read_pairs(given, "--min-duration", "a number, or MODE=NUMBER,MODE=NUMBER", float))
 
 
 def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
@@ -152,12 +133,7 @@ def _write(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path
     from switchfit.io.problem_file.fitted import write_fitted_problem
     from switchfit.runtime.errors import InputError
 
-    os.environ.setdefault("MPLBACKEND", "Agg")
-    terminal.write_file(folder / "modes.txt", f"{search}\n")
-    with terminal.explain_write_errors(folder / "modes.json") as path:
-        search.save(path)
-    if search.chosen:
-        write_figure(search, folder / f"modes.{figures}")
+    terminal.write_result(search, folder / "modes", figures if search.chosen else "", saved=True)
     best = None
     if search.best is not None:
         try:

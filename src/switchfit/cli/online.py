@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import signal
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,18 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.terminal import (
-    Debug,
-    FigureFormat,
-    ProblemPath,
-    Quiet,
-    Verbose,
-    fail_for_refused,
-    option,
-    output_folder,
-    read_pairs,
-    write_figure,
-)
+from switchfit.cli.terminal import option, output_folder
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
@@ -87,7 +75,7 @@ Live = Annotated[
 
 
 def online(
-    problem: ProblemPath,
+    problem: terminal.ProblemPath,
     replay: Replayed = None,
     stdin: Stdin = False,
     window: Window = None,
@@ -101,10 +89,10 @@ def online(
     journal: JournalFile = None,
     live: Live = None,
     out: Annotated[Path | None, output_folder("online.txt and online.png")] = None,
-    figures: FigureFormat = "png",
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    debug: Debug = False,
+    figures: terminal.FigureFormat = "png",
+    quiet: terminal.Quiet = False,
+    verbose: terminal.Verbose = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Estimate while the samples come in: which mode is it now, since when, with which parameters?
 
@@ -118,11 +106,7 @@ def online(
     with terminal.report_errors(debug, json=not quiet, quiet=quiet, verbose=verbose):
         if stdin and replay is not None:
             terminal.fail("--replay and --stdin contradict each other; give one of them.")
-        given: dict[str, Any] = {} if window is None else {"window": window}
-        if renews is not None:
-            given["renews"] = _read_renewed(renews)
-        if drift is not None:
-            given["drift"] = dict(read_pairs(drift, "--drift", "PARAMETER=NUMBER,PARAMETER=NUMBER", float))
+        given = terminal.select_given(window=window, renews=_read_renewed(renews), drift=_read_drift(drift))
         from switchfit.io.problem_file import load_problem
 
         loaded = load_problem(problem, replay, searched=True, streamed=stdin)
@@ -152,17 +136,25 @@ def online(
                 with contextlib.suppress(terminal.CtrlC):
                     terminal.print_note("the samples have ended; Ctrl-C ends the page")
                     page.wait()
-        fail_for_refused(loaded.issues)
+        terminal.fail_for_refused(loaded.issues)
         if course.refused:
             terminal.fail(f"{format_count(len(course.refused), 'line')} of stdin could not be used.")
         if estimator.now.status.name == "LOST":
             terminal.end_unreliable(f"{estimator.now.status.value}.")
 
 
-def _read_renewed(given: str) -> dict[str, list[str]]:
+def _read_drift(given: str | None) -> dict[str, float] | None:
+    """Return the numbers in ``mu=0.1,c=0.2``."""
+    form = "PARAMETER=NUMBER,PARAMETER=NUMBER"
+    return None if given is None else dict(terminal.read_pairs(given, "--drift", form, float))
+
+
+def _read_renewed(given: str | None) -> dict[str, list[str]] | None:
     """Return the parameters of each mode in ``slip=mu,slip=c``."""
+    if given is None:
+        return None
     found: dict[str, list[str]] = {}
-    for mode, name in read_pairs(given, "--renews", "MODE=PARAMETER,MODE=PARAMETER", str):
+    for mode, name in terminal.read_pairs(given, "--renews", "MODE=PARAMETER,MODE=PARAMETER", str):
         found.setdefault(mode, []).append(name)
     return found
 
@@ -299,7 +291,5 @@ def _serve(loaded: ProblemFile, port: int) -> LivePage:
 
 
 def _write(log: OnlineLog, folder: Path, figures: str) -> None:
-    os.environ.setdefault("MPLBACKEND", "Agg")
-    terminal.write_file(folder / "online.txt", f"{log}\n")
-    write_figure(log, folder / f"online.{figures}")
+    terminal.write_result(log, folder / "online", figures)
     terminal.print_note(f"written to {folder}")

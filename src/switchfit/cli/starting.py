@@ -7,7 +7,8 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-from switchfit.cli.terminal import Debug, Quiet, argument, fail, option, print_note, print_text, report_errors
+from switchfit.cli import terminal
+from switchfit.cli.terminal import argument, option
 from switchfit.io import find_examples
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
@@ -24,8 +25,8 @@ FirstLog = Annotated[
 def init(
     name: NewFolder,
     log: FirstLog = None,
-    quiet: Quiet = False,
-    debug: Debug = False,
+    quiet: terminal.Quiet = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """Create a problem to begin with, ready to fit.
 
@@ -33,7 +34,7 @@ def init(
     the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
     estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
     """
-    with report_errors(debug, quiet=quiet):
+    with terminal.report_errors(debug, quiet=quiet):
         from switchfit.io.command_line import describe_experiments
         from switchfit.io.first_problem import write_first_problem
         from switchfit.io.problem_file import load_problem
@@ -41,9 +42,9 @@ def init(
         folder = Path(name)
         written = write_first_problem(folder, log)
         loaded = load_problem(folder / "problem.toml")
-        print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
-        print_text(describe_experiments(loaded.problem.experiments))
-        print_text(
+        terminal.print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
+        terminal.print_text(describe_experiments(loaded.problem.experiments))
+        terminal.print_text(
             f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
             f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
         )
@@ -66,24 +67,24 @@ ExampleFolder = Annotated[Path | None, argument("FOLDER", "Folder to create. Def
 def examples(
     name: ExampleName = None,
     folder: ExampleFolder = None,
-    debug: Debug = False,
+    debug: terminal.Debug = False,
 ) -> None:
     """List the examples, or copy one.
 
     It is copied into a new folder. Nothing is overwritten.
     """
-    with report_errors(debug):
+    with terminal.report_errors(debug):
         found = _list_examples()
         if name is None:
             width = max(map(len, found), default=0)
-            print_text("\n".join(f"{each:<{width}}  {_describe(path)}" for each, path in found.items()))
-            print_note("\nCopy one with: switchfit examples NAME")
+            terminal.print_text("\n".join(f"{each:<{width}}  {_describe(path)}" for each, path in found.items()))
+            terminal.print_note("\nCopy one with: switchfit examples NAME")
             return
         if name not in found:
-            fail(f"there is no example {name!r}; there are {', '.join(found)}.")
+            terminal.fail(f"there is no example {name!r}; there are {', '.join(found)}.")
         target = Path(name) if folder is None else folder
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.")
+            terminal.fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.")
         source = found[name]
         if source.is_dir():
             shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
@@ -93,7 +94,7 @@ def examples(
         problems, scripts = sorted(target.glob("*.toml")), sorted(target.glob("*.py"))
         commands = [f"switchfit {_choose_command(path)} {path}" for path in problems]
         commands = commands or [f"python {path}" for path in scripts]
-        print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
+        terminal.print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
 
 
 def _choose_command(path: Path) -> str:

@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypeVar
 import typer
 
 if TYPE_CHECKING:
-    from switchfit.io.problem_file.building import ProblemFile
     from switchfit.runtime.errors import Issue
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
@@ -305,11 +304,9 @@ Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr wh
 Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
 
 
-def load(problem: Path) -> ProblemFile:
-    """Read a problem file."""
-    from switchfit.io.problem_file import load_problem
-
-    return load_problem(problem)
+def select_given(**options: Any) -> dict[str, Any]:
+    """Return the options that are given; the others are None."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def read_pairs(given: str, name: str, form: str, read: Callable[[str], T]) -> list[tuple[str, T]]:
@@ -327,8 +324,22 @@ def print_list(title: str, entries: Sequence[object]) -> None:
         print_text("\n".join([title, *(f"  {entry}" for entry in entries), ""]))
 
 
+def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) -> None:
+    """Write the text of a result, its figure if `figures` names a format, and the result itself if it is to be saved.
+
+    The files differ in their endings.
+    """
+    write_file(stem.with_suffix(".txt"), f"{result}\n")
+    if saved:
+        with explain_write_errors(stem.with_suffix(".json")) as path:
+            result.save(path)
+    if figures:
+        write_figure(result, stem.with_suffix(f".{figures}"))
+
+
 def write_figure(result: Any, path: Path) -> None:
     """Write the figure of a result; the ending of the name is its format."""
+    os.environ.setdefault("MPLBACKEND", "Agg")
     figure, content = result.plot(), io.BytesIO()
     if path.suffix == ".png":
         _write_png(figure, content)
