@@ -14,7 +14,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.experiment_design.search import Design, DesignRecord
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.trajectory import Trajectory
-from switchfit.io.result_tables import list_unknowns
+from switchfit.io.result_tables import list_unknowns, zip_rows
 from switchfit.modes.result import ModeSearch
 from switchfit.online.state import Now
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -367,14 +367,13 @@ def summarize_validation(found: Validation) -> dict[str, Any]:
     """
     refit = () if found.refit is None else found.refit.theta_names
     sources = ["fit" if name in found.kept else "run" if name in refit else "guess" for name in found.theta_names]
-    numbers = zip(
-        found.theta_names,
-        found.problem.unknowns.units,
-        found.theta,
-        found.corrected_standard_errors,
-        sources,
-        strict=True,
-    )
+    columns = {
+        "name": found.theta_names,
+        "unit": found.problem.unknowns.units,
+        "value": found.theta,
+        "standard_error": found.corrected_standard_errors,
+        "from": sources,
+    }
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     return {
         **_summarize_verdict(found.verdict),
@@ -382,9 +381,7 @@ def summarize_validation(found: Validation) -> dict[str, Any]:
         "fit_percent": found.percent,
         "degrees_of_freedom": found.freedom,
         **_pick(found, "explained", "chi_square", "probability"),
-        "unknowns": [
-            dict(zip(("name", "unit", "value", "standard_error", "from"), entry, strict=True)) for entry in numbers
-        ],
+        "unknowns": zip_rows(columns),
         "channels": [
             {"name": name, "fit_percent": percent, "whiteness": tests[name].whiteness if name in tests else None}
             for name, percent in found.channels.items()
@@ -408,8 +405,8 @@ def summarize_comparison(found: ModelComparison) -> dict[str, Any]:
         "weight": found.weights,
         **_pick(found, "log_likelihood", "aicc", "delta_aicc", "bic", "delta_bic"),
     }
-    rows = [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
-    return {**_pick(found, "best", "values"), "models": sorted(rows, key=lambda row: float(row["bic"]))}
+    rows = sorted(zip_rows(columns), key=lambda row: float(row["bic"]))
+    return {**_pick(found, "best", "values"), "models": rows}
 
 
 SEQUENCE = ("switches", "sequences", "transition_times", "cost", "criterion", "bic", "mbic", "aicc")
@@ -478,10 +475,9 @@ def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: I
     names, structures = problem.run_names, evaluator.structures
     runs = zip(names, problem.experiments, evaluator.meshes, structures, strict=True)
     unknowns = problem.unknowns
-    numbers = zip(unknowns.names, unknowns.units, unknowns.initial, unknowns.lower, unknowns.upper, strict=True)
-    names = ("name", "unit", "first_guess", "lower", "upper")
+    columns = {"name": unknowns.names, "unit": unknowns.units, "first_guess": unknowns.initial}
     return {
-        "unknowns": [dict(zip(names, entry, strict=True)) for entry in numbers],
+        "unknowns": zip_rows(columns | _pick(unknowns, "lower", "upper")),
         "runs": [
             {
                 "name": name,

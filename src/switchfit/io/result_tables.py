@@ -48,11 +48,22 @@ def list_unknowns(fit: Fit) -> list[dict[str, Any]]:
         "high": correct_intervals(fit)[:, 1],
         "first_guess": fit.initial_theta,
     }
-    rows = [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
+    rows = zip_rows(columns)
     ends = {"date": "value", "date_low": "low", "date_high": "high"}
     for row, run in zip(rows, list_dated(fit), strict=True):
         row |= {} if run is None else {date: format_iso(row[end], run) or None for date, end in ends.items()}
     return rows
+
+
+def zip_rows(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
+    """Return the rows of a table, each a dict, from its columns.
+
+    Parameters
+    ----------
+    columns : mapping of str to iterable
+        All of one length.
+    """
+    return [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
 
 
 HEADERS = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from switchfit.io.logs import import_library
 from switchfit.io.logs.log import Event, FloatArray, Log, Options
+from switchfit.io.logs.tables import subtract_first
 from switchfit.io.logs.text import decode
 from switchfit.runtime.errors import InputError, Issue
 
@@ -43,7 +44,7 @@ def read_gpx(path: Path, options: Options) -> Log:
     points = [point for track in gpx.tracks for segment in track.segments for point in segment.points]
     if not any(point.time for point in points):
         raise InputError(f"{path} has no track with times: of {len(points)} points, none has a time.")
-    times, offset = _subtract_start([None if p.time is None else _count_micros(p.time) for p in points])
+    times, offset = subtract_first([None if p.time is None else _count_micros(p.time) for p in points], 1e-6)
     fields = {
         "latitude": "latitude", "longitude": "longitude", "altitude": "elevation", "speed": "speed", "course": "course",
         "hdop": "horizontal_dilution",
@@ -82,7 +83,8 @@ def read_nmea(path: Path, options: Options) -> Log:
         raise InputError(
             f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
         )
-    times, offset = _subtract_start(_count_fixes(fixes)) if day else (np.array(_count_fixes(fixes)) * 1e-6, 0.0)
+    micros = _count_fixes(fixes)
+    times, offset = subtract_first(micros, 1e-6) if day else (np.array(micros) * 1e-6, 0.0)
     columns = {name: _make_column([fix.get(name) for fix in fixes]) for name in UNITS}
     rows = np.array([fix["line"] for fix in fixes], dtype=np.intp)
     issues: tuple[Issue, ...] = ()
@@ -156,12 +158,6 @@ def _count_fixes(fixes: list[dict[str, Any]]) -> list[int]:
 def _count_micros(moment: datetime) -> int:
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
-
-
-def _subtract_start(micros: Sequence[int | None]) -> tuple[FloatArray, float]:
-    """Return seconds since the first moment, NaN where one is missing, and the first one."""
-    first = next(entry for entry in micros if entry is not None)
-    return np.array([np.nan if entry is None else (entry - first) * 1e-6 for entry in micros]), first * 1e-6
 
 
 def _make_column(entries: list[Any]) -> FloatArray:

@@ -87,10 +87,17 @@ def interpret_times(
     return (numbers, epoch, 0.0) if keep_epoch else (numbers - finite[0], epoch, float(finite[0]))
 
 
-def subtract_first(counts: Sequence[int], unit: str) -> tuple[FloatArray, str, float]:
-    """Return integers since 1970 as times from the first one on; doubles would round nanoseconds."""
-    integers = np.array(counts, dtype=np.int64)
-    return (integers - integers[0]).astype(np.float64), unit, float(integers[0])
+def subtract_first(counts: Sequence[int | None], length: float = 1.0) -> tuple[FloatArray, float]:
+    """Return integers since 1970 from the first one on, NaN for None, and the first one; doubles would round them.
+
+    Parameters
+    ----------
+    counts : sequence of int or None
+    length : float
+        What both are multiplied by.
+    """
+    first = next(count for count in counts if count is not None)
+    return np.array([np.nan if count is None else (count - first) * length for count in counts]), first * length
 
 
 def _are_uptimes(times: FloatArray) -> bool:
@@ -169,12 +176,8 @@ def build_log(
 
 def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
     if column.dtype.kind == "M":
-        nanoseconds = column.astype("datetime64[ns]")
-        missing = np.isnat(nanoseconds)
-        times, _, first = subtract_first(nanoseconds.astype(np.int64)[~missing].tolist(), "ns")
-        seconds = np.full(len(column), np.nan)
-        seconds[~missing] = times * SECONDS["ns"]
-        return seconds, "s", first * SECONDS["ns"]
+        times, first = subtract_first(column.astype("datetime64[ns]").astype(object).tolist(), SECONDS["ns"])
+        return times, "s", first
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.int64) * SECONDS["ns"], "s", 0.0
     return interpret_times(np.asarray(column, dtype=np.float64), name, unit, keep_epoch=keep_epoch)

@@ -216,9 +216,8 @@ def parse_dates(cells: Sequence[str], places: Sequence[str]) -> tuple[FloatArray
     """
     found = [None if is_missing(cell) else _read_date(cell, place) for cell, place in zip(cells, places, strict=True)]
     zones = {entry[1] for entry in found if entry is not None}
-    first = next(entry[0] for entry in found if entry is not None)
-    seconds = np.array([np.nan if entry is None else (entry[0] - first) // 1000 * 1e-6 for entry in found])
-    return seconds, first // 1000 * 1e-6, zones.pop() if len(zones) == 1 else "UTC"
+    seconds, first = subtract_first([None if entry is None else entry[0] // 1000 for entry in found], 1e-6)
+    return seconds, first, zones.pop() if len(zones) == 1 else "UTC"
 
 
 def parse_clock(cells: Sequence[str], places: Sequence[str]) -> FloatArray:
@@ -571,7 +570,7 @@ def _read_times(table: _Table, column: int, keep_epoch: bool) -> tuple[FloatArra
         numbers, table.header.names[column], table.header.units[column], keep_epoch=keep_epoch
     )
     if offset and cells and all(map(_LONG_INTEGER.fullmatch, cells)):
-        times, unit, offset = subtract_first(list(map(int, cells)), unit)
+        times, offset = subtract_first(list(map(int, cells)))
     return times, unit, offset, None
 
 

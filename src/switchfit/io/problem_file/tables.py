@@ -8,7 +8,7 @@ import datetime
 import inspect
 import math
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 from pydantic import BeforeValidator, Field, Tag
@@ -112,8 +112,13 @@ def _drop_first(given: Any) -> Any:
 
 ENTRY = BeforeValidator(_wrap_entry)
 
-TABLE_OR_NOT = pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "other")
-"""Errors are then about what is given, and not about either."""
+Other = TypeVar("Other")
+Entries = TypeVar("Entries")
+OrTable = Annotated[
+    Annotated[Other, Tag("other")] | Annotated[dict[str, Entries], Tag("table")],
+    pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "other"),
+]
+"""Something, or a table with entries; errors are about what is given, and not about either."""
 
 Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
 """A number in the experiment's time unit, or a date."""
@@ -124,10 +129,7 @@ Duration = Annotated[float, Field(ge=0)]
 Names = Annotated[list[str], Field(min_length=1)]
 NameOrNames = Annotated[list[str], ENTRY]
 
-MinDuration = Annotated[
-    Annotated[Duration, Tag("other")] | Annotated[dict[str, Duration], Tag("table")],
-    TABLE_OR_NOT,
-]
+MinDuration = OrTable[Duration, Duration]
 """One for all modes, or one for each; 0 for those that are left out."""
 
 
@@ -239,10 +241,7 @@ class DataTable(LogTable):
 class InputTable(LogTable):
     """A known input u(t); the modes are then functions f(t, x, p, u)."""
 
-    columns: Annotated[
-        Annotated[Names, Tag("other")] | Annotated[dict[str, str], Field(min_length=1), Tag("table")],
-        TABLE_OR_NOT,
-    ]
+    columns: Annotated[OrTable[Names, str], Field(min_length=1)]
     """names of the columns with the values, or { name in the model = column }, with which u is a dict"""
     kind: Literal["hold", "linear", "cubic"] = "hold"
     """interpolation between samples"""
@@ -340,18 +339,11 @@ class DesignTable(Table):
     without names is u, or u[0], u[1], ..."""
     criterion: Literal["D", "A", "E"] | None = None
     """'D': determinant of the covariance, the default; 'A': its trace; 'E': its largest eigenvalue"""
-    names: (
-        Annotated[Annotated[NameOrNames, Tag("other")] | Annotated[dict[str, Positive], Tag("table")], TABLE_OR_NOT]
-        | None
-    ) = None
+    names: OrTable[NameOrNames, Positive] | None = None
     """unknowns that count, or a table with the scale of each; left out, all"""
-    samples: Annotated[Annotated[int, Tag("other")] | Annotated[dict[str, int], Tag("table")], TABLE_OR_NOT] | None = (
-        None
-    )
+    samples: OrTable[int, int] | None = None
     """most sample times of each sensor, or a table with a number for each; left out, all"""
-    sensors: (
-        Annotated[Annotated[int, Tag("other")] | Annotated[dict[str, Positive], Tag("table")], TABLE_OR_NOT] | None
-    ) = None
+    sensors: OrTable[int, Positive] | None = None
     """most sensors, or a table with the cost of each, which is called by its channels, such as 'X, Y'; left out, all"""
     budget: Positive | None = None
     """most that the sensors may cost together"""
