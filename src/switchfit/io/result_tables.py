@@ -355,15 +355,10 @@ class ResultTable:
 
     def _write_parquet(self, columns: Sequence[str]) -> bytes:
         """Return Parquet; an empty cell is null, and the fields of unknowns have their units as metadata."""
-        import pyarrow
         import pyarrow.parquet
 
-        arrays, fields = [], []
-        for name in columns:
-            array = pyarrow.array([row.get(name) for row in self.rows])
-            unit = self.unknowns.get(name.removesuffix(ERROR.format("")), "")
-            arrays.append(array)
-            fields.append(pyarrow.field(name, array.type, metadata={"unit": unit} if unit else None))
-        file = io.BytesIO()
-        pyarrow.parquet.write_table(pyarrow.table(arrays, schema=pyarrow.schema(fields)), file)
+        table, file = pyarrow.table({name: [row.get(name) for row in self.rows] for name in columns}), io.BytesIO()
+        units = [self.unknowns.get(name.removesuffix(ERROR.format("")), "") for name in columns]
+        fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
+        pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
         return file.getvalue()

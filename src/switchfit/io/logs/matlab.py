@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +18,11 @@ from switchfit.runtime.files import explain_read_errors
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 
-OPAQUE = ("s0", "s1", "s2", "arr")
-"""Fields of the array that SciPy returns for an object: its name, its type system, its class, its number."""
+OBJECTS = (
+    "Objects, such as a timeseries, only MATLAB reads. Save their numbers there: "
+    "s = struct('t', ts.Time, 'y', ts.Data); save('log.mat', '-struct', 's')"
+)
+"""What to do with a file that has no times, or not where they were looked for."""
 
 
 def read_mat(path: Path, options: Options) -> Log:
@@ -41,21 +44,17 @@ def read_mat(path: Path, options: Options) -> Log:
         If the file cannot be read, or it is not clear which struct is meant.
     """
     contents, time, topic = _load(path), options.time, options.topic
-    objects = " ".join(_explain_objects(contents))
     groups = {name: group for name, group in _list_groups(contents).items() if _find_times(group, time)}
     if topic is None and len(groups) != 1:
         what = f"several structs with times ({join_names(name or 'the file itself' for name in groups)})"
-        if objects and not groups:
-            raise InputError(f"{path}: {objects}")
         raise InputError(
             f"{path} has {what if groups else 'no vector of times'}; its variables are {join_names(contents)}. "
-            f"{'Name one: topic = ...' if groups else 'Name the one with the times: time = ...'}"
+            f"{'Name one: topic = ...' if groups else f'Name the one with the times: time = ... {OBJECTS}'}"
         )
     chosen = next(iter(groups)) if topic is None else topic
     if chosen not in groups:
         raise InputError(
-            f"{path} has no struct {shorten(chosen)} with times; those that have are {join_names(groups)}. "
-            f"{objects}".strip()
+            f"{path} has no struct {shorten(chosen)} with times; those that have are {join_names(groups)}. {OBJECTS}"
         )
     group = groups[chosen]
     key = _find_times(group, time) or ""
@@ -81,57 +80,13 @@ def _load(path: Path) -> dict[str, Any]:
 
         warnings.simplefilter("ignore", MatReadWarning)  # of objects, which have no name of their own
         contents = loadmat(path, simplify_cells=True)
-    return _mark_objects({name: value for name, value in contents.items() if not name.startswith("__")})
-
-
-class _Object(NamedTuple):
-    """An object of MATLAB, whose content no other program reads: its class."""
-
-    kind: str
-
-
-def _mark_objects(contents: Mapping[str, Any]) -> dict[str, Any]:
-    """Return variables or fields with an `_Object` for each object, which SciPy gives as an array of four entries."""
-    found = {}
-    for name, value in contents.items():
-        if isinstance(value, Mapping):
-            value = _mark_objects(value)
-        elif isinstance(value, np.ndarray) and value.dtype.names == OPAQUE:
-            stored = np.ravel(value)[0]
-            name = bytes(stored["s0"]).decode("utf-8", "replace") or name  # a variable's, which SciPy calls "None"
-            value = _Object(bytes(stored["s2"]).decode("utf-8", "replace"))
-        found[name] = value
-    return found
-
-
-_REMEDIES = {
-    "timeseries": "s = struct('t', {0}.Time, 'y', {0}.Data)",
-    "timetable": "s = timetable2table({0}); s.Time = seconds(s.Time - s.Time(1)); "
-    "s = table2struct(s, 'ToScalar', true)",
-    "table": "s = table2struct({0}, 'ToScalar', true)",
-}
-"""How to make a struct of objects of some classes in MATLAB."""
-
-
-def _explain_objects(contents: Mapping[str, Any]) -> list[str]:
-    """Return for each object what it is, and what to do in MATLAB."""
-    found = []
-    for name, group in _list_groups(contents).items():
-        for key, value in group.items():
-            if isinstance(value, _Object):
-                whole = f"{name}.{key}" if name else key
-                remedy = _REMEDIES.get(value.kind, "s = struct('t', TIMES, 'y', VALUES)").format(whole)
-                found.append(
-                    f"{whole} is a {value.kind}, an object that only MATLAB reads. In MATLAB, save its numbers: "
-                    f"{remedy}; save('log.mat', '-struct', 's')"
-                )
-    return found
+    return {name: value for name, value in contents.items() if not name.startswith("__")}
 
 
 def _read_hdf(h5py: Any, item: Any) -> Any:
     """Return a group as a dict, text as a string, and an array in MATLAB's order of dimensions."""
     if "MATLAB_object_decode" in item.attrs:
-        return _Object(bytes(item.attrs["MATLAB_class"]).decode())
+        return None  # numbers that stand for an object
     if isinstance(item, h5py.Group):
         return {name: _read_hdf(h5py, entry) for name, entry in item.items()}
     value = np.asarray(item[()]).T

@@ -22,10 +22,11 @@ from switchfit.io.problem_file.experiments import (
     build_parameter,
     build_system,
     check_model_name,
+    make,
 )
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
-from switchfit.io.user_files import build_at, call, load_object
+from switchfit.io.user_files import build_at, load_object
 from switchfit.models import BUILT_IN
 from switchfit.modes.library import build_library
 from switchfit.problem.problem import Problem
@@ -219,15 +220,8 @@ def _load_from_python(path: Path, contents: Contents) -> Problem:
     if given:
         raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
     reference = contents.problem or ""
-    found = load_object(reference, path.parent, f"{path}: problem")
-    if callable(found):
-        found = call(found, f"{path}: problem {reference!r}")
-    if not isinstance(found, Problem):
-        raise InputError(
-            f"{path}: problem {reference!r} must be an sf.Problem or a function that returns one; "
-            f"got {type(found).__name__}."
-        )
-    return found
+    what = f"{path}: problem"
+    return make(load_object(reference, path.parent, what), ModelTable(name=reference), what, Problem)
 
 
 def _build_from_tables(

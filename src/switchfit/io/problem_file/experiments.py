@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,6 +35,8 @@ from switchfit.problem.parameter import LogNormal, Normal, Prior
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError, Issue
 
+T = TypeVar("T")
+
 
 def build_system(path: Path, table: ModelTable) -> HybridSystem:
     """Return the system of a model that is built in, or in a Python file.
@@ -51,13 +53,28 @@ def build_system(path: Path, table: ModelTable) -> HybridSystem:
     else:
         check_model_name(what, table)
         found = load_object(table.name, path.parent, what)
+    return make(found, table, what, HybridSystem)
+
+
+def make(found: Any, table: ModelTable, what: str, kind: type[T]) -> T:
+    """Return an object of some kind that a Python file has, or that a function in it returns.
+
+    Parameters
+    ----------
+    found : object
+    table : ModelTable
+        Its name, and the arguments of the function.
+    what : str
+        Place in the problem file, for messages.
+    kind : type
+    """
     if callable(found):
         found = call(found, f"{what} {table.name!r}", **_check_arguments(found, table, what))
     elif table.arguments:
         raise InputError(f"{what} {table.name!r} is not a function; leave out its arguments.")
-    if not isinstance(found, HybridSystem):
+    if not isinstance(found, kind):
         raise InputError(
-            f"{what} {table.name!r} must be an sf.HybridSystem or a function that returns one; "
+            f"{what} {table.name!r} must be an sf.{kind.__name__} or a function that returns one; "
             f"got {type(found).__name__}."
         )
     return found
