@@ -2,7 +2,7 @@
 
 stdout has the result alone: a report, or with --json one JSON value. Notes and errors go to stderr.
 
-The command itself, the arguments that several commands take, and problem files.
+The arguments that several commands take.
 """
 
 from __future__ import annotations

@@ -255,7 +255,8 @@ _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _POINT_NUMBER = re.compile(r"[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _EXCEL = re.compile(r"sep=.?")
 """The line in which Excel notes the delimiter; the one that is found is the same."""
-_LONG_INTEGER = re.compile(r"\d{16,19}")
+_LONG_INTEGER = re.compile(r"(?<![\d.])\d{16,19}(?![\d.])")
+"""Such as nanoseconds since 1970, which doubles would round."""
 
 
 @dataclass(frozen=True)
@@ -445,7 +446,7 @@ def _parse_block(lines: list[str], delimiter: str, width: int) -> FloatArray | N
         if "." in text:
             return None
         text = text.replace(",", ".")
-    if "_" in text or _LONG_INTEGER.search(lines[0]):
+    if "_" in text or _LONG_INTEGER.search(text, 0, text.index("\n", 1)):
         return None
     lines = text.split("\n")[1:-1]
     try:
