@@ -382,17 +382,11 @@ def _minimize(hessian: FloatArray, programme: Programme) -> ModelStep:
 
 def null_space(normals: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
-    return split_space(normals)[0]
-
-
-def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return orthonormal bases of the null space, (d, d - r), and of the row space, (d, r), of the normals."""
-    d = normals.shape[1]
     if normals.size == 0:
-        return np.eye(d), np.zeros((d, 0))
+        return np.eye(normals.shape[1])
     Q, R, _ = factorize_rows(unit_rows(normals)[0])
     rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
-    return Q[:, rank:], Q[:, :rank]
+    return Q[:, rank:]
 
 
 def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
