@@ -7,7 +7,7 @@ import pytest
 
 from switchfit.optimize import LinearConstraints, minimize, solve_qp
 from switchfit.optimize.arrow import Arrow, ArrowFactor, ArrowLayout, convexify_arrow, solve_arrow_qp
-from switchfit.optimize.matrix import Dense, diagonal_scaling, split_space
+from switchfit.optimize.matrix import Dense, diagonal_scaling, null_space
 from switchfit.optimize.qp import Room
 
 PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7, 10, 9]), np.array([8, 9])]
@@ -153,14 +153,14 @@ def test_curvature_on_the_face_of_active_constraints_is_kept(seed):
     normals = np.zeros((4, 11))
     normals[0], normals[1, 3], normals[2, 5], normals[3, 9] = ORDERED[0], 1.0, -1.0, 1.0
     chosen = normals[rng.random(4) > 0.3] if seed else normals
-    Z, Y = split_space(chosen)
+    Z = null_space(chosen)
     full = random_matrix(rng, lowest=0.2)
     for n in chosen:
         full -= rng.uniform(0.1, 30.0) * np.outer(n, n)  # of the arrow's shape, and nothing on the face
     convex = convexify_arrow(arrow_of(full), chosen, NO_FLOOR).dense()
     assert np.linalg.eigvalsh(convex)[0] > 0.0
     np.testing.assert_allclose(Z.T @ convex @ Z, Z.T @ full @ Z, rtol=1e-9, atol=1e-9)
-    assert Y.shape[1] == len(chosen)
+    assert Z.shape[1] == 11 - len(chosen)
 
 
 # --- the whole optimiser ----------------------------------------------------------------------------------------------

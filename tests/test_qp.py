@@ -10,8 +10,8 @@ from switchfit.optimize.matrix import (
     Dense,
     convexify,
     diagonal_scaling,
+    null_space,
     shift_to_positive,
-    split_space,
 )
 from switchfit.optimize.point import kkt_residual
 from switchfit.optimize.qp import CholeskyFactor, QPSolution, Room, solve_programme
@@ -142,7 +142,7 @@ def test_convexified_matrix_is_positive_definite_and_exact_where_possible(seed, 
     H = rng.normal(size=(d, d))
     H = H + H.T
     N = rng.normal(size=(min(k, d), d))
-    Z, _ = split_space(N)
+    Z = null_space(N)
     H = H + Z @ Z.T * (np.abs(np.linalg.eigvalsh(H)).max() + 1.0)  # positive definite on the face only
     B = convexify(H, N)
     assert np.linalg.eigvalsh(B)[0] > 0.0

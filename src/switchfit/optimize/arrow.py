@@ -30,8 +30,10 @@ from switchfit.optimize.algebra import (
     IntArray,
     is_finite,
     positive_eigenvalues,
+    unit_rows,
 )
 from switchfit.optimize.matrix import (
+    STIFFENINGS,
     Curvature,
     Dense,
     ModelStep,
@@ -40,14 +42,11 @@ from switchfit.optimize.matrix import (
     SymmetricMatrix,
     convexify,
     diagonal_scaling,
-    split_space,
 )
 from switchfit.optimize.qp import CholeskyFactor, Room, newton_step, solve_programme
 
 #: Rounds of adding violated constraints to the quadratic programme; each adds one or more, a few are enough.
 MAX_ROUNDS = 1000
-#: By how much the constrained directions of a run are made stiffer, in turn, until they no longer spoil the others.
-STIFFENINGS = (1.0, 1e2, 1e4, 1e6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,10 +323,9 @@ def solve_arrow_qp(gradient: FloatArray, matrix: Arrow, room: Room, free: BoolAr
 def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> Arrow:
     """Return a positive definite B of the same shape that equals H wherever H can be kept.
 
-    A positive definite H is kept. Otherwise its blocks are made positive definite, each by `convexify`, and then the
-    Schur complement of the shared unknowns. With Z a basis of the null space of the constraints expected to be active,
-    ZᵀBZ equals ZᵀHZ where that is positive definite, so that Newton's step on this face is unchanged. For this the
-    directions of each run across its active constraints are made as stiff as it takes.
+    A positive definite H is kept. Otherwise directions across the constraints are made stiffer, as by `convexify`. If H
+    is not positive definite on their face either, eigenvalues of its blocks are replaced, and then those of the Schur
+    complement of the shared unknowns.
 
     Parameters
     ----------
@@ -340,39 +338,31 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
     layout = hessian.layout
     scaling = diagonal_scaling(hessian, floor)
     scaled = hessian.scale(scaling)
-    if ArrowFactor.of(scaled.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
-        return hessian
-    # Rows N D^-1 of the scaled unknowns, with one more column for the padding, whose index is d.
-    pressed = np.append(normals / scaling, np.zeros((len(normals), 1)), axis=1)
-    blocks, across = _convex_blocks(scaled, pressed)
-    of_shared = pressed[:, layout.shared]
-    of_shared = of_shared[np.any(of_shared != 0.0, axis=1)]
-    free = split_space(of_shared)[0]
-    # C - sum_e G_e' B_e^-1 G_e has to be positive on the face of the shared constraints. Directions of a run across its
-    # own active constraints are blocked, and must not take curvature from the shared ones: made stiff, B_e^-1 is that
-    # of the face.
-    for stiffness in (0.0, *STIFFENINGS) if across.any() else (0.0,):
-        stiff = blocks + stiffness * across
-        tie = np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(stiff, scaled.borders))
-        complement = scaled.corner - tie
-        on_face = free.T @ complement @ free
-        if on_face.size == 0 or np.linalg.eigvalsh(0.5 * (on_face + on_face.T))[0] > EIGENVALUE_FLOOR:
-            break
-    else:
-        # No stiffness was enough: the curvature of the shared unknowns is replaced instead.
-        stiff, tie = blocks, np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(blocks, scaled.borders))
-        complement = scaled.corner - tie
-    # B has the borders of H: its Schur complement is the convex one if the corner is that plus the tie.
-    corner = convexify(0.5 * (complement + complement.T), of_shared) + tie
-    convex = Arrow(layout, stiff, scaled.borders, 0.5 * (corner + corner.T))
+    # N'N, with the rows of the scaled unknowns.
+    rows = unit_rows(normals / scaling)[0]
+    own, shared = np.append(rows, np.zeros((len(rows), 1)), axis=1)[:, layout.own], rows[:, layout.shared]
+    across = Arrow(
+        layout, np.einsum("rek,rel->ekl", own, own), np.einsum("rek,rs->eks", own, shared), shared.T @ shared
+    )
+    for stiffness in (0.0, *STIFFENINGS) if len(normals) else (0.0,):
+        pairs = zip(scaled.parts, across.parts, strict=True)
+        stiff = scaled.with_parts(*(part + stiffness * other for part, other in pairs))
+        if ArrowFactor.of(stiff.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
+            return stiff.scale(1.0 / scaling) if stiffness else hessian
+    blocks = _convex_blocks(scaled)
+    tie = np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(blocks, scaled.borders))
+    # B has the borders of H: its Schur complement C - sum_e G_e' B_e^-1 G_e is convex with the tie added to the corner.
+    complement = scaled.corner - tie
+    corner = convexify(0.5 * (complement + complement.T), np.zeros((0, len(tie)))) + tie
+    convex = Arrow(layout, blocks, scaled.borders, 0.5 * (corner + corner.T))
     ridge = EIGENVALUE_FLOOR
     while ArrowFactor.of(convex) is None:  # rounding, where a block is nearly singular
         convex, ridge = convex.plus_diagonal(ridge), 10.0 * ridge
     return convex.scale(1.0 / scaling)
 
 
-def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return positive definite blocks, and projections across each run's active constraints: (R, k, k)."""
+def _convex_blocks(scaled: Arrow) -> FloatArray:
+    """Return positive definite blocks: (R, k, k)."""
     values, vectors = np.linalg.eigh(scaled.blocks)
     # An eigenvalue that is replaced is made large enough for the shared unknowns not to lose their own curvature to it.
     # (v' G)^2 / lam is what an eigenvalue lam takes from the diagonal of the Schur complement, which is 1 at most after
@@ -381,19 +371,9 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
     positive = positive_eigenvalues(values)
     changed = np.where(values > EIGENVALUE_FLOOR, values, np.maximum(positive, 2.0 * coupling.sum(2)))
     convex = (vectors * changed[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    indefinite = values[:, 0] <= EIGENVALUE_FLOOR
     # Blocks that are positive definite stay as they are, to the last bit.
-    blocks = np.where(indefinite[:, None, None], 0.5 * (convex + np.swapaxes(convex, 1, 2)), scaled.blocks)
-    across = np.zeros_like(blocks)
-    for e in np.flatnonzero(np.any(pressed[:, scaled.layout.own] != 0.0, axis=(0, 2))):
-        normals = pressed[:, scaled.layout.own[e]]
-        normals = normals[np.any(normals != 0.0, axis=1)]
-        if indefinite[e]:
-            blocks[e] = convexify(scaled.blocks[e], normals)
-        # Y Y', the orthogonal projection onto the span of the normals of this run.
-        rows = split_space(normals)[1]
-        across[e] = rows @ rows.T
-    return blocks, across
+    indefinite = values[:, 0] <= EIGENVALUE_FLOOR
+    return np.where(indefinite[:, None, None], 0.5 * (convex + np.swapaxes(convex, 1, 2)), scaled.blocks)
 
 
 def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatArray | None]:

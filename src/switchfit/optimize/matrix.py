@@ -21,7 +21,6 @@ from switchfit.optimize import lapack
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EIGENVALUE_REPLACEMENT,
-    EPS,
     EQUILIBRATED,
     EQUILIBRATIONS,
     BoolArray,
@@ -242,6 +241,9 @@ def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -
     return scaling
 
 
+STIFFENINGS = (1.0, 1e2, 1e4, 1e6)
+"""By how much directions across the constraints expected to be active are made stiffer, in turn."""
+
 RAISED = 2.0
 """Multiple of the smallest eigenvalue by which an indefinite matrix is shifted inside a trust region."""
 
@@ -380,17 +382,11 @@ def _minimize(hessian: FloatArray, programme: Programme) -> ModelStep:
 
 def null_space(normals: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
-    return split_space(normals)[0]
-
-
-def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return orthonormal bases of the null space, (d, d - r), and of the row space, (d, r), of the normals."""
-    d = normals.shape[1]
     if normals.size == 0:
-        return np.eye(d), np.zeros((d, 0))
+        return np.eye(normals.shape[1])
     Q, R, _ = factorize_rows(unit_rows(normals)[0])
     rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
-    return Q[:, rank:], Q[:, :rank]
+    return Q[:, rank:]
 
 
 def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -411,10 +407,9 @@ def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
 def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
     """Return a positive definite B that equals H wherever H can be kept.
 
-    In scaled variables, with Z a basis of the null space of the constraints expected to be active and Y their normals:
-    a positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
-    face unspoiled, and only the Schur complement on Y has its eigenvalues replaced by their absolute values. If
-    ZᵀHZ is not positive definite either, its eigenvalues are treated in the same way.
+    A positive definite H is kept. Otherwise directions across the constraints expected to be active are made stiffer,
+    which leaves Newton's step on their face unspoiled. If H is not positive definite on the face either, eigenvalues
+    are replaced by their absolute values. All of this is done in scaled variables.
 
     Parameters
     ----------
@@ -483,25 +478,14 @@ def _convex_on_face(
     scaled: FloatArray, normals: FloatArray, make_definite: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
     """Return a positive definite matrix that differs from a scaled one across the normals alone if that is enough."""
-    if not len(normals):
-        return make_definite(scaled)
-    free, blocked = split_space(normals)
-    if blocked.shape[1] == 0 or free.shape[1] == 0:
-        return make_definite(scaled)
-    # B = (Z Y) ((Z'HZ)+, Z'HY; Y'HZ, .) (Z Y)' is positive definite if and only if its upper block is, and so is the
-    # Schur complement Y'BY - tie. Only the two are changed: Newton's step on the face is that of Z'HZ if that was
-    # definite.
-    top = make_definite(free.T @ scaled @ free)
-    cross = free.T @ scaled @ blocked
-    tie = cross.T @ np.linalg.solve(top, cross)
-    bottom = make_definite(blocked.T @ scaled @ blocked - tie) + tie
-    basis = np.hstack([free, blocked])
-    convex = basis @ np.block([[top, cross], [cross.T, bottom]]) @ basis.T
-    values = np.linalg.eigvalsh(convex)
-    # A nearly singular Z'HZ makes the tie huge, and the smallest eigenvalue rounding.
-    if values[0] < max(0.1 * EIGENVALUE_FLOOR, 64 * EPS * values[-1]):
-        return make_definite(scaled)
-    return np.asarray(0.5 * (convex + convex.T))
+    across = unit_rows(normals)[0]
+    across = across.T @ across
+    # H + sigma N'N is H on the face, and positive definite for a large sigma if and only if H is there ([1]_, 17.4).
+    for stiffness in STIFFENINGS if len(normals) else ():
+        stiff = scaled + stiffness * across
+        if _has_curvature(stiff):
+            return stiff
+    return make_definite(scaled)
 
 
 def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
