@@ -228,8 +228,8 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [
             (
-                "second[j] = list_entries(rest, with_time=moving)",
-                "second[j] = list_entries([value * (not tableau.coupled) for value in rest], with_time=moving)",
+                "second[j] = list_entries(S, with_time=moving)",
+                "second[j] = list_entries(S * (not tableau.coupled), with_time=moving)",
             )
         ],
     ),
