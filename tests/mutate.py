@@ -171,7 +171,7 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         SAMPLE_LOOPS,
         [('"late": writer.at(found["late"], row, writer.sizes.n)', '"late": found["late"]')],
     ),
-    "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * apply_weights(W, A)", "return factor * A")]),
+    "W in the Gauss-Newton matrix": (TEMPLATES, [("hb * apply_weights(W, A)", "hb * A")]),
 }
 
 IN_JAX: dict[str, tuple[str, Replacements]] = {
