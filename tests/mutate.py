@@ -219,8 +219,8 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [
             (
-                "after = x + combine(tableau.b, k)",
-                'after = x + combine(tableau.a[1] if "late" in name else tableau.b, k)',
+                "x + (combine(tableau.b, k) if k",
+                'x + (combine(tableau.a[1] if "late" in name else tableau.b, k) if k',
             )
         ],
     ),
