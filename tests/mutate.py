@@ -171,7 +171,7 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         SAMPLE_LOOPS,
         [('"late": writer.at(found["late"], row, writer.sizes.n)', '"late": found["late"]')],
     ),
-    "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * apply_weights(W, A)", "return factor * A")]),
+    "W in the Gauss-Newton matrix": (TEMPLATES, [("hb * apply_weights(W, A)", "hb * A")]),
 }
 
 IN_JAX: dict[str, tuple[str, Replacements]] = {
@@ -219,8 +219,8 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [
             (
-                "after = x + combine(tableau.b, k)",
-                'after = x + combine(tableau.a[1] if "late" in name else tableau.b, k)',
+                "x + (combine(tableau.b, k) if k",
+                'x + (combine(tableau.a[1] if "late" in name else tableau.b, k) if k',
             )
         ],
     ),
@@ -228,8 +228,8 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [
             (
-                "second[j] = list_entries(rest, with_time=moving)",
-                "second[j] = list_entries([value * (not tableau.coupled) for value in rest], with_time=moving)",
+                "second[j] = list_entries(S, with_time=moving)",
+                "second[j] = list_entries(S * (not tableau.coupled), with_time=moving)",
             )
         ],
     ),

@@ -17,7 +17,7 @@ from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import PREFIX, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.writer import GIVEN, WHOLE_NUMBERS, ZEROED, layout_of
+from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, ZEROED, layout_of
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -210,7 +210,8 @@ class NativeExperiment:
             self._divide(block, {name: a.size for name, a in arrays.items()})
         self._sums = np.zeros(sum(layout.sums.values()))
         self._divide(self._sums, layout.sums)
-        self._pointers = layout.pointers
+        of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
+        self._pointers = [*layout.pointers, *of_samples]
         self._memory = np.zeros(0)  # the workspace that the table points to, after the first `_bind`
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)

@@ -101,12 +101,12 @@ class HypothesisKernels(Kernels):
             # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
             # J.
             given = at(*point, zeros, h * weight)
-            ell, _, g_x, g_p, *rest = stage(graph, *given, only=(ELL, *GRADIENT, *SECOND), checked=True)
+            ell, _, g_x, g_p, S = stage(graph, *given, only=(ELL, *GRADIENT, *SECOND), checked=True)
             # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
             # future.
             densities.append(ell.item())
             g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
-            second.append(list_entries(rest, with_time=False))
+            second.append(list_entries(S, with_time=False))
         stores = [("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)), ("g", 0, as_vector(graph, g))]
         for j, X_d in enumerate(tangents):
             stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])

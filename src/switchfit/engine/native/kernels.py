@@ -347,8 +347,8 @@ class Kernels:
 
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
             given = at(times[j], states[j], w, hb)
-            g_t, g_x, g_p, *rest = stage(graph, *given, only=GRADIENT + SECOND, checked=True, known=known[j])
-            second[j] = list_entries(rest, with_time=moving)
+            g_t, g_x, g_p, S = stage(graph, *given, only=GRADIENT + SECOND, checked=True, known=known[j])
+            second[j] = list_entries(S, with_time=moving)
             if moving:
                 slopes[j] = stage(graph, *given, only=SLOPES, known=known[j])
             return g_t.item(), g_x, g_p
@@ -635,7 +635,7 @@ class Kernels:
     def _scalar(self, graph: Graph, derivatives: Sequence[Objects], moving: bool) -> list[Store]:
         """Return stores that add the derivatives of a scalar, g_t, g_x, g_p and the second ones, to g and H."""
         # g_x is left to the costate: the caller adds it to `jump`, and D_x of it reaches theta by the rows before.
-        g_t, _, g_p, *second = derivatives
+        g_t, _, g_p, second = derivatives
         g = graph.load("g", 0, vector=True) + self._along_p(graph, g_p)
         if moving:
             g = g + g_t.item() * graph.load("moves", 0, vector=True)
@@ -706,17 +706,10 @@ class Kernels:
         return rows
 
 
-def list_entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int], Node]:
-    """Return the lower half of a second derivative along (t, x, p), as entries of one matrix; zeros are left out."""
-    tt, xt, xx, pt, px, pp = second
-    n, M = len(xt), len(pt)
-    entries = {(1 + i, 1 + j): xx[i, j] for i in range(n) for j in range(i + 1)}
-    entries |= {(1 + n + k, 1 + i): px[k, i] for k in range(M) for i in range(n)}
-    entries |= {(1 + n + k, 1 + n + m): pp[k, m] for k in range(M) for m in range(k + 1)}
-    if with_time:
-        entries |= {(0, 0): tt.item()} | {(1 + i, 0): xt[i] for i in range(n)}
-        entries |= {(1 + n + k, 0): pt[k] for k in range(M)}
-    return entries
+def list_entries(second: Objects, with_time: bool) -> dict[tuple[int, int], Node]:
+    """Return the lower half of a second derivative along (t, x, p), all of it or that along (x, p)."""
+    first = 0 if with_time else 1
+    return {(k, m): second[k, m] for k in range(first, len(second)) for m in range(first, k + 1)}
 
 
 def _has_time(chosen: Iterable[tuple[int, int]]) -> bool:

@@ -33,8 +33,8 @@ SLOPES = tuple(range(8))
 """Positions in the outputs of `Templates.stage`: f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p."""
 
 GRADIENT = (8, 9, 10)
-SECOND = tuple(range(11, 17))
-"""Positions of the derivatives of ``w . f + hb ell``: first in t, x and p; second in tt, xt, xx, pt, px, pp."""
+SECOND = (11,)
+"""Positions of the derivatives of ``w . f + hb ell``: first in t, x and p; second along (t, x, p), as one matrix."""
 
 
 class Order(IntEnum):
@@ -93,8 +93,8 @@ def constants_of(arguments: Arguments) -> list[Any]:
 class Templates:
     """Traces the functions of a library, with derivatives of an order.
 
-    The derivatives of a scalar are listed in this order: first in t, x, p, then second in tt, xt, xx, pt, px, pp. At
-    order GAUSS_NEWTON, the second ones are the entries of the Gauss-Newton matrix.
+    The derivatives of a scalar are listed in this order: first in t, x, p, then the matrix of the second ones along
+    (t, x, p). At order GAUSS_NEWTON, it is the Gauss-Newton matrix.
     """
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order) -> None:
@@ -144,20 +144,21 @@ class Templates:
             def cost_to_go(t: Any, x: Any, p: Any) -> Any:
                 return w @ f(t, x, p) + (hb * ell(t, x, p) if costs else 0.0)
 
-            def gauss_newton() -> list[Any]:
+            def gauss_newton() -> Any:
                 second = self._no_second()
                 residuals = model.reference_residuals(piece) if costs else ()
                 for residual, W in zip(residuals, model.arguments.weights, strict=False):
-                    second = _add_all(second, _normal_matrix(residual, partial(_weigh, W, hb), t, x, p))
+                    weigh = lambda A, W=W: hb * apply_weights(W, A)  # noqa: E731
+                    second = second + _normal_matrix(residual, weigh, t, x, p)
                 if not (costs and self.library.running):
                     return second
 
                 # A running cost is no sum of squares: its own second derivatives stand for it in the Gauss-Newton
                 # matrix.
-                def cost_of_state(x: Any, p: Any) -> Any:
+                def cost_of_state(_: Any, x: Any, p: Any) -> Any:
                     return hb * sum(density(t, x, model.parameters(p)) for density in self.library.running)
 
-                return _add_all(second, self._second_in_state(cost_of_state, x, p))
+                return second + _differentiate_twice(cost_of_state, t, x, p)
 
             return [*slope, *cost, *self._differentiate(cost_to_go, t, x, p, gauss_newton)]
 
@@ -173,7 +174,7 @@ class Templates:
             def given(t: Any) -> Samples:
                 return Samples(jnp.zeros((), int), t, value, weight)
 
-            def gauss_newton() -> list[Any]:
+            def gauss_newton() -> Any:
                 # rho' / sigma^2 weighs the residuals: the second derivatives of rho are left out with those of h.
                 residual = lambda t, x, p: model.sample_residual(k, given(t), x, p)  # noqa: E731
                 information = model.sample_information(k, given(time), x, p)
@@ -182,7 +183,7 @@ class Templates:
                     return second
                 # Fisher information of normal noise: 2 for log sigma, 0 between sigma and the rest.
                 log_sigma = lambda t, x, p: model.log_sigma(k, given(t), p)  # noqa: E731
-                return _add_all(second, _normal_matrix(log_sigma, lambda A: 2.0 * A, time, x, p))
+                return second + _normal_matrix(log_sigma, lambda A: 2.0 * A, time, x, p)
 
             return self._cost(lambda t, x, p: model.sample_cost(k, given(t), x, p), time, x, p, gauss_newton)
 
@@ -205,8 +206,8 @@ class Templates:
             cost = get_end_cost(model)
             if cost is None:
                 raise ValueError("there is no terminal cost")
-            gauss_newton = lambda: self._second_in_state(partial(cost, 0.0), x, p)  # noqa: E731
-            return self._cost(cost, jnp.zeros(()), x, p, gauss_newton)
+            at = jnp.zeros(()), x, p
+            return self._cost(cost, *at, lambda: _differentiate_twice(cost, *at))
 
         return self._trace(end, (self.sizes.n,), (self.sizes.M,), name="a terminal cost")
 
@@ -223,7 +224,7 @@ class Templates:
             if kind.constraint:
                 return self._map(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
             # The second derivatives of a cost belong to the Gauss-Newton matrix too.
-            return self._cost(function, t, x, p, lambda: _list_second(function, t, x, p))
+            return self._cost(function, t, x, p, lambda: _differentiate_twice(function, t, x, p))
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,), (), (4, self.sizes.signals)
         return self._trace(at, *shapes, name=f"one of the {kind.name}")
@@ -273,7 +274,7 @@ class Templates:
 
         return trace_scalars(call, *shapes, *self.sizes.constants, name=name)
 
-    def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], list[Any]]) -> Any:
+    def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any]) -> Any:
         """Return a cost with the derivatives of the order."""
         return [value(t, x, p), *self._differentiate(value, t, x, p, gauss_newton)]
 
@@ -287,43 +288,32 @@ class Templates:
         return [function(t, x, p), *jacobians, *weighted]
 
     def _differentiate(
-        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], list[Any]]
+        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any]
     ) -> list[Any]:
         """Return the derivatives of the order; at order GAUSS_NEWTON, the second ones are given."""
         if self.order == Order.COST:
             return []
         # First, since the machine code of both is then a little faster.
-        second = gauss_newton() if self.order == Order.GAUSS_NEWTON else _list_second(value, t, x, p)
-        return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), *second]
+        second = gauss_newton() if self.order == Order.GAUSS_NEWTON else _differentiate_twice(value, t, x, p)
+        return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), second]
 
-    def _no_second(self) -> list[Any]:
-        n, M = self.sizes.n, self.sizes.M
-        return [jnp.zeros(shape) for shape in ((), (n,), (n, n), (M,), (M, n), (M, M))]
-
-    def _second_in_state(self, value: Callable[..., Any], x: Any, p: Any) -> list[Any]:
-        """Return the second derivatives of a function of (x, p); those in t are zero."""
-        (xx, _), (px, pp) = jax.jacfwd(jax.grad(value, argnums=(0, 1)), argnums=(0, 1))(x, p)
-        tt, xt, _, pt, _, _ = self._no_second()
-        return [tt, xt, xx, pt, px, pp]
+    def _no_second(self) -> Any:
+        return jnp.zeros((1 + self.sizes.n + self.sizes.M,) * 2)
 
 
-def _list_second(value: Callable[..., Any], *at: Any) -> list[Any]:
-    """Return the second derivatives of a scalar in tt, xt, xx, pt, px, pp."""
-    (tt, _, _), (xt, xx, _), (pt, px, pp) = jax.jacfwd(jax.grad(value, argnums=(0, 1, 2)), argnums=(0, 1, 2))(*at)
-    return [tt, xt, xx, pt, px, pp]
+def _differentiate_twice(value: Callable[..., Any], t: Any, x: Any, p: Any) -> Any:
+    """Return the matrix of the second derivatives of a scalar along (t, x, p)."""
+
+    def along(z: Any) -> Any:
+        t, *state = jnp.split(z, (1, 1 + x.size))
+        return value(t.reshape(()), *state)
+
+    return jax.hessian(along)(jnp.concatenate([t.reshape(1), x, p]))
 
 
-def _normal_matrix(residual: Callable[..., Any], weigh: Callable[[Any], Any], *at: Any) -> list[Any]:
-    """Return ``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W."""
+def _normal_matrix(residual: Callable[..., Any], weigh: Callable[[Any], Any], *at: Any) -> Any:
+    """Return ``r_d' W r_d`` along (t, x, p); `weigh` multiplies by W."""
     # A time that moves with theta, as of a late sample, is one more direction of the residual.
-    t, x, p = jax.jacfwd(residual, argnums=(0, 1, 2))(*at)
-    Wt, Wx, Wp = weigh(t[:, None])[:, 0], weigh(x), weigh(p)
-    return [t @ Wt, x.T @ Wt, x.T @ Wx, p.T @ Wt, p.T @ Wx, p.T @ Wp]
-
-
-def _weigh(W: Any, factor: Any, A: Any) -> Any:
-    return factor * apply_weights(W, A)
-
-
-def _add_all(one: list[Any], other: list[Any]) -> list[Any]:
-    return [a + b for a, b in zip(one, other, strict=True)]
+    t_d, *in_state = jax.jacfwd(residual, argnums=(0, 1, 2))(*at)
+    r_d = jnp.concatenate([t_d[:, None], *in_state], axis=1)
+    return r_d.T @ weigh(r_d)
