@@ -61,7 +61,7 @@ def check_numbers(
     """
     found = {}
     for name, value in given.items():
-        if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
+        if not isinstance(value, (float, int, np.integer, np.floating)) or isinstance(value, bool):
             raise TypeError(f"{name} must be a number{or_name}; got {shorten(value)}.")
         found[name] = as_positive(value, name) if name in positive else as_finite(value, name)
         if name in not_negative and value < 0:

@@ -257,7 +257,8 @@ def list_unknowns(
 
     def add(name: str, unit: str, parameter: Parameter) -> slice:
         first = len(names)
-        names.extend(f"{name}{_index(k)}" for k in np.ndindex(parameter.shape))
+        entries = map(_index, np.ndindex(parameter.shape)) if parameter.shape else [""]
+        names.extend(f"{name}{entry}" for entry in entries)
         units.extend([unit] * parameter.value.size)
         pieces.append(parameter)
         return slice(first, len(names))
@@ -296,7 +297,7 @@ def list_unknowns(
 
 
 def _index(k: tuple[int, ...]) -> str:
-    return f"[{','.join(map(str, k))}]" if k else ""
+    return f"[{','.join(map(str, k))}]"
 
 
 def get_min_duration(min_duration: float | Mapping[str, float], mode: str) -> float:
