@@ -10,7 +10,7 @@ from models import decay, first_state
 
 import switchfit as sf
 from switchfit.discretization.model import Model
-from switchfit.problem.functions import call_for_vector, use_float64
+from switchfit.problem.functions import Call, call_for_vector, use_float64
 
 
 def grow(t, x, p):
@@ -204,13 +204,13 @@ def test_parameter(build, said):
         (
             {"data": samples(), "t0": None, "tf": None},
             ValueError,
-            ["t0 and tf are left out", "span of the data, from 0.5 to 0.5, the horizon (t0, tf) would be (0.5, 0.5)"],
+            ["t0 and tf are left out", "t0 < tf; got (0.5, 0.5)", "taken from the data: give it"],
         ),
-        ({"t0": 2.0, "tf": None}, ValueError, ["tf is left out", "would be (2.0, 1.0): give tf, so that t0 < tf"]),
+        ({"t0": 2.0, "tf": None}, ValueError, ["tf is left out", "t0 < tf; got (2.0, 1.0)"]),
         (
             {"t0": None, "tf": sf.Parameter(-1.0, upper=2.0)},
             ValueError,
-            ["t0 is left out", "would be (0.0, -1.0): give t0"],
+            ["t0 is left out", "t0 < tf; got (0.0, -1.0)"],
         ),
         (
             {"data": [samples([0.0, 2.0], [1, 1]), reference([0, 0.5, 1, 1.5], [1, 1, 1, 1])], "tf": None},
@@ -373,7 +373,7 @@ def test_integers_and_booleans_are_taken_for_numbers():
     """A constant velocity written as ``jnp.array([1])`` is no mistake of the user's."""
     with use_float64():
         for value in (jnp.array([1]), jnp.array([True]), [1], 1):
-            array = call_for_vector(lambda value=value: value, (), (1,), "mode", "f()")
+            array = call_for_vector(Call(lambda value=value: value, (), (1,), "mode", "f()"), ())
             assert array.dtype == jnp.float64
             np.testing.assert_array_equal(array, [1.0])
 

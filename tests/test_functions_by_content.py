@@ -17,7 +17,7 @@ import pytest
 import switchfit as sf
 from switchfit import models
 from switchfit.problem import functions
-from switchfit.problem.functions import trace_function
+from switchfit.problem.functions import Call, trace_function
 
 SAMPLES = sf.Measurements([0.5, 1.0], [math.exp(-0.5), math.exp(-1.0)], sigma=0.1)
 
@@ -255,10 +255,9 @@ def test_runs_with_functions_of_their_own_are_one_program():
     ],
 )
 def test_other_functions_are_other(change):
-    given = (((2,), None), {"a": (), "b": ()})
-    settings = {"what": "f", "form": "f(x, p)", "shape": (2,)}
-    own = trace_function(change, *given, **settings)
-    assert trace_function(lambda x, p: change(x, p), *given, **settings) == own
+    call = Call(change, ((2,), None), (2,), "f", "f(x, p)")
+    own = trace_function(call, {"a": (), "b": ()})
+    assert trace_function(call._replace(function=lambda x, p: change(x, p)), {"a": (), "b": ()}) == own
     for other in TRACED:
         assert own != other
         assert own.digest != other.digest

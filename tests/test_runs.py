@@ -17,7 +17,7 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
 from switchfit.io.result_tables import write_runs
-from switchfit.problem.functions import trace_function
+from switchfit.problem.functions import Call, trace_function
 from switchfit.problem.structure import choose_common_lengths, pad_length
 from switchfit.runtime.errors import InputError
 from switchfit.strategy.beam import follow_order
@@ -451,7 +451,7 @@ READ = {
 def test_entries_that_no_operation_reads(name):
     """At any other value of these the result is the same, not a number included."""
     read, expected = READ[name]
-    traced = trace_function(lambda p: read(p["q"]), (None,), {"q": Q.shape}, what="f", form="f(p)", shape=None)
+    traced = trace_function(Call(lambda p: read(p["q"]), (None,), None, "f", "f(p)"), {"q": Q.shape})
     assert traced.read["q"] == tuple(sorted(set(np.ravel(expected).tolist())))
     values = np.sin(1.0 + Q)
     holes = np.where(np.isin(Q, traced.read["q"]), values, np.nan)

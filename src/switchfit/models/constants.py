@@ -34,47 +34,39 @@ def check_constants(
     ValueError
         If a number is not finite, or not positive where it must be, or a name is no identifier.
     """
-    found: dict[str, Constant] = {}
-    for name, value in given.items():
-        if isinstance(value, str):
-            if not value.isidentifier():
-                raise ValueError(f"{name} must be a number or the name of a parameter; got the name {value!r}.")
-            found[name] = value
-            continue
-        if not _is_number(value):
-            raise TypeError(
-                f"{name} must be a number, or the name of a parameter to be fixed or estimated in the Problem; got "
-                f"{type(value).__name__}."
-            )
-        found[name] = as_positive(value, name) if name in positive else as_finite(value, name)
-        if name in not_negative and value < 0:
-            raise ValueError(f"{name} must be 0 or more; got {value}.")
-    return found
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    names = {name: value for name, value in given.items() if isinstance(value, str)}
+    for name, value in names.items():
+        if not value.isidentifier():
+            raise ValueError(f"{name} must be a number or the name of a parameter; got the name {value!r}.")
+    others = {name: value for name, value in given.items() if name not in names}
+    or_name = ", or the name of a parameter to be fixed or estimated in the Problem"
+    return names | check_numbers(others, positive=positive, not_negative=not_negative, or_name=or_name)
 
 
 def check_numbers(
-    given: Mapping[str, Any], *, positive: Iterable[str] = (), not_negative: Iterable[str] = ()
+    given: Mapping[str, Any], *, positive: Iterable[str] = (), not_negative: Iterable[str] = (), or_name: str = ""
 ) -> dict[str, float]:
     """Return constants that cannot be the names of parameters, as floats.
 
     Parameters
     ----------
     given, positive, not_negative : as of `check_constants`
+    or_name : str, optional
+        What else one may be, for messages.
 
     Raises
     ------
     TypeError, ValueError
         As `check_constants`, and for a name.
     """
+    found = {}
     for name, value in given.items():
-        if not _is_number(value):
-            raise TypeError(f"{name} must be a number; got {shorten(value)}.")
-    found = check_constants(given, positive=positive, not_negative=not_negative)
-    return {name: float(value) for name, value in found.items()}
+        if not isinstance(value, (float, int, np.integer, np.floating)) or isinstance(value, bool):
+            raise TypeError(f"{name} must be a number{or_name}; got {shorten(value)}.")
+        found[name] = as_positive(value, name) if name in positive else as_finite(value, name)
+        if name in not_negative and value < 0:
+            raise ValueError(f"{name} must be 0 or more; got {value}.")
+    return found
 
 
 def check_modes(modes: Any, known: Iterable[str]) -> tuple[str, ...]:

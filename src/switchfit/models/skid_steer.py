@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import permutations
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,13 +41,6 @@ FORCES = ("F1", "F2", "F3", "F4 (N)")
 
 STICK_FORCES, SLIP_FORCES = (15.0, 15.0, 15.0, 15.0), (27.0, 0.0, 0.0, 27.0)
 """Driving forces of the wheels in the paper's simulations (N), F1 to F4."""
-
-
-class _Forces(NamedTuple):
-    """Driving forces of the wheels in stick and in all other modes; None if they are the input."""
-
-    stick: tuple[float, ...]
-    slip: tuple[float, ...]
 
 
 def skid_steer(
@@ -177,7 +170,7 @@ def skid_steer(
     [('front_slip', 'stick'), ('slip', 'front_slip'), ('slip', 'stick')]
     """
     names = _check_modes(modes, restick)
-    forces = _check_forces(stick_forces, slip_forces, forces_from_input)
+    forces = _check_forces(forces_from_input, stick_forces=stick_forces, slip_forces=slip_forces)
     constants = check_constants(
         {
             "m_b": m_b, "m_w": m_w, "B_l": B_l, "B_w": B_w, "a": a, "b": b, "c_1": c_1, "c_2": c_2, "g": g,
@@ -213,27 +206,30 @@ def _check_modes(modes: Sequence[str], restick: str) -> tuple[str, ...]:
     return names
 
 
-def _check_forces(stick: Any, slip: Any, from_input: bool) -> _Forces | None:
+def _check_forces(from_input: bool, **given: Any) -> list[tuple[float, ...]] | None:
+    """Return the driving forces of the wheels in stick and in all other modes; None if they are the input."""
     if as_flag(from_input, "forces_from_input"):
-        for name, given in (("stick_forces", stick), ("slip_forces", slip)):
-            if given is not None:
-                raise ValueError(f"{name} must be left out where the forces are the input; got {given!r}.")
+        for name, forces in given.items():
+            if forces is not None:
+                raise ValueError(f"{name} must be left out where the forces are the input; got {forces!r}.")
         return None
     found = []
-    for name, given, default in (("stick_forces", stick, STICK_FORCES), ("slip_forces", slip, SLIP_FORCES)):
-        forces = default if given is None else given
+    for (name, own), default in zip(given.items(), (STICK_FORCES, SLIP_FORCES), strict=True):
+        forces = default if own is None else own
         if np.shape(forces) != (4,):
             raise ValueError(f"{name} must be four numbers (N), one for each wheel; got {shorten(forces)}.")
         found.append(tuple(as_finite(force, f"{name}[{k}]") for k, force in enumerate(forces)))
-    return _Forces(*found)
+    return found
 
 
-def _make_mode(name: str, forces: _Forces | None, constants: Constants, small: float) -> Callable[..., Any]:
+def _make_mode(
+    name: str, forces: list[tuple[float, ...]] | None, constants: Constants, small: float
+) -> Callable[..., Any]:
     """Return the vector field of a mode."""
     stuck = STUCK[name]
     if forces is None:
         return partial(_move_by_input, stuck, constants, small)
-    return partial(_move, forces.stick if len(stuck) == 2 else forces.slip, stuck, constants, small)
+    return partial(_move, forces[0] if len(stuck) == 2 else forces[1], stuck, constants, small)
 
 
 def _move_by_input(stuck: tuple[int, ...], constants: Constants, small: float, t: Any, x: Any, p: Any, u: Any) -> Any:
@@ -241,13 +237,7 @@ def _move_by_input(stuck: tuple[int, ...], constants: Constants, small: float, t
 
 
 def _move(
-    forces: tuple[Any, ...],
-    stuck: tuple[int, ...],
-    constants: Constants,
-    small: float,
-    t: Any,
-    x: Any,
-    p: Any,
+    forces: tuple[Any, ...], stuck: tuple[int, ...], constants: Constants, small: float, t: Any, x: Any, p: Any
 ) -> Any:
     """Return dx/dt with driving forces (4,) where some axles do not move sideways."""
     _, dX, _, dY, theta, dtheta = x

@@ -16,13 +16,13 @@ Every function takes arrays of NumPy or JAX; `xp` is their module.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, count_from_instant, is_dated
+from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, count_from_instant, has_dates, is_dated
 from switchfit.problem.signals import (
     PiecewisePolynomial,
     build_polynomial,
@@ -225,8 +225,6 @@ class TerminalConstraint:
 
 
 FloatArray = NDArray[np.float64]
-T = TypeVar("T")
-
 Observe = Callable[..., Any]
 """``h(t, x, p) -> (q,)``: the output of a sensor."""
 
@@ -469,11 +467,6 @@ class ReferenceSignal:
                 signal = filter_lowpass(signal, lowpass_hz)
         return cls(signal, observe, weights, names, (given, table), lowpass_hz, units)
 
-    @property
-    def dates(self) -> Dates | None:
-        """Dates of the samples, until an experiment has converted them; None if their times are numbers."""
-        return self.samples[0] if self.samples is not None and isinstance(self.samples[0], Dates) else None
-
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
@@ -642,19 +635,36 @@ class Measurements:
 Data = Measurements | ReferenceSignal | RunningCost | TransitionCost | TerminalCost | TerminalConstraint
 
 
-def count_from(item: T, origin: Origin, time_unit: str) -> T:
-    """Return data, an input or a jump with dates as numbers of a unit since the origin; anything else as it is."""
-    what = f"times of {type(item).__name__}"
-    if isinstance(item, ReferenceSignal) and item.samples is not None and item.dates is not None:
-        times = origin.to_numbers(item.dates, time_unit, what)
+def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any:
+    """Return what an experiment is given, dates as numbers of a unit since the origin; anything else as it is.
+
+    Parameters
+    ----------
+    item : data, input, jump, time or `Parameter`, or a tuple of these
+    origin : Origin
+    time_unit : str
+    what : str, optional
+        What messages call it; of data, inputs and jumps their times.
+    """
+    if isinstance(item, tuple):
+        return tuple(count_from(entry, origin, time_unit, what) for entry in item)
+    if isinstance(item, Dates):
+        return origin.to_numbers(item, time_unit, what)
+    if not has_dates(item):
+        return item
+    what = what or f"times of {type(item).__name__}"
+    if isinstance(item, ReferenceSignal) and item.samples is not None:
+        times = origin.to_numbers(item.samples[0], time_unit, what)
         own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
-        return ReferenceSignal.from_samples(times, item.samples[1], **own)  # type: ignore[return-value]  # of its type
-    return origin.count(item, time_unit, what)
+        return ReferenceSignal.from_samples(times, item.samples[1], **own)
+    own = {each.name: getattr(item, each.name) for each in fields(item)}
+    dated = {name: count_from(value, origin, time_unit, what) for name, value in own.items() if has_dates(value)}
+    return replace(item, **dated)
 
 
 def _check_samples(
-    times: ArrayLike,
-    values: ArrayLike,
+    times: Any,
+    values: Any,
     what: str,
     *,
     at_least: int,

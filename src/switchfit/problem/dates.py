@@ -19,7 +19,7 @@ import datetime
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, NoReturn
 from zoneinfo import ZoneInfo
@@ -264,10 +264,14 @@ class Dates:
 
 def is_dated(value: Any) -> bool:
     """Return whether a value is to be read as dates: dates, text, and arrays, tables' columns and lists of these."""
+    if type(value) is float:  # as are most times
+        return False
     if isinstance(value, (Dates, *_DATE_TYPES)):
         return True
     dtype = getattr(value, "dtype", None)
     kind = getattr(dtype, "kind", "")
+    if kind in ("f", "i"):
+        return False
     if isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1):
         return any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))
     return kind in ("M", "U") or (is_of_library(value, "polars") and str(dtype).startswith(("Date", "String")))
@@ -443,24 +447,6 @@ class Origin:
         dates = dates.localize(self.time_zone, what) if self.time_zone else dates
         return count_from_instant(dates.instants, self.instant, NANOSECONDS[normalize_time_unit(time_unit)])
 
-    def count(self, value: Any, time_unit: str, what: str) -> Any:
-        """Return a value in which all that `list_dates` finds are numbers of a unit since the origin, by `to_numbers`.
-
-        Parameters
-        ----------
-        value : object
-        time_unit, what : str
-        """
-        if isinstance(value, Dates):
-            return self.to_numbers(value, time_unit, what)
-        if isinstance(value, (list, tuple)):
-            return tuple(self.count(entry, time_unit, what) for entry in value)
-        if not has_dates(value):
-            return value
-        own = {each.name: getattr(value, each.name) for each in fields(value)}
-        dated = {name: self.count(entry, time_unit, what) for name, entry in own.items() if has_dates(entry)}
-        return replace(value, **dated)
-
     def to_dates(self, times: ArrayLike, time_unit: str) -> list[datetime.datetime]:
         """Return times (K,) as dates in the experiment's zone, to the microsecond.
 
@@ -550,8 +536,7 @@ def choose_origin(given: Sequence[Given], origin: Any, time_zone: Any, t0: Any, 
     if asked is None and bare and zoned:
         raise ValueError(
             f"{zoned[0].what} has a time zone ({zoned[0].dates!r}), but {bare[0].what} has none ({bare[0].dates!r}). "
-            f"Give the experiment the zone of the dates without one, such as time_zone='Europe/Berlin' or 'UTC', or "
-            "write the zone into all dates."
+            "Say where those were read, such as time_zone='Europe/Berlin', or write the zone into all dates."
         )
     zones = {one.dates.time_zone for one in zoned}
     zone = asked if asked is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"

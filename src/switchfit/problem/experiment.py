@@ -232,16 +232,16 @@ class Experiment:
     def __post_init__(self) -> None:
         self._convert_dates()
         data = self.data
-        if self.t0 is None or self.tf is None:
-            missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
-            t0, tf = _choose_horizon(self.t0, self.tf, data, missing)
-            set_fields(self, taken_from_data=missing)
-        else:
-            t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
+        missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
+        span = _find_span(data, missing, self.t0) if missing else (0.0, 0.0)
+        t0 = span[0] if self.t0 is None else as_number(self.t0, "t0")
+        tf = span[1] if self.tf is None else _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
             ends = f"({show_time(self, t0)}, {show_time(self, last)})"
-            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.")
+            why = f" {_say_left_out(missing)}, and taken from the data: give it." if missing else ""
+            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.{why}")
+        set_fields(self, taken_from_data=missing)
         by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
         if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
             raise ValueError(
@@ -292,21 +292,13 @@ class Experiment:
         found: dict[str, Any] = {"data": data, "jumps": jumps}
         if given or self.origin is not None or self.time_zone is not None:
             kinds = [type(item).__name__ for item in data if isinstance(item, TIMED) and not has_dates(item)]
-            numbers = ""
-            if kinds:
-                numbers = f"the {kinds[0]}" if len(data) == 1 else f"a {kinds[0]} beside it"
+            numbers = f"the {kinds[0]}{'' if len(data) == 1 else ' beside it'}" if kinds else ""
             origin = choose_origin(given, self.origin, self.time_zone, t0, numbers=numbers)
             unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-            found = {
-                "origin": origin,
-                "time_zone": origin.time_zone or None,
-                "data": tuple(count_from(item, origin, unit) for item in data),
-                "jumps": tuple(count_from(jump, origin, unit) for jump in jumps),
-                "inputs": count_from(self.inputs, origin, unit),
-                "transition_times": origin.count(times, unit, of_times),
-                "t0": origin.count(t0, unit, "t0"),
-                "tf": origin.count(tf, unit, "tf"),
-            }
+            found |= {"inputs": self.inputs, "transition_times": times, "t0": t0, "tf": tf}
+            names = {"transition_times": of_times, "t0": "t0", "tf": "tf"}
+            found = {name: count_from(value, origin, unit, names.get(name, "")) for name, value in found.items()}
+            found |= {"origin": origin, "time_zone": origin.time_zone or None}
         set_fields(self, **found)
 
     @property
@@ -407,21 +399,19 @@ class Experiment:
         unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
         for i, tau in enumerate(self._own_times, start=1):
             if tau.unit not in ("", unit):
-                is_tf = i > len(self.transition_times)
+                what = "tf" if i > len(self.transition_times) else f"transition time {i}"
                 raise ValueError(
-                    f"{'tf' if is_tf else f'transition time {i}'} has the unit {tau.unit!r}, but time_unit of the "
-                    f"experiment is {unit!r}, and times are not converted. If all times of the experiment are in "
-                    f"{tau.unit}, give it time_unit={tau.unit!r}; otherwise give "
-                    f"{'tf' if is_tf else 'the transition time'} in {unit}."
+                    f"{what} has the unit {tau.unit!r}, but time_unit of the experiment is {unit!r}, and times are not "
+                    f"converted. If all times are in {tau.unit}, give it time_unit={tau.unit!r}; otherwise give {what} "
+                    f"in {unit}."
                 )
 
     def _check_times(self) -> None:
         scales = {tau.scale for tau in self._own_times if not tau.fixed}
         if len(scales) > 1:
             raise ValueError(
-                "the transition times of an experiment that are estimated, and a free tf, must be on one scale, since "
-                f"their order is a constraint; got {shorten([tau.scale for tau in self._own_times])}. Give scale='log' "
-                "to all of them, or to none."
+                "the transition times of an experiment that are estimated, and a free tf, must be on one scale; got "
+                f"{shorten([tau.scale for tau in self._own_times])}. Give scale='log' to all of them, or to none."
             )
         if any(tau.shape != () for tau in self.transition_times):
             shapes = [tau.shape for tau in self.transition_times]
@@ -445,8 +435,7 @@ class Experiment:
         if outside.any():
             raise ValueError(
                 f"A Jump must lie in [t0, tf) = [{show_time(self, self.t0)}, {show_time(self, last)}){unit}; got "
-                f"{self._show_times(acts[outside])}. "
-                "Leave it out, or move t0 or tf."
+                f"{self._show_times(acts[outside])}. Leave it out, or move t0 or tf."
             )
         for i, tau in enumerate(self._own_times, start=1):
             if not tau.fixed and np.any(acts == tau.value):
@@ -602,32 +591,24 @@ def _check_jumps(given: Any) -> tuple[Jump, ...]:
     return tuple(jumps)
 
 
-def _choose_horizon(
-    t0: Any, tf: Any, data: tuple[Data, ...], missing: tuple[str, ...]
-) -> tuple[float, float | Parameter]:
-    """Return t0 and tf as given and checked; those that are missing are taken from the span of the data."""
-    left_out = f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} left out"
+def _find_span(data: tuple[Data, ...], missing: tuple[str, ...], t0: Any) -> tuple[float, float]:
+    """Return the first and the last time of the data, from which t0 or tf is taken where it is left out."""
     sensors = [item for item in data if isinstance(item, Measurements)]
     spans = [item.seen_times[[0, -1]] for item in sensors if len(item.times)]
     spans += [item.signal.knots[[0, -1]] for item in data if isinstance(item, ReferenceSignal)]
-    if sensors and not spans and t0 is not None and tf is None:  # of a stream
+    if sensors and not spans and t0 is not None:  # of a stream
         spans = [as_number(t0, "t0") + np.array([0.0, 1.0])]
     if not spans:
         kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
         raise ValueError(
-            f"{left_out}, but nothing among the data ({kinds}) has times that say where the horizon begins and ends: "
-            f"give {' and '.join(missing)}."
+            f"{_say_left_out(missing)}, but nothing among the data ({kinds}) has times that say where the horizon "
+            f"begins and ends: give {' and '.join(missing)}."
         )
-    first, last = float(np.min(spans)), float(np.max(spans))
-    start = first if t0 is None else as_number(t0, "t0")
-    end = last if tf is None else _check_final_time(tf)
-    guess = float(end.value) if isinstance(end, Parameter) else end
-    if not start < guess:
-        raise ValueError(
-            f"{left_out}, and with the span of the data, from {first} to {last}, the horizon (t0, tf) would be "
-            f"({start}, {guess}): give {' and '.join(missing)}, so that t0 < tf."
-        )
-    return start, end
+    return float(np.min(spans)), float(np.max(spans))
+
+
+def _say_left_out(missing: tuple[str, ...]) -> str:
+    return f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} left out"
 
 
 def _check_final_time(given: Any) -> float | Parameter:

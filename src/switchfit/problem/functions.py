@@ -29,7 +29,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from itertools import compress
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -268,55 +268,62 @@ _retracing = jax.make_user_context(0)
 """With a new value, JAX does not reuse earlier traces of jitted functions inside a function."""
 
 
-def trace_function(
-    function: Callable[..., Any],
-    arguments: Sequence[Shape | None],
-    parameters: Mapping[str, Shape],
-    hidden: frozenset[str] = frozenset(),
-    *,
-    what: str,
-    form: str,
-    shape: Shape | None,
-    inputs: tuple[str, ...] = (),
-) -> Function:
+class Call(NamedTuple):
+    """A function of the user, and how it is called.
+
+    Attributes
+    ----------
+    function : callable
+    arguments : tuple of shape or None
+        Shapes of its arguments; None stands for the dict of parameters.
+    shape : shape or None
+        Required shape of its result; None for any.
+    what, form : str
+        Its name and signature for messages, such as "mode 'slip'" and "f(t, x, p)".
+    inputs : tuple of str
+        Names of the entries of the last argument, which is then passed as a dict; the `Function` takes an array.
+    """
+
+    function: Callable[..., Any]
+    arguments: tuple[Shape | None, ...]
+    shape: Shape | None
+    what: str
+    form: str
+    inputs: tuple[str, ...] = ()
+
+
+def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozenset[str] = frozenset()) -> Function:
     """Trace a function of the user, or return a cached trace that is still valid.
 
     Parameters
     ----------
-    function : callable
-    arguments : sequence of shape or None
-        Shapes of its arguments; None stands for the dict of parameters.
+    call : Call
     parameters : mapping of str to shape
-        Names and shapes of the entries of that dict.
+        Names and shapes of the entries of its dict of parameters.
     hidden : set of str
         Those among them that are in the dict only if the function reads them by name.
-    what, form : str
-        Its name and signature for messages, such as "mode 'slip'" and "f(t, x, p)".
-    shape : shape, optional
-        Required shape of its result; any if left out.
-    inputs : tuple of str, optional
-        Names of the entries of the last argument, which is then passed as a dict; the `Function` takes an array.
 
     Raises
     ------
     ValueError
         If it raises, returns another shape or dtype, or computes in less than double precision.
     """
-    function = _without_jit(function)
+    function = _without_jit(call.function)
     content = read_contents(function)
-    key = None if content is None else (content, tuple(arguments), tuple(parameters.items()), hidden, shape, inputs)
+    asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()), hidden)
+    key = None if content is None else (content, asked)
     found = None if key is None else _traces.get(key)
     if found is not None:
         return found
-    settings: dict[str, Any] = {"what": what, "form": form, "shape": shape, "inputs": inputs}
+    call = call._replace(function=function)
     shown = {name: size for name, size in parameters.items() if name not in hidden}
     with use_float64(), nullcontext() if key is not None else _retracing(next(_turn)):
         try:
-            traced = _trace(function, arguments, shown, **settings)
+            traced = _trace(call, shown)
         except ValueError:  # the function may read a hidden parameter by its name
             if not hidden:
                 raise
-            traced = _trace(function, arguments, parameters, **settings)
+            traced = _trace(call, parameters)
     with _lock:
         traced = _known.setdefault(traced._key, traced)
         if key is not None:
@@ -333,29 +340,20 @@ def _without_jit(function: Any) -> Any:
     return function
 
 
-def _trace(
-    function: Callable[..., Any],
-    arguments: Sequence[Shape | None],
-    parameters: Mapping[str, Shape],
-    *,
-    what: str,
-    form: str,
-    shape: Shape | None,
-    inputs: tuple[str, ...],
-) -> Function:
+def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
     """Trace a function with these parameters in its dict, and keep those on which its result depends."""
-    position, count = list(arguments).index(None), len(arguments) - 1
+    position, count = call.arguments.index(None), len(call.arguments) - 1
 
-    def call(*given: Array) -> Array:
+    def evaluate(*given: Array) -> Array:
         flat: list[Any] = list(given[:count])
-        if inputs:
-            flat[-1] = {name: flat[-1][k] for k, name in enumerate(inputs)}
+        if call.inputs:
+            flat[-1] = {name: flat[-1][k] for k, name in enumerate(call.inputs)}
         named = dict(zip(parameters, given[count:], strict=True))
-        return call_for_vector(function, (*flat[:position], named, *flat[position:]), shape, what, form)
+        return call_for_vector(call, (*flat[:position], named, *flat[position:]))
 
-    shapes = [*(size for size in arguments if size is not None), *parameters.values()]
-    closed = jax.make_jaxpr(call)(*(jax.ShapeDtypeStruct(size, jnp.float64) for size in shapes))
-    refuse_wrong_constants(closed, what)
+    shapes = [*(size for size in call.arguments if size is not None), *parameters.values()]
+    closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(size, jnp.float64) for size in shapes))
+    refuse_wrong_constants(closed, call.what)
     is_kept = [True] * count + [False] * len(parameters)
     jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=is_kept)
     _copy_literals(jaxpr)
@@ -449,12 +447,9 @@ class _Text:
                 self._parameter(name, entry)
         elif isinstance(value, (np.ndarray, jax.Array)):
             self.lines.append(f"{name}={self._array(value)}")
-        elif callable(value) and not isinstance(value, type):
-            self.lines.append(f"{name}=object {len(self.opaque)}")
-            self.opaque.append(value)
         else:
             text = repr(value)
-            if " at 0x" in text:
+            if " at 0x" in text or (callable(value) and not isinstance(value, type)):
                 text = f"object {len(self.opaque)}"
                 self.opaque.append(value)
             self.lines.append(f"{name}={text}")
@@ -468,8 +463,9 @@ class _Text:
 # Calling a user's function while tracing
 
 
-def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:
+def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
     """Call a user's function while tracing; turn any exception into one sentence that names the function."""
+    function, what, form = call.function, call.what, call.form
     misfit = find_misfit(function, arguments)
     if misfit is not None:
         inputs = " Modes get an input u if and only if the experiment has inputs." if what.startswith("mode ") else ""
@@ -508,14 +504,9 @@ def _describe_missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
     return f"reads {name!r}, which is neither {known}."
 
 
-def call_for_vector(
-    function: Callable[..., Any], arguments: tuple[Any, ...], shape: Shape | None, what: str, form: str
-) -> Array:
-    """Return the result of a user's function, checked (while tracing) to be a float64 array of the given shape.
-
-    Without a shape, any shape is accepted.
-    """
-    array = call_while_tracing(function, arguments, what, form)
+def call_for_vector(call: Call, arguments: tuple[Any, ...]) -> Array:
+    """Return the result of a user's function, checked (while tracing) to be a float64 array of the required shape."""
+    array, shape, what, form = _call_while_tracing(call, arguments), call.shape, call.what, call.form
     if shape is not None and array.shape != shape:
         if not array.size == int(np.prod(shape)) == 1:
             raise ValueError(f"{what}: {form} must return an array of shape {shape}; got shape {array.shape}.")

@@ -141,10 +141,9 @@ def check_delays(experiments: tuple[Experiment, ...], parameters: Mapping[str, P
             least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
             if not low <= least <= most <= high:
                 raise ValueError(
-                    f"the delay {item.delay!r} may lie in [{least}, {most}]{unit} (its bounds, if it is not "
-                    f"fixed), but only from {low:.6g} to {high:.6g}{unit} are all samples of moments inside "
-                    f"(t0, tf) = ({experiment.t0}, {experiment.earliest_end}): give it narrower bounds, move t0 "
-                    "or tf, or leave out samples at the ends."
+                    f"the delay {item.delay!r} may lie in [{least}, {most}]{unit}, but only from {low:.6g} to "
+                    f"{high:.6g}{unit} are all samples inside (t0, tf) = ({experiment.t0}, {experiment.earliest_end}): "
+                    "give it narrower bounds, move t0 or tf, or leave out samples at the ends."
                 )
 
 
@@ -381,8 +380,7 @@ class Problem:
             if changed:
                 raise ValueError(
                     f"{', '.join(changed)} does something else in this process, or now, than when the problem was "
-                    "built: it reads something that has changed since. Then build the problem anew before it is sent "
-                    "to other processes."
+                    "built, as what it reads has changed: build the problem anew before it is sent to other processes."
                 )
 
     @property
@@ -789,8 +787,7 @@ def require_samples(problem: Problem) -> None:
     for name, run in zip(names, problem.experiments, strict=True):
         if not all(len(item.times) for item in run.measurements):
             raise ValueError(
-                f"the Measurements of {name} have no samples: give times and values. Only sf.OnlineEstimator goes "
-                "without."
+                f"the Measurements of {name} have no samples: give times and values (sf.OnlineEstimator needs none)."
             )
 
 

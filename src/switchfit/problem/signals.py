@@ -142,9 +142,8 @@ def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePo
     step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
     if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
         raise ValueError(
-            f"lowpass_hz must not need more than {MOST_FILTERED} points, ten per period; got {cutoff_hz:g} Hz for a "
-            f"signal from {start:g} to {end:g}. Its samples show nothing above "
-            f"{0.5 / np.min(np.diff(signal.knots)):.3g} Hz; a higher cut-off filters nothing."
+            f"lowpass_hz must not need more than {MOST_FILTERED} points, ten per period; got {cutoff_hz:g} Hz from "
+            f"{start:g} to {end:g}. Samples show nothing above {0.5 / np.min(np.diff(signal.knots)):.3g} Hz."
         )
     grid = np.linspace(start, end, max(int(np.ceil((end - start) / step)) + 1, 8))
     rate = (len(grid) - 1) / (end - start)

@@ -9,7 +9,7 @@ Lengths to which arrays are padded, so that experiments of similar size share on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise, product
@@ -28,9 +28,9 @@ from switchfit.problem.data import (
     TransitionCost,
 )
 from switchfit.problem.experiment import Experiment, initial_state_of, insert_jumps
-from switchfit.problem.functions import Function, Shape, trace_function
+from switchfit.problem.functions import Call, Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter
-from switchfit.problem.system import HybridSystem
+from switchfit.problem.system import AtTransitions, HybridSystem
 
 
 def pad_length(length: int) -> int:
@@ -274,23 +274,13 @@ class _Tracer:
         self.read: dict[str, set[int]] = {}
         self._key = tuple(self.shapes.items()), hidden
 
-    def __call__(
-        self,
-        function: Callable[..., Any],
-        arguments: tuple[Shape | None, ...],
-        shape: Shape | None,
-        what: str,
-        form: str,
-        inputs: tuple[str, ...] = (),
-    ) -> Function:
-        """Trace a function with arguments of these shapes, None standing for p, and a result of the given shape."""
-        key = (id(function), arguments, shape, what, inputs, self._key)
+    def __call__(self, *given: Any) -> Function:
+        """Trace a function, given what a `Call` consists of."""
+        call = Call(*given)
+        key = (id(call.function), call[1:], self._key)
         traced = self._traced.get(key)
         if traced is None:
-            traced = trace_function(
-                function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape, inputs=inputs
-            )
-            self._traced[key] = traced
+            traced = self._traced[key] = trace_function(call, self.shapes, self.hidden)
         for name, entries in traced.read.items():
             self.read.setdefault(name, set()).update(entries)
         return traced
@@ -325,11 +315,7 @@ def trace_structure(
     in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
 
     def at_transitions(
-        given: Mapping[tuple[str, str], Callable[..., Any]],
-        shape: Shape,
-        what: str,
-        form: str,
-        at_jumps: Sequence[Function | None] = (),
+        given: AtTransitions, shape: Shape, what: str, form: str, at_jumps: Sequence[Function | None] = ()
     ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
         """Return the function of each transition and jump, None for one without, and those of all possible ones."""
         own = list(pairwise(experiment.mode_sequence))
@@ -430,9 +416,7 @@ def _select_parameters(trace: _Tracer, structure: Structure) -> tuple[tuple[str,
     )
 
 
-def _choose_transition_costs(
-    items: list[TransitionCost], modes: tuple[str, ...]
-) -> dict[tuple[str, str], Callable[..., Any]]:
+def _choose_transition_costs(items: list[TransitionCost], modes: tuple[str, ...]) -> AtTransitions:
     """Return the cost of each transition that may happen and has one."""
     found = {}
     for before, after in product(modes, modes):

@@ -23,6 +23,9 @@ ResetMap = Callable[..., Any]
 Guard = Callable[..., Any]
 """``g(t, x, p) -> ()``: zero where a transition happens, of the state just before it."""
 
+AtTransitions = Mapping[tuple[str, str], Callable[..., Any]]
+"""Functions by the modes before and after a transition."""
+
 
 @dataclass(frozen=True, eq=False)
 class HybridSystem:
@@ -194,9 +197,7 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
     return state
 
 
-def _check_pairs(
-    given: Mapping[tuple[str, str], Callable[..., Any]] | None, name: str, modes: Mapping[str, VectorField]
-) -> dict[tuple[str, str], Callable[..., Any]]:
+def _check_pairs(given: AtTransitions | None, name: str, modes: Mapping[str, VectorField]) -> AtTransitions:
     """Return functions of transitions, by the modes before and after."""
     if not isinstance(given, Mapping | None):
         raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shorten(given)}.")

@@ -257,7 +257,8 @@ def list_unknowns(
 
     def add(name: str, unit: str, parameter: Parameter) -> slice:
         first = len(names)
-        names.extend(f"{name}{_index(k)}" for k in np.ndindex(parameter.shape))
+        entries = map(_index, np.ndindex(parameter.shape)) if parameter.shape else [""]
+        names.extend(f"{name}{entry}" for entry in entries)
         units.extend([unit] * parameter.value.size)
         pieces.append(parameter)
         return slice(first, len(names))
@@ -285,19 +286,18 @@ def list_unknowns(
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Two unknowns share a name: {join_names(twice)}; rename the parameter or the experiment.")
-    columns = {key: [getattr(q, key).ravel() for q in pieces] for key in ("value", "lower", "upper")}
-    flat = {key: np.concatenate([np.zeros(0), *column]) for key, column in columns.items()}
+    columns = ([getattr(q, key).ravel() for q in pieces] for key in ("value", "lower", "upper"))
+    value, lower, upper = (np.concatenate([np.zeros(0), *column]) for column in columns)
     priors = PriorTerms.join([PriorTerms.of(None, (0,)), *(PriorTerms.of(q.prior, q.shape) for q in pieces)])
     log = np.array([q.scale == "log" for q in pieces for _ in range(q.value.size)], dtype=bool)
     starts = tuple(experiment.t0 for experiment in experiments)
     A, b, rows = _build_ordering(experiments, where, len(names), durations)
-    vectors = flat["value"], flat["lower"], flat["upper"]
     places = tuple(where), spans, tuple(states)
-    return Unknowns(tuple(names), tuple(units), *vectors, *places, A, b, rows, priors, log, starts)
+    return Unknowns(tuple(names), tuple(units), value, lower, upper, *places, A, b, rows, priors, log, starts)
 
 
 def _index(k: tuple[int, ...]) -> str:
-    return f"[{','.join(map(str, k))}]" if k else ""
+    return f"[{','.join(map(str, k))}]"
 
 
 def get_min_duration(min_duration: float | Mapping[str, float], mode: str) -> float:

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import datetime
 import inspect
+import math
 import numbers
 import operator
 import os
@@ -255,7 +256,7 @@ def as_number(value: Any, what: str) -> float:
 def as_finite(value: Any, what: str) -> float:
     """Return `value` as a finite float."""
     number = as_number(value, what)
-    if not np.isfinite(number):
+    if not math.isfinite(number):
         raise ValueError(f"{what} must be finite; got {number}.")
     return number
 
@@ -435,7 +436,7 @@ def refuse_single_precision(value: Any, what: str) -> None:
             whole = (wide == np.rint(wide)) & (np.abs(wide) <= 2**24)
         doubtful &= ~(short | whole)
     places = np.flatnonzero(doubtful)
-    meant = np.array([float(str(number)) for number in given[places]])  # the shortest decimals
+    meant = np.array([_find_shortest_decimal(number) for number in given[places]])
     changed = np.flatnonzero(meant != wide[places])
     if not changed.size:
         return
@@ -448,6 +449,14 @@ def refuse_single_precision(value: Any, what: str) -> None:
         f"{what} must be in double precision: {float(meant[first])!r} became {float(wide[places[first]])!r} "
         f"({given.dtype.name}). {advice}"
     )
+
+
+def _find_shortest_decimal(number: Any) -> float:
+    """Return the double with the shortest decimal text of a finite low-precision number."""
+    # NumPy has no shortest texts of bfloat16 and similar types.
+    digits = (f"{float(number):.{count}e}" for count in range(17))
+    texts = [str(number)] if isinstance(number, np.floating) else digits
+    return next(float(text) for text in texts if type(number)(float(text)) == number)
 
 
 # --- everything else --------------------------------------------------------------------------------------------------
