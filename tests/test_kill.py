@@ -70,10 +70,10 @@ TIMES = {
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files, hidden ones too, without the times that were measured."""
+    """All files but the temporary ones that a kill left, without the times that were measured."""
     found = {}
     for path in sorted(folder.rglob("*")):
-        if path.is_file():
+        if path.is_file() and not path.name.startswith(".switchfit-"):
             pattern, nothing = TIMES.get(path.suffix, (rb"$.", b""))
             found[str(path.relative_to(folder))] = re.sub(pattern, nothing, path.read_bytes())
     return found
