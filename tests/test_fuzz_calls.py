@@ -359,7 +359,7 @@ SYSTEM_WORDS = {
     "modes": ("mode",),
     "reset_maps": ("reset",),
     "guards": ("guard",),
-    "initial_state": ("initial_state", "state"),
+    "initial_state": ("initial_state", "state", "the guess leads"),
 }
 PROBLEM = {"system": system(), "experiments": experiment(), "parameters": PARAMETERS}
 PROBLEM_WORDS = {"parameters": ("parameter", "mode"), "experiments": ("experiment",)}

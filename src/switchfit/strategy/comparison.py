@@ -272,9 +272,9 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
 def _check_estimates(estimates: Any, names: Any) -> tuple[list[Estimate], tuple[str, ...]]:
     """Return the estimates and their names, checked."""
     fits = list(as_sequence(estimates, "estimates", "a sequence of results of sf.estimate"))
-    wrong = next((fit for fit in fits if not isinstance(fit, Estimate)), None)
-    if wrong is not None:
-        raise TypeError(f"compare needs results of sf.estimate; got {type(wrong).__name__}.")
+    wrong = [type(fit).__name__ for fit in fits if not isinstance(fit, Estimate)]
+    if wrong:
+        raise TypeError(f"compare needs results of sf.estimate; got {wrong[0]}.")
     if len(fits) < 2:
         raise ValueError(f"compare needs two estimates or more; got {len(fits)}.")
     given = tuple(f"model{k + 1}" for k in range(len(fits))) if names is None else names
