@@ -26,12 +26,13 @@ import numpy as np
 import switchfit as sf
 from switchfit import cli
 from switchfit.batch import study
-from switchfit.paper import noise, runner
+from switchfit import paper
+from switchfit.paper import noise
 
 kind, folder, toss = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
 study.choose_chunk_size = lambda: 2  # many chunks, so that many moments are those of a write
 noise.QUICK_LEVELS, noise.QUICK_RUNS = (0.0, 0.25), 6
-runner.PARTS = {"lti": runner.PARTS["lti"], "noise": runner.PARTS["noise"]}
+paper.PARTS = {"lti": paper.PARTS["lti"], "noise": paper.PARTS["noise"]}
 
 system = sf.HybridSystem({"up": lambda t, x, p: p["v"] + 0 * x, "rest": lambda t, x, p: 0 * x}, [0.0])
 times = np.linspace(0.05, 1.95, 20)
