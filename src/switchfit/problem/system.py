@@ -183,9 +183,10 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
         form = "a number or an sf.Parameter"
         entries = tuple(as_parameter(entry, f"each entry of {name}", form, fixed=True) for entry in value)
         if any(entry.shape != () for entry in entries):
-            shapes = shorten([entry.shape for entry in entries])
+            wrong = next(entry.shape for entry in entries if entry.shape != ())
             raise ValueError(
-                f"each entry of {name} must be one number, or an sf.Parameter of one; got shapes {shapes}."
+                f"{name} must have one number or one sf.Parameter of one number for each state; got an entry of shape "
+                f"{wrong}."
             )
         return entries
     state = as_array(value, name, form="an array of numbers, one for each state")
