@@ -144,7 +144,7 @@ def test_what_cannot_be_compared():
     one = fit(1)
     with pytest.raises(TypeError, match=r"compare needs results of sf.estimate; got Problem"):
         sf.compare([one, one.problem])
-    with pytest.raises(TypeError, match="compare needs results of sf.estimate; got NoneType"):
+    with pytest.raises(TypeError, match=r"compare needs results of sf.estimate; got NoneType"):
         sf.compare([None, None])
     with pytest.raises(ValueError, match="compare needs two estimates or more; got 1"):
         sf.compare([one])
