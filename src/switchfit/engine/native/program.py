@@ -43,7 +43,7 @@ from switchfit.engine.native.segments import (
 )
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, list_place_lengths
+from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, layout_of, list_place_lengths
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
@@ -315,9 +315,10 @@ def _program_of(
 
 
 def drop_programs() -> None:
-    """Drop cached programs that are not in use."""
+    """Drop cached programs that are not in use, and what is known of their memory."""
     with _one_at_a_time:
         _program_of.cache_clear()
+        layout_of.cache_clear()
 
 
 def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
