@@ -219,7 +219,7 @@ PLACES: dict[str, Function] = {
     "take wrapped": lambda x: jnp.take(x, (3 * x).astype(int), mode="wrap"),
     "take of columns": lambda x: jnp.take(jnp.outer(x, x), (3 * x).astype(int), axis=1, mode="clip"),
     "take_along_axis by the state": lambda x: jnp.take_along_axis(
-        jnp.outer(x, jnp.sin(x)), (2 * jnp.outer(x, x)).astype(int) % 3, axis=1
+        jnp.outer(x, jnp.sin(x)), jnp.argsort(jnp.outer(x, x), axis=1), axis=1
     ),
     "at get with NaN by the state": lambda x: x.at[(3 * x).astype(int)].get(mode="fill"),
     "at set by the state": lambda x: x.at[(3 * x[0]).astype(int)].set(9 * x[1]),
@@ -280,6 +280,7 @@ TABLES: dict[str, Function] = {
     "interp of NaN": lambda x: jnp.interp(jnp.where(x > 0.5, x, jnp.nan), TABLE_T, TABLE_Y),
     "interp of states": lambda x: jnp.interp(x[0], np.array([-1.0, 0.5, 1.0]), x * x),
     "searchsorted of NaN": lambda x: jnp.searchsorted(LEVELS, jnp.where(x > 0.5, x, jnp.nan), side="right") * x,
+    "searchsorted by sorting": lambda x: jnp.searchsorted(TABLE_T, x, method="sort") * x,
     "searchsorted by comparing": lambda x: jnp.searchsorted(TABLE_T, x, method="compare_all") * x,
     "digitize": lambda x: jnp.digitize(x, TABLE_T) * x,
     "step table of 8 bits": lambda x: jnp.asarray(TABLE_Y)[(400 * x).astype(jnp.int8)] * x,
@@ -347,10 +348,20 @@ def some(count):
 
 
 ORDER: dict[str, Function] = {
-    "sort": lambda x: jnp.sort(some(5)(x)),
-    "argsort": lambda x: some(5)(x)[jnp.argsort(some(5)(x))],
-    "quantile": lambda x: jnp.quantile(some(6)(x), 0.3),
-    "top_k": lambda x: lax.top_k(some(6)(x), 4)[0],
+    **{f"sort {n}": lambda x, n=n: jnp.sort(some(n)(x)) for n in (2, 5, 8, 16, 17)},
+    **{f"argsort {n}": lambda x, n=n: some(n)(x)[jnp.argsort(some(n)(x))] * jnp.argsort(-some(n)(x)) for n in (2, 8)},
+    "sort with NaN": lambda x: jnp.sort(jnp.where(x > 0.5, x, jnp.nan)),
+    "sort of rows": lambda x: jnp.sort(jnp.outer(x, np.array([1.0, -1.0, 2.0])), axis=0),
+    "sort of integers": lambda x: jnp.sort((3 * x).astype(int)) * x,
+    "sort of booleans": lambda x: jnp.sort(x > 0.5) * x,
+    "sort of pairs": lambda x: lax.sort((jnp.floor(2 * x), x * np.arange(3.0)))[1],
+    "lexsort": lambda x: x[jnp.lexsort((x, jnp.floor(x)))],
+    "sort by two keys": lambda x: lax.sort((jnp.floor(x), -x, x * np.arange(3.0)), num_keys=2)[2],
+    "quantile by the state": lambda x: jnp.quantile(some(6)(x), jax.nn.sigmoid(x[0])),
+    "nanmedian": lambda x: jnp.nanmedian(jnp.where(x > 0.5, x, jnp.nan)),
+    "top_k 4": lambda x: lax.top_k(some(6)(x), 4)[0] * lax.top_k(some(6)(x), 4)[1],
+    "top_k with NaN": lambda x: lax.top_k(jnp.where(x > 0.5, x, jnp.nan), 2)[0],
+    "argpartition": lambda x: x[jnp.argpartition(x, 1)],
 }
 
 LOOPS: dict[str, Function] = {
@@ -455,10 +466,7 @@ FALLS_BACK = {
     "matrices: slogdet 6": "calls jnp.linalg.slogdet, which works with a matrix of 6 rows (limit: 5)",
     "matrices: cholesky 7": "calls jnp.linalg.cholesky, which works with a matrix of 7 rows (limit: 6)",
     "matrices: positive definite system 6": "takes more than 10000 operations",
-    "order: sort": "calls jnp.sort",
-    "order: argsort": "calls jnp.argsort",
-    "order: quantile": "calls jnp.quantile",
-    "order: top_k": "calls jax.lax.top_k",
+    "order: sort 17": "calls jnp.sort, which sorts 17 numbers that depend on the state (limit: 16)",
     "loops: known while": "cannot be traced with its derivatives: ValueError",
     "loops: while": "cannot be traced with its derivatives: ValueError",
     "loops: fori_loop as long as the state says": "cannot be traced with its derivatives: ValueError",

@@ -47,6 +47,7 @@ def test_the_page_claims_machine_code_only_for_what_has_it():
         ("indices that depend", (entries.MOST_CHOICES,)),
         ("linear systems", (arrays.MOST_ROWS_TO_PIVOT,)),
         ("Cholesky", (arrays.MOST_ROWS, arrays.MOST_KNOWN_ROWS)),
+        ("sorting", (arrays.MOST_SORTED,)),
     ],
 )
 def test_the_limits_on_the_page_are_those_of_the_code(row, limits):

@@ -26,6 +26,8 @@ from switchfit.engine.native.arrays import (
     lu,
     scatter,
     search,
+    sort,
+    top_k,
     triangular_solve,
 )
 from switchfit.engine.native.entries import (
@@ -585,6 +587,8 @@ RULES: dict[str, Callable[..., Any]] = {
     "lu": lu,
     "cholesky": cholesky,
     "triangular_solve": triangular_solve,
+    "sort": sort,
+    "top_k": top_k,
     "dot_general": _dot,
     **{f"reduce_{name}": _reduce(op) for name, op in SUMS.items()},
     **{f"reduce_{name}": _reduce(name) for name in ("and", "or", "xor")},
