@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.stats
-from test_report import made
 
 import switchfit as sf
 from switchfit.estimation.local_fit import _drop_noise_of_times
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.result import free_curvature, termination_of
+from switchfit.fit.result import termination_of
 from switchfit.fit.solution import REACH, _compute_reach, minimize_cost
 from switchfit.fit.trajectory import SimulatedProblem
 
@@ -212,14 +211,6 @@ def scaled_discharge(t, x, p):
 
 
 SCALED = sf.HybridSystem({"charge": scaled_charge, "discharge": scaled_discharge}, [0.0])
-
-
-def test_curvature_without_an_unknown_is_that_of_the_others():
-    hessian = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, 2.0], [0.5, 2.0, 1.0]])
-    fit = made(hessian=hessian, free_basis=np.eye(3))
-    found = free_curvature(fit, fit.theta_names[1:2])
-    assert found.smallest == pytest.approx(np.linalg.eigvalsh(hessian[::2, ::2])[0], rel=1e-12)
-    assert set(found.weakest) == {fit.theta_names[0], fit.theta_names[2]}
 
 
 def test_badly_scaled_unknowns_take_the_same_iterates():

@@ -753,7 +753,7 @@ STUDIES = ("Fits.", "MonteCarlo.", "Multistart.", "Bootstrap.")
 
 @pytest.fixture
 def cheap_doors(doors, monkeypatch):
-    monkeypatch.setattr("switchfit.batch.study.fit_chunk", take_long)
+    monkeypatch.setattr("switchfit.batch.study.Batch.fit", take_long)
     monkeypatch.setattr(Evaluator, "constrained", take_long)
     monkeypatch.setattr("switchfit.uncertainty.certificate.measure_derivative_gap", take_long)
     return {name: door for name, door in doors.items() if not name.startswith(STUDIES)}
