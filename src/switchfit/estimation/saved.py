@@ -33,7 +33,7 @@ from switchfit.runtime.json_records import from_json, read_document, to_json, wr
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.verdict import Verdict, judge
 
-PACKAGES = ("switchfit", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
+PACKAGES = ("switchfit", "daqp", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
 """Whose versions are kept."""
 
 
