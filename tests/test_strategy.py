@@ -110,6 +110,33 @@ def test_a_search_that_looked_once_is_enough(sigma, steps, enough):
     assert is_enough(problem, sf.estimate(problem, strategy="local"), steps) == enough
 
 
+def burn(t, x, p):
+    return p["a"] * x**2 * (1.0 - x)
+
+
+def quench(t, x, p):
+    return burn(t, x, p) - p["q"] * x
+
+
+def test_an_end_that_chi_square_allows_and_residuals_refute_is_not_the_end():
+    # A flame is quenched at 160. Every sample interval may have a minimum: an early one is 165.8, J 61.1 for 50.
+    times = np.linspace(3.0, 300.0, 100)
+    flame = sf.HybridSystem({"burn": burn, "quench": quench}, [0.01])
+
+    def pose(values, tau, a, q):
+        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("burn", "quench"), (tau,), 0.0, 300.0)
+        return sf.Problem(flame, run, {"a": a, "q": q})
+
+    truth = sf.simulate(pose(np.zeros((100, 1)), 160.0, 1.0, 0.05), times=times).states
+    values = truth + 0.01 * np.random.default_rng(7).normal(size=truth.shape)
+    near = pose(values, 166.6, 1.147, 0.044)
+    wrong = sf.estimate(near, strategy="local")
+    assert abs(wrong.transition_times[0][0] - 165.8) < 0.1 and wrong.verdict.level == "doubtful"
+    assert choice.is_explained(near, wrong.cost) and not choice.is_confirmed(near, wrong)
+    found = sf.estimate(near)
+    assert abs(found.transition_times[0][0] - 160.6) < 0.1 and found.verdict.level == "good"
+
+
 def test_what_is_no_noise_is_enough_once_a_search_agrees():
     problem = thermostat(FAR)
     wrong = sf.estimate(problem, strategy="local")
