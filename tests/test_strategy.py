@@ -131,10 +131,13 @@ def test_an_end_that_chi_square_allows_and_residuals_refute_is_not_the_end():
     values = truth + 0.01 * np.random.default_rng(7).normal(size=truth.shape)
     near = pose(values, 166.6, 1.147, 0.044)
     wrong = sf.estimate(near, strategy="local")
-    assert abs(wrong.transition_times[0][0] - 165.8) < 0.1 and wrong.verdict.level == "doubtful"
-    assert choice.is_explained(near, wrong.cost) and not choice.is_confirmed(near, wrong)
+    assert abs(wrong.transition_times[0][0] - 165.8) < 0.1
+    assert wrong.verdict.level == "doubtful"
+    assert choice.is_explained(near, wrong.cost)
+    assert not choice.is_confirmed(near, wrong)
     found = sf.estimate(near)
-    assert abs(found.transition_times[0][0] - 160.6) < 0.1 and found.verdict.level == "good"
+    assert abs(found.transition_times[0][0] - 160.6) < 0.1
+    assert found.verdict.level == "good"
 
 
 def test_what_is_no_noise_is_enough_once_a_search_agrees():

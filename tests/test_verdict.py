@@ -457,6 +457,8 @@ def test_a_search_that_was_cut_short_is_doubtful_unless_noise_of_a_known_size_is
     assert kinds(doubted) == ["search cut short"]
     assert steps(doubted) == ["next: more time"]
     assert "many starts ended by its limit of time" in str(doubted.verdict).replace("\n  ", " ")
+    for starts, level in (((40, 0, 30), "good"), ((40, 0, 1), "doubtful"), ((40, 1, 30), "bad")):
+        assert replace(doubted, starts=starts).verdict.level == level
 
 
 # --- costs without noise ----------------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Printed
 from switchfit.uncertainty.answers import (
+    AGREEING,
     BARELY_DETERMINED,
     CLEARLY_OFF,
     LEVELS,
@@ -422,9 +423,14 @@ def _find_collapsed(fit: Fit) -> Iterator[Finding]:
 
 
 def _find_cut_search(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
-    """Find a search that its limit of time has ended, unless noise of a known size is all that is left of the data."""
+    """Find a search that its limit of time has ended, unless noise of a known size is all that is left of the data, or
+    enough of its starts ended where the fit did.
+    """
     is_noise = quality is not None and quality.channels and quality.known and quality.probability >= UNLIKELY
-    if fit.status.successful and fit.steps and fit.steps[-1].ended == "time" and not is_noise:
+    tried, lower, agreeing = fit.starts or (0, 0, 0)
+    is_agreed = lower == 0 and agreeing >= max(2, AGREEING * tried)
+    is_cut = bool(fit.status.successful and fit.steps and fit.steps[-1].ended == "time")
+    if is_cut and not is_noise and not is_agreed:
         yield Finding("doubtful", Issue("search cut short", (fit.steps[-1].strategy,)), ("more time",))
 
 
