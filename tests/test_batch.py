@@ -535,7 +535,6 @@ class Interrupted:
     """Work whose third chunk is interrupted from the keyboard."""
 
     size = 2
-    most_chunks = 1
 
     def __call__(self, runs):
         if runs.start == 4:
@@ -550,14 +549,6 @@ def test_ctrl_c_returns_what_is_done(tmp_path):
     runs, arrays = run_chunks(Interrupted(), 6, folder=tmp_path / "x")
     assert set(runs) <= {0, 1, 2, 3}
     np.testing.assert_array_equal(arrays["value"], runs)
-
-
-@pytest.mark.parametrize(("samples", "engine", "together"), [(24, "auto", 4), (9000, "auto", 1), (24, "jax", 1)])
-def test_calls_take_few_chunks_of_large_logs_and_one_of_models_without_machine_code(samples, engine, together):
-    """Whose functions may call back into Python, where an error ends the program for all fits of a call."""
-    times = np.linspace(0.1, 5.9, samples)
-    problem = replace(room(sf.Measurements(times, np.zeros(samples), sigma=0.1)), engine=engine)
-    assert work_of(problem, TRUTH, TRUTH).most_chunks == together
 
 
 def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():

@@ -33,7 +33,6 @@ from switchfit.batch.program import (
     Limits,
     Varying,
     choose_chunk_size,
-    count_chunks_together,
 )
 from switchfit.batch.verdict import (
     EXPLAINED_BADLY,
@@ -238,16 +237,6 @@ class Study:
         return choose_chunk_size()
 
     @cached_property
-    def most_chunks(self) -> int:
-        """Neighbouring chunks that one call may take."""
-        return count_chunks_together(self.problem, self.meshes, self.stack_data([0])[0])
-
-    @property
-    def room(self) -> int:
-        """Most fits of any call."""
-        return self.size * self.most_chunks
-
-    @cached_property
     def arguments(self) -> tuple[Arguments, ...]:
         """Those of the problem itself."""
         return tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
@@ -274,7 +263,7 @@ class Study:
     def __call__(self, runs: range) -> Arrays:
         """Return the fits of some of the runs."""
         data, errors = self.stack_data(runs)
-        batch = Batch(self.problem, self.meshes, data, self.limits, self.room)
+        batch = Batch(self.problem, self.meshes, data, self.limits)
         chunk = batch.fit(self.list_starts(runs), retry=self.retry)
         for k, error in errors.items():
             chunk.clear_fit(k, error)
