@@ -5,7 +5,8 @@ converged costs nothing more, and chunks run side by side, one a core. On a GPU 
 Either way each is the same function of its data and start. (Lockstep on a CPU gains little, and two programs at once
 can deadlock there: XLA splits large operations among the same threads.)
 
-Fits with features that `minimize_traced` does not support are finished by `minimize`, like a single fit.
+What it does not settle, and fits with features that `minimize_traced` does not support, are done by `minimize`, like a
+single fit.
 
 What the compiled programs of many fits are written for, and the cost of a problem inside them.
 
@@ -40,7 +41,6 @@ from switchfit.fit.result import Fit, Kink, Termination, inverse_on, termination
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Result, Status
 from switchfit.optimize.problem import HessianKind
-from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, minimize_traced
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
@@ -391,18 +391,16 @@ class Batch:
         """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of a program."""
         return tuple(jnp.asarray(pad_fits(value, self.size)) for value in self.varying.values)
 
-    def fit(self, starts: FloatArray, *, retry: bool = True) -> Chunk:
+    def fit(self, starts: FloatArray) -> Chunk:
         """Fit all of them.
 
-        The program of all fits has no trust region, and a step too long may lead one astray.
+        The program of all fits has no trust region, and a step too long may lead one astray: `minimize` begins anew at
+        the start of what it does not settle, with the iterations that are left.
 
         Parameters
         ----------
         starts : (R, d)
             Feasible.
-        retry : bool
-            Whether `minimize` begins anew at the start, with the iterations that are left, where a fit ended in no
-            strict minimum; the lower cost counts. Of many starts for the same data, another one serves as well.
         """
         problem = self.evaluator.problem
         has_crossings = any(map(has_corners, problem.structures))
@@ -410,7 +408,7 @@ class Batch:
             outcome = Outcome.at_starts(starts, np)
         else:
             outcome = self._run_program(starts)
-        return self._finish_rest(outcome, starts if retry else None)
+        return self._finish_rest(outcome, starts)
 
     def evaluate(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
         """Return costs, gradients and Hessians at thetas (n, d), to one side (n,) of breakpoints.
@@ -491,11 +489,10 @@ class Batch:
         hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
         return minimize_cost(self.evaluator, start, hessian, *limits, follower=follower)
 
-    def _finish_rest(self, outcome: Outcome, starts: FloatArray | None) -> Chunk:
-        """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one.
+    def _finish_rest(self, outcome: Outcome, starts: FloatArray) -> Chunk:
+        """Return the outcomes as a chunk; fits that did not settle are done by `minimize`, one by one.
 
-        What then ends in no strict minimum is fitted from its start as well, unless `starts` is None. Meshes follow,
-        unless each fit has times of its own, with which no mesh is made.
+        Meshes follow, unless each fit has times of its own, with which no mesh is made.
         """
         problem, limits, chunk = self.evaluator.problem, self.limits, Chunk.of(outcome)
         settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
@@ -511,22 +508,15 @@ class Batch:
             before = int(chunk.iterations[k])
             try:
                 self._give_data(k)
-                left = limits._replace(max_iterations=limits.max_iterations - before)
-                results = [self._fit_on_meshes(k, nearest_feasible(problem.constraints, chunk.theta[k]), left)]
-                left = left._replace(max_iterations=left.max_iterations - results[0].iterations)
-                # The program has no trust region: where it led to no strict minimum, its start is tried once more with
-                # one.
-                strayed = before > 0 and not results[0].status.is_strict_minimum
-                if starts is not None and strayed and left.max_iterations > 0:
-                    results.append(self._fit_on_meshes(k, starts[k], left))
+                found = self._fit_on_meshes(
+                    k, starts[k], limits._replace(max_iterations=limits.max_iterations - before)
+                )
             except Exception as error:  # of any kind: the other fits go on
                 chunk.set_error(k, error)
                 chunk.free[k] = 0
                 continue
-            best = min(results, key=lambda one: np.nan_to_num(one.cost, nan=np.inf))
-            total, evaluations = (sum(getattr(one, name) for one in results) for name in ("iterations", "evaluations"))
-            best = replace(best, iterations=total, evaluations=evaluations)
-            chunk.replace_fit(k, best, str(termination_of(replace(best, iterations=before + total), problem)))
+            termination = termination_of(replace(found, iterations=before + found.iterations), problem)
+            chunk.replace_fit(k, found, str(termination))
         return chunk
 
 

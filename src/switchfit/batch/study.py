@@ -229,7 +229,6 @@ class Study:
     seed: int
 
     shares_problem = True  # whether bounds, sample times and meshes are those of `problem`
-    retry = True  # whether a fit that strayed is fitted from its start too
     is_finished = True  # whether fits are done again that need it, and get pieces
 
     @property
@@ -265,7 +264,7 @@ class Study:
         """Return the fits of some of the runs."""
         data, errors = self.stack_data(runs)
         batch = Batch(self.problem, self.meshes, data, self.limits)
-        chunk = batch.fit(self.list_starts(runs), retry=self.retry)
+        chunk = batch.fit(self.list_starts(runs))
         for k, error in errors.items():
             chunk.clear_fit(k, error)
         return self.finish_fits(chunk, runs, batch) if self.is_finished else self.describe_fits(chunk, runs)
