@@ -9,14 +9,12 @@ import stat
 import subprocess
 import sys
 import threading
-import time
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from switchfit.batch import chunks
 from switchfit.batch.chunks import run_chunks
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 from switchfit.runtime.files import write_atomically
@@ -162,7 +160,6 @@ class Squares:
     """Work whose runs are known: numbers, an array a run, and text."""
 
     size = 3
-    most_chunks = 1
 
     def __init__(self, name="squares"):
         self.name = name
@@ -181,7 +178,6 @@ class Heavy:
     """Chunks of 5 kB."""
 
     size = 2
-    most_chunks = 1
 
     def __call__(self, runs):
         return {"value": np.repeat(np.asarray(runs, dtype=float)[:, None], 300, axis=1)}
@@ -282,73 +278,6 @@ def test_a_chunk_with_damaged_bytes(seed, study):
     for name, array in arrays.items():
         np.testing.assert_array_equal(found[name], array)
     again(folder, arrays, [])
-
-
-class Together(Squares):
-    """Work that may take several chunks at once, and takes some time for each run."""
-
-    most_chunks = 4
-
-    def __init__(self, seconds):
-        super().__init__()
-        self.seconds = seconds
-        self.lengths = []
-
-    def __call__(self, runs):
-        time.sleep(self.seconds * len(runs))
-        self.lengths.append(len(runs))
-        return super().__call__(runs)
-
-
-def test_quick_chunks_are_taken_together(tmp_path, monkeypatch):
-    """Files and arrays are those of chunks that are taken one by one; at the end no core waits for a long call."""
-    monkeypatch.setattr(chunks, "count_cores", lambda: 1)
-    _, expected = run_chunks(Squares(), 210, folder=tmp_path / "one by one")
-    work, told = Together(0.0), []
-    runs, found = run_chunks(
-        work, 210, folder=tmp_path / "together", progress=lambda done, total: told.append((done, total))
-    )
-    assert max(work.lengths) == 4 * Squares.size
-    assert work.lengths[-chunks.CALLS :] == [Squares.size] * chunks.CALLS
-    done = [0, *(done for done, _ in told)]
-    assert sorted(np.diff(done)) == sorted(work.lengths)  # two calls may end in the other order
-    assert {total for _, total in told} == {done[-1]} == {210}
-    np.testing.assert_array_equal(runs, np.arange(210))
-    for name, array in expected.items():
-        np.testing.assert_array_equal(found[name], array)
-    for path in (tmp_path / "one by one").glob("*.npz"):
-        with np.load(path) as one, np.load(tmp_path / "together" / path.name) as other:
-            assert one.files == other.files
-            for name in set(one.files) - {"seal"}:  # of text that may stand in a wider array
-                np.testing.assert_array_equal(one[name], other[name])
-
-
-def test_slow_chunks_are_taken_one_by_one(monkeypatch):
-    monkeypatch.setattr(chunks, "count_cores", lambda: 1)
-    monkeypatch.setattr(chunks, "QUICK", 0.002)
-    work = Together(0.001)
-    run_chunks(work, 60)
-    assert work.lengths == [Squares.size] * 20
-
-
-def test_chunks_with_a_gap_between_them_are_not_taken_together(tmp_path, monkeypatch):
-    monkeypatch.setattr(chunks, "count_cores", lambda: 1)
-    _, expected = run_chunks(Squares(), 210, folder=tmp_path)
-    for path in sorted(tmp_path.glob("*.npz"))[::2]:
-        path.unlink()
-    work = Together(0.0)
-    _, found = run_chunks(work, 210, folder=tmp_path)
-    assert work.lengths == [Squares.size] * 35
-    np.testing.assert_array_equal(found["row"], expected["row"])
-
-
-def test_all_chunks_of_a_call_are_kept_where_it_is_the_last(tmp_path, monkeypatch):
-    monkeypatch.setattr(chunks, "count_cores", lambda: 1)
-    work = Together(0.0)
-    runs, found = run_chunks(work, 210, folder=tmp_path, progress=lambda done, total: max(work.lengths) > Squares.size)
-    assert len(runs) % Squares.size == 0
-    assert len(list(tmp_path.glob("*.npz"))) == len(runs) // Squares.size
-    np.testing.assert_array_equal(found["square"], runs**2.0)
 
 
 def test_chunks_of_a_study_that_goes_on_further(study):

@@ -111,7 +111,6 @@ class Endless:
     """Work whose second chunk takes very long."""
 
     size = 1
-    most_chunks = 1
 
     def __init__(self):
         self.released = threading.Event()

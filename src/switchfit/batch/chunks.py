@@ -12,10 +12,8 @@ import functools
 import hashlib
 import io
 import os
-import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing
 from fnmatch import fnmatch
 from pathlib import Path
@@ -38,11 +36,8 @@ Arrays = dict[str, NDArray[Any]]
 RETRIES = 3
 """Times a chunk is tried again on a Dask cluster after an error."""
 
-QUICK = 0.5
-"""Seconds: where a chunk takes less, one call takes several, as many as take this long ..."""
-
-CALLS = 8
-"""... as long as that leaves each core so many calls: no core shall wait long for the last one."""
+MANY = 8
+"""Chunks a core from which there is one thread more than cores."""
 
 
 def run_chunks(
@@ -53,10 +48,9 @@ def run_chunks(
     Parameters
     ----------
     work : object
-        Called with a range of runs, of one chunk or of several neighbouring ones, it returns arrays with one entry for
-        each. It has the number of runs in a chunk, `size`; the most chunks that one call may take, `most_chunks`; and
-        ``fingerprint()``, a digest that changes with everything that a result depends on. For a Dask cluster it must
-        survive pickling.
+        Called with the range of runs of a chunk, it returns arrays with one entry for each. It has the number of runs
+        in a chunk, `size`, and ``fingerprint()``, a digest that changes with everything that a result depends on. For a
+        Dask cluster it must survive pickling.
     count : int
     client : dask.distributed.Client, optional
         Where the chunks are computed; in threads of this process, one a core, if left out. A chunk whose worker is
@@ -90,12 +84,11 @@ def run_chunks(
         computed = _run_in_threads(work, missing) if client is None else _run_on_cluster(work, missing, client)
         with closing(computed):
             try:
-                for together in computed:
-                    for chunk, arrays in together:
-                        results[chunk.start] = arrays
-                        if store is not None:
-                            store.save(chunk, arrays)
-                        done += len(chunk)
+                for chunk, arrays in computed:
+                    results[chunk.start] = arrays
+                    if store is not None:
+                        store.save(chunk, arrays)
+                    done += len(chunk)
                     if progress is not None and progress(done, count):
                         break
             except KeyboardInterrupt:
@@ -108,60 +101,28 @@ def run_chunks(
     return runs, {name: np.concatenate([results[chunk.start][name] for chunk in finished]) for name in names}
 
 
-def _run_in_threads(work: Any, chunks: list[range]) -> Generator[list[tuple[range, Arrays]]]:
-    """Yield chunks as they are done by threads; JAX's programs run outside Python's lock.
-
-    Several chunks in one call take less of Python, for whose lock the threads wait.
-    """
+def _run_in_threads(work: Any, chunks: list[range]) -> Generator[tuple[range, Arrays]]:
+    """Yield chunks as they are done by threads; JAX's programs run outside Python's lock."""
     cores = count_cores()
     # One thread more where there are many chunks: it works while another one waits for the lock.
-    pool = ThreadPoolExecutor(cores + (len(chunks) >= CALLS * cores))
-    waiting, calls, most = deque(chunks), dict[Future[tuple[Arrays, float]], list[range]](), 1
+    pool = ThreadPoolExecutor(cores + (len(chunks) >= MANY * cores))
+    calls = {pool.submit(work, chunk): chunk for chunk in chunks}
     try:
-        while waiting or calls:
-            while waiting and len(calls) < 2 * cores:
-                taken = _take_neighbours(waiting, min(most, len(waiting) // (CALLS * cores)))
-                calls[pool.submit(_time_call, work, range(taken[0].start, taken[-1].stop))] = taken
-            finished = wait(calls, return_when=FIRST_COMPLETED).done
-            for future in sorted(finished, key=lambda future: calls[future][0].start):
-                taken = calls.pop(future)
-                arrays, seconds = future.result()
-                most = min(work.most_chunks, int(len(taken) * QUICK / max(seconds, 1e-9)))
-                yield list(_split_arrays(arrays, taken))
+        for future in as_completed(calls):
+            yield calls[future], future.result()
     finally:
         # Stopped early, a chunk under way may take long: it ends by itself, and nobody waits for it.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _take_neighbours(waiting: deque[range], most: int) -> list[range]:
-    """Take the first chunk that waits, and those that follow without a gap, up to `most`."""
-    taken = [waiting.popleft()]
-    while waiting and len(taken) < most and waiting[0].start == taken[-1].stop:
-        taken.append(waiting.popleft())
-    return taken
-
-
-def _time_call(work: Any, runs: range) -> tuple[Arrays, float]:
-    """Return what the work returns, and how long it took."""
-    began = time.perf_counter()
-    return work(runs), time.perf_counter() - began
-
-
-def _split_arrays(arrays: Arrays, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:
-    """Yield each of neighbouring chunks with its part of their arrays."""
-    for chunk in chunks:
-        first, last = chunk.start - chunks[0].start, chunk.stop - chunks[0].start
-        yield chunk, {name: array[first:last] for name, array in arrays.items()}
-
-
-def _run_on_cluster(work: Any, chunks: list[range], client: Any) -> Generator[list[tuple[range, Arrays]]]:
+def _run_on_cluster(work: Any, chunks: list[range], client: Any) -> Generator[tuple[range, Arrays]]:
     """Yield chunks as they are done by the workers of a Dask cluster.
 
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
     them; a worker unpickles them once, or it would compile the model's functions anew for every chunk.
     """
     import cloudpickle
-    from distributed import as_completed
+    import distributed
 
     blob = cloudpickle.dumps(work)
     shared = client.submit(_receive, blob, pure=False)
@@ -170,8 +131,8 @@ def _run_on_cluster(work: Any, chunks: list[range], client: Any) -> Generator[li
         for chunk in chunks
     }
     try:
-        for future in as_completed(list(futures)):
-            yield [(futures[future], future.result())]
+        for future in distributed.as_completed(list(futures)):
+            yield futures[future], future.result()
     finally:
         client.cancel([*futures, shared])
 

@@ -100,7 +100,6 @@ class StudyOfLogs(Study):
     problems: list[Problem]
 
     shares_problem = False
-    room, most_chunks = 0, 1  # the meshes of a call are those of one of its logs
 
     def __call__(self, runs: range) -> Arrays:
         """Fits of some of the problems: those whose programs agree go together, and then back into their order."""

@@ -191,7 +191,7 @@ def multistart(
         points = _check_starts(problem, starts)
     else:
         points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
-    study = StudyOfStarts(problem, _find_meshes(problem, points), points, limits, seed)
+    study = Study(problem, _find_meshes(problem, points), points, limits, seed)
     found = repeat(problem, study, len(points), "Multistart", how)
     best, errors = _find_best(problem, Fits(**found), limits)
     status, message = found["status"].tolist(), found["message"].tolist()
@@ -233,12 +233,6 @@ def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Estimate |
         except Exception as error:  # of this end alone: listed
             errors[k] = error
     return None, errors
-
-
-class StudyOfStarts(Study):
-    """The runs of a multistart."""
-
-    retry = False  # another start serves as well
 
 
 def _check_starts(problem: Problem, starts: Any) -> FloatArray:

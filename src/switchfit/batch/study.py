@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -33,7 +33,6 @@ from switchfit.batch.program import (
     Limits,
     Varying,
     choose_chunk_size,
-    count_chunks_together,
 )
 from switchfit.batch.verdict import (
     EXPLAINED_BADLY,
@@ -61,12 +60,12 @@ from switchfit.uncertainty.walks import (
     MOST_RUNS,
     PIECE,
     Derivatives,
-    Samples,
     Walks,
     is_any_near,
     join_walks,
     list_transitions,
     list_walks,
+    stack_sample_times,
     trace_walks,
 )
 
@@ -155,16 +154,16 @@ def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Itera
         free = variances > 0
     ends = problem.ends_of_modes(theta)
     for row, (e, place) in enumerate(list_transitions(problem)):
-        tau, samples = theta[:, place], Samples.of(problem, theta, e)
+        tau, samples = theta[:, place], stack_sample_times(problem, theta, e)
         collapsed = np.sum(ends[e] == tau[:, None], axis=1) > 1  # ties it to another time
         held = (chunk.status[fits] == AT_KINK) & (variances[:, place] == 0)
         with np.errstate(invalid="ignore"):
-            within = np.abs(samples.times - tau[:, None]) <= (quantile * errors[:, place])[:, None]
+            within = np.abs(samples - tau[:, None]) <= (quantile * errors[:, place])[:, None]
         few = np.sum(within, axis=1) <= MOST_SAMPLES
         taken = ~collapsed & (held | (few & is_any_near(samples, tau, errors[:, place])))
         if taken.any():
-            own = Samples(*(each[taken] for each in samples))
-            walks = list_walks(problem, e, place, theta[taken], free[taken], thresholds[taken], own, MOST_KEPT)
+            own = theta[taken], free[taken], thresholds[taken], samples[taken]
+            walks = list_walks(problem, e, place, *own, MOST_KEPT)
             yield np.tile(fits[taken], 2), np.full(len(walks.place), row), walks
 
 
@@ -196,10 +195,11 @@ def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatAr
     return error <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 
 
-def replace_fit(chunk: Chunk, k: int, again: Estimate) -> None:
-    """Replace the k-th fit by an estimate."""
+def replace_fit(chunk: Chunk, batch: Batch, k: int, again: Estimate) -> None:
+    """Replace the k-th fit by an estimate, on meshes of its own."""
     ordinary = again.status is Status.CONVERGED and not again.active
     chunk.replace_fit(k, again, "" if ordinary else again.message)
+    batch.own[k] = again.evaluator_at_solution
 
 
 CHUNK_FORMAT = "fits 3"
@@ -229,23 +229,12 @@ class Study:
     seed: int
 
     shares_problem = True  # whether bounds, sample times and meshes are those of `problem`
-    retry = True  # whether a fit that strayed is fitted from its start too
     is_finished = True  # whether fits are done again that need it, and get pieces
 
     @property
     def size(self) -> int:
         """Runs in a chunk."""
         return choose_chunk_size()
-
-    @cached_property
-    def most_chunks(self) -> int:
-        """Neighbouring chunks that one call may take."""
-        return count_chunks_together(self.problem, self.meshes, self.stack_data([0])[0])
-
-    @property
-    def room(self) -> int:
-        """Most fits of any call."""
-        return self.size * self.most_chunks
 
     @cached_property
     def arguments(self) -> tuple[Arguments, ...]:
@@ -274,8 +263,8 @@ class Study:
     def __call__(self, runs: range) -> Arrays:
         """Return the fits of some of the runs."""
         data, errors = self.stack_data(runs)
-        batch = Batch(self.problem, self.meshes, data, self.limits, self.room)
-        chunk = batch.fit(self.list_starts(runs), retry=self.retry)
+        batch = Batch(self.problem, self.meshes, data, self.limits)
+        chunk = batch.fit(self.list_starts(runs))
         for k, error in errors.items():
             chunk.clear_fit(k, error)
         return self.finish_fits(chunk, runs, batch) if self.is_finished else self.describe_fits(chunk, runs)
@@ -286,18 +275,15 @@ class Study:
 
     def finish_fits(self, chunk: Chunk, runs: range, batch: Batch) -> Arrays:
         """Return the arrays of fits, of which those that need it are done again, with pieces of profiles."""
-        before = chunk.theta.copy()
-        self._redo_unresolved(chunk, runs)
+        self._redo_unresolved(chunk, runs, batch)
         if self.problem.constraint_names:
-            self._redo_doubted(chunk, runs)
+            self._redo_doubted(chunk, runs, batch)
         if any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
             return self.describe_fits(chunk, runs)
-        for k in np.flatnonzero(find_replaced(before, chunk)).tolist():
-            batch.own[k] = cache(partial(self._build_own, runs[k], chunk.theta[k]))
         pieces = trace_chunk(chunk, self.group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
 
-    def _redo_unresolved(self, chunk: Chunk, runs: range) -> None:
+    def _redo_unresolved(self, chunk: Chunk, runs: range, batch: Batch) -> None:
         """Replace fits whose integration error is too large by those that `estimate` finds.
 
         Of fits that share meshes, those that failed are looked at. A mode that is active elsewhere than where the
@@ -318,9 +304,9 @@ class Study:
                     chunk.set_error(k, error)
                 continue  # a fit from this end fails too: the first one stays, and is listed as failed
             if again.status.successful or not failed[k]:
-                replace_fit(chunk, k, again)
+                replace_fit(chunk, batch, k, again)
 
-    def _redo_doubted(self, chunk: Chunk, runs: range) -> None:
+    def _redo_doubted(self, chunk: Chunk, runs: range, batch: Batch) -> None:
         """Replace fits that did not converge, lost modes or are far from their data by better ones, if there are any.
 
         Only of problems with guards or terminal constraints, which the compiled program does not take.
@@ -345,11 +331,7 @@ class Study:
                     continue
                 before = chunk.cost[k] if has_converged(chunk.status)[k] else np.inf
                 if again.status.successful and again.cost < before:
-                    replace_fit(chunk, k, again)
-
-    def _build_own(self, run: int, theta: FloatArray) -> Evaluator:
-        """Return the evaluator of a fit that was done again."""
-        return Evaluator(self.problem_of(run), theta)
+                    replace_fit(chunk, batch, k, again)
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
         """Return the arrays of fits as they are, without pieces of profiles."""
@@ -371,8 +353,3 @@ class Study:
         return compute_fingerprint(
             CHUNK_FORMAT, settings, self.problem.digests, self.starts, *bounds, *data.values, *shared
         )
-
-
-def find_replaced(before: FloatArray, chunk: Chunk) -> NDArray[np.bool_]:
-    """Return which fits of a chunk are not those that ended at these thetas: (R,)."""
-    return np.asarray(np.any(before != chunk.theta, axis=1))

@@ -93,12 +93,6 @@ class Evaluator:
         """The same problem with every cell of its meshes cut in two."""
         return self.divide(2)
 
-    def pad_like(self, finer: Evaluator) -> Evaluator:
-        """Return the same problem with meshes as long as those of a finer evaluator, so that both share programs."""
-        lengths = [len(mesh.nodes) - 1 for mesh in finer.meshes]
-        meshes = [mesh.pad_to(length) for mesh, length in zip(self.meshes, lengths, strict=True)]
-        return Evaluator(self.problem, meshes=meshes)
-
     def halve_rows(self, theta: FloatArray) -> Evaluator:
         """Return the same problem with every step at theta cut in two, to estimate the integration error."""
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]

@@ -149,8 +149,8 @@ class SampleDerivatives(NamedTuple):
     experiment : (S,) int
     item, channel : (S,) int
         Indices of the Measurements in the experiment, and of the channel in it.
-    time, residual, weight : (S,)
-        Sample time in the experiment's time unit, fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown).
+    residual, weight : (S,)
+        Fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown).
     derivative : (S, d)
         Derivative of the fitted value in theta.
     """
@@ -158,7 +158,6 @@ class SampleDerivatives(NamedTuple):
     experiment: NDArray[np.intp]
     item: NDArray[np.intp]
     channel: NDArray[np.intp]
-    time: FloatArray
     residual: FloatArray
     weight: FloatArray
     derivative: FloatArray
@@ -181,14 +180,13 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
             q = item.values.shape[1]
             points = found.at(item.seen_times)
             there = ~np.isnan(item.values)
-            where = np.argwhere(there)
+            channels = np.nonzero(there)[1]
             fitted, slope = points.outputs[:, first : first + q], points.outputs_d[:, first : first + q]
             columns.append(
                 (
-                    np.full(len(where), e),
-                    np.full(len(where), k),
-                    where[:, 1],
-                    item.times[where[:, 0]],
+                    np.full(len(channels), e),
+                    np.full(len(channels), k),
+                    channels,
                     (fitted - np.nan_to_num(item.values))[there],
                     item.weights[there],
                     slope[there],

@@ -83,8 +83,6 @@ class ChannelResiduals:
         Number of residuals beyond four standard deviations; 0.001 are expected in 16 samples.
     origin : Origin or None
         The date at which times are 0; None where they are no dates.
-    fitted_unknowns : float
-        Number of unknowns that were fitted to the channel, shared among channels by their numbers of samples.
 
     See Also
     --------
@@ -118,7 +116,6 @@ class ChannelResiduals:
     effective: float
     outliers: int
     origin: Origin | None = None
-    fitted_unknowns: float = 0.0
 
     def __repr__(self) -> str:
         return format_line(self, self.name, f"{len(self.values)} values", f"rms = {self.rms:.3g}")
@@ -150,6 +147,11 @@ class ChannelResiduals:
         """
         size = self.rms if self.sigma_known else 1.0
         return max(1.0, size * self.narrowing)
+
+    @property
+    def is_seriously_correlated(self) -> bool:
+        """Whether the correlation of the residuals has an effect on standard errors that matters."""
+        return self.correlation > 0 and min(self.narrowing, self.widening) > SERIOUS
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,15 +196,14 @@ class ResidualDiagnostics(Tabular, Printed):
         The probability of a false alarm is divided among the channels.
         """
         shared = UNLIKELY / max(len(self.channels), 1)
-        return tuple(c.whiteness < shared and c.correlation > 0 and c.narrowing > SERIOUS for c in self.channels)
+        return tuple(c.whiteness < shared and c.is_seriously_correlated for c in self.channels)
 
     @property
     def issues(self) -> list[Issue]:
         """Failed tests: channels whose residuals are correlated, and channels whose residuals are not normal."""
         found = []
         named = list(zip(self.labels, self.channels, strict=True))
-        tested = zip(named, self.correlated, strict=True)
-        alike = [(label, c) for (label, c), correlated in tested if correlated and c.widening > SERIOUS]
+        alike = [each for each, correlated in zip(named, self.correlated, strict=True) if correlated]
         if alike:
             figures: dict[str, float | tuple[float, ...]] = {
                 "correlation": tuple(c.correlation for _, c in alike),
@@ -351,7 +352,7 @@ def measure_widening(fit: Fit) -> FloatArray:
     found = diagnose(fit)
     factors = np.ones(len(fit.comparisons))
     for channel, correlated in zip(found.channels, found.correlated, strict=True):
-        if correlated and channel.widening > SERIOUS:
+        if correlated:
             factors[channel.experiment] = max(factors[channel.experiment], channel.widening)
     each *= factors.max(initial=1.0)
     for factor, places in zip(factors, fit.transition_places, strict=True):
@@ -423,7 +424,6 @@ def diagnose_channel(
         skewness=skewness,
         kurtosis=kurtosis,
         effective=min(n, n * (1 - first) / (1 + first)),
-        fitted_unknowns=unknowns * n,
         outliers=int(np.sum(np.abs(spread) > 4 * np.sqrt(variance))) if variance > 0 else 0,
     )
 
@@ -606,13 +606,12 @@ def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals,
     """
     z, n, tests = np.abs(residuals.values), len(residuals.values), {}
     if np.isfinite(residuals.whiteness):
-        serious = residuals.correlation > 0 and min(residuals.narrowing, residuals.widening) > SERIOUS
-        tests["model"] = residuals.whiteness if serious else 1.0
+        tests["model"] = residuals.whiteness if residuals.is_seriously_correlated else 1.0
     if comparison.downweighted is not None:
         if is_given:
             above = int(np.sum(z > SERIOUS * special.ndtri(0.75)))
             tests["sigma"] = float(special.bdtrc(above - 1, n, HALF))
-        elif _share_outliers(comparison, k) > HALF:
+        elif np.mean(comparison.downweighted[np.isfinite(comparison.residuals[:, k]), k]) > HALF:
             tests["sigma"] = 0.0
         return tests
     if n >= FEWEST and residuals.rms > 0:
@@ -680,10 +679,10 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     """
     y, residual = comparison.measured[:, k], comparison.residuals[:, k]
     there = np.isfinite(residual)
-    if comparison.downweighted is not None and _share_outliers(comparison, k) <= HALF:
-        there &= ~comparison.downweighted[:, k]
     if not there.any() or (comparison.weights is not None and comparison.weights[k] == 0):
         return np.nan, np.nan, 1.0
+    if comparison.downweighted is not None and np.mean(outliers := comparison.downweighted[there, k]) <= HALF:
+        there[there] = ~outliers
     weight = _compute_weights(comparison)[there]
     y, residual = y[there], residual[there]
     size = 1.0
@@ -696,14 +695,6 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     if spread <= NO_VARIATION**2 * about_zero:
         spread = about_zero if comparison.kind == "measurements" else 0.0
     return float(weight @ residual**2), spread, size if size > 0 else 1.0
-
-
-def _share_outliers(comparison: Comparison, k: int) -> float:
-    """Return the share of a channel's values that a robust loss treats as outliers."""
-    there = np.isfinite(comparison.residuals[:, k])
-    if comparison.downweighted is None or not there.any():
-        return 0.0
-    return float(comparison.downweighted[there, k].mean())
 
 
 def _compute_weights(comparison: Comparison) -> FloatArray:

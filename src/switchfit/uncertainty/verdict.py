@@ -17,13 +17,11 @@ import numpy as np
 from switchfit.fit.result import NAMED, Fit, disagreement, list_without_effect
 from switchfit.optimize import Status
 from switchfit.problem.inspection import name_whole_parameters
-from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Printed
 from switchfit.uncertainty.answers import (
     AGREEING,
     BARELY_DETERMINED,
-    CLEARLY_OFF,
     LEVELS,
     NEARLY_ALL,
     NO_RESIDUALS,
@@ -31,6 +29,7 @@ from switchfit.uncertainty.answers import (
     Doubt,
     Level,
     Numbers,
+    compare_with_sigma,
     find_doubts,
 )
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate, analyse_solution, certify
@@ -158,11 +157,9 @@ def _check_noise(fit: Fit) -> Iterator[Issue]:
     variance = fit.residual_variance
     if not (fit.status.successful and fit.sigma_known and np.isfinite(variance)):
         return
-    freedom = fit.freedom
-    below, above = special.chdtr(freedom, 2 * fit.cost), special.chdtrc(freedom, 2 * fit.cost)
-    if 2 * min(below, above) > UNLIKELY or abs(variance - 1) < CLEARLY_OFF:
-        return
-    yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})
+    probability, is_size = compare_with_sigma(2 * fit.cost, fit.freedom)
+    if probability < UNLIKELY or not is_size:
+        yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})
 
 
 def _check_residuals(fit: Fit) -> Iterator[Issue]:

@@ -106,37 +106,6 @@ class Walks(NamedTuple):
     threshold: FloatArray
 
 
-class Samples(NamedTuple):
-    """Times of the states that were measured in an experiment, of F fits: there the slope of J in a transition time
-    jumps.
-
-    Attributes
-    ----------
-    times : (F, S)
-        Delays subtracted; NaN where a fit has fewer than others.
-    late : (F, S) bool
-        Whose delay is a parameter.
-    """
-
-    times: FloatArray
-    late: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, problem: Problem, thetas: FloatArray, e: int) -> Samples:
-        """Return those of experiment e at thetas (F, d)."""
-        shared = list_sample_times(problem, thetas[0], e)
-        if not problem.late_times(thetas[0], e).size:
-            times = np.broadcast_to(shared, (len(thetas), shared.size))
-            return cls(times, np.zeros(times.shape, dtype=bool))
-        each = [list_sample_times(problem, theta, e) for theta in thetas]
-        times = np.full((len(thetas), max(map(len, each))), np.nan)
-        late = np.zeros(times.shape, dtype=bool)
-        for f, (theta, own) in enumerate(zip(thetas, each, strict=True)):
-            times[f, : own.size] = own
-            late[f, : own.size] = np.isin(own, problem.late_times(theta, e))
-        return cls(times, late)
-
-
 def list_transitions(problem: Problem) -> Iterator[tuple[int, int]]:
     """Yield the experiment and the place in theta of each free transition time, and of a free tf."""
     for e, where in enumerate(problem.unknowns.times):
@@ -159,6 +128,25 @@ def list_sample_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray
     return np.unique(np.concatenate([problem.late_times(theta, e), *known]))
 
 
+def stack_sample_times(problem: Problem, thetas: FloatArray, e: int) -> FloatArray:
+    """Return the times of the states that were measured in an experiment, of F fits, where the slope of J in a
+    transition time jumps: (F, S), NaN where a fit has fewer than others.
+
+    Parameters
+    ----------
+    problem : Problem
+    thetas : (F, d)
+    e : int, from 0
+    """
+    if not problem.late_times(thetas[0], e).size:
+        return np.tile(list_sample_times(problem, thetas[0], e), (len(thetas), 1))
+    each = [list_sample_times(problem, theta, e) for theta in thetas]
+    times = np.full((len(thetas), max(map(len, each))), np.nan)
+    for f, own in enumerate(each):
+        times[f, : own.size] = own
+    return times
+
+
 def list_walks(
     problem: Problem,
     e: int,
@@ -166,7 +154,7 @@ def list_walks(
     thetas: FloatArray,
     free: NDArray[np.bool_],
     thresholds: FloatArray,
-    samples: Samples,
+    samples: FloatArray,
     most: int,
 ) -> Walks:
     """Return the ways from the estimates of one transition time of F fits: 2 F, first all to the left.
@@ -180,8 +168,8 @@ def list_walks(
     free : (F, d) bool
         Unknowns that are not held.
     thresholds : (F,)
-    samples : Samples
-        Of experiment e.
+    samples : (F, S)
+        Sample times of experiment e.
     most : int
         Sample times that are passed on one way; with more of them in an interval the kinks average out.
     """
@@ -201,9 +189,9 @@ def list_walks(
         neighbour = np.concatenate([knots, beyond], axis=1)[:, i + side]
         limit = np.clip(neighbour, lower[:, place], upper[:, place])
         with np.errstate(invalid="ignore"):
-            ahead = (side * (samples.times - tau[:, None]) > near) & (side * (samples.times - limit[:, None]) < 0)
-        # Where a delay is a parameter, the engines do not tell one side of a sample from the other: stop just behind.
-        marks = samples.times + np.where(samples.late, side * near, 0.0)
+            ahead = (side * (samples - tau[:, None]) > near) & (side * (samples - limit[:, None]) < 0)
+        # Stop just behind: where a delay is a parameter, engines do not tell one side of a sample from the other.
+        marks = samples + side * near
         # Samples ahead in the order in which the way meets them, then the limit, then NaN.
         outwards = np.sort(np.where(ahead, side * marks, np.inf), axis=1)[:, :most]
         stops = np.full((len(thetas), most + 2), np.nan)
@@ -427,7 +415,7 @@ def trace_profiles(
     at, places = fit.theta[None], []
     ways: list[Walks] = []
     for e, k in list_transitions(problem):
-        samples = Samples.of(problem, at, e)
+        samples = stack_sample_times(problem, at, e)
         near = is_any_near(samples, at[:, k], fit.standard_errors[k : k + 1])[0]
         if fit.theta_names[k] in kinks or (movable[k] and near):
             ways.append(list_walks(problem, e, k, at, movable[None], np.array([highest]), samples, MOST_PIECES))
@@ -461,17 +449,18 @@ def compute_threshold(fit: Fit, level: float) -> float:
     return 0.5 * fit.quantile(level) ** 2 * scale
 
 
-def is_any_near(samples: Samples, values: FloatArray, errors: FloatArray) -> NDArray[np.bool_]:
+def is_any_near(samples: FloatArray, values: FloatArray, errors: FloatArray) -> NDArray[np.bool_]:
     """Return of which fits a sample is so near to a transition time that one parabola does not give its interval: (F,).
 
     Parameters
     ----------
-    samples : Samples
+    samples : (F, S)
+        Sample times.
     values, errors : (F,)
         Of the transition time, and its standard errors.
     """
     with np.errstate(invalid="ignore"):
-        near = np.abs(samples.times - values[:, None]) <= NEAR * errors[:, None]
+        near = np.abs(samples - values[:, None]) <= NEAR * errors[:, None]
     return np.asarray((errors > 0) & near.any(axis=1))
 
 
