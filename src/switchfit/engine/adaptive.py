@@ -42,7 +42,7 @@ from switchfit.engine.jax import call_model
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
-from switchfit.engine.protocol import Run, runs_of
+from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
 from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
@@ -265,20 +265,18 @@ class _Solve:
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
         is_common = coarse is run.coarse
         whole = run.coarse_arguments if is_common else run.build_arguments(coarse)
-        self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
+        self._whole, self._arguments = whole, whole.without_mesh()
         self._native: NativeExperiment | None = None
-        named = zip(structure.mode_names, structure.implicit, strict=True)
         # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
-        methods = tuple(is_set or name in settings.implicit for name, is_set in named)
+        chosen = take_implicit_steps(structure, settings.implicit)
         if branches is None or branches.count:
             known = run.solvers.__dict__ if is_common else {}
-            key = f"{'' if branches is None else branches.version} {methods}"
+            key = f"{'' if branches is None else branches.version} {chosen.implicit}"
             if key not in known:
-                made = None
-                if methods != structure.implicit:
-                    chosen = replace(structure, implicit=methods)
-                    made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
-                known[key] = made or native_experiment(structure, whole, coarse.times, order=Order.COST)
+                made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
+                if made is None and chosen is not structure:
+                    made = native_experiment(structure, whole, coarse.times, order=Order.COST)
+                known[key] = made
             self._native = known[key]
         self._course: Course | None = None
         self._p = np.zeros(0)
@@ -297,7 +295,7 @@ class _Solve:
         inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
         steps, x = [ends[:1]], self._find_initial_state()
         if self._branches is not None:
-            self._course = Course(self._branches, structure, self._arguments, self._coarse.nodes, self._signals, p)
+            self._course = Course(self._branches, structure, self._whole, p)
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 x = self._apply_reset(i - 1, ends[i], x)
@@ -456,7 +454,7 @@ class _Solve:
 
         def slope(t: float, y: FloatArray) -> FloatArray:
             cell = min(int(times.searchsorted(min(max(t, first), last), "right")) - 1, len(times) - 2)
-            piece = Piece(times[cell], self._signals[cell])
+            piece = Piece(times[cell], self._whole.signals[cell])
             given = self._arguments, piece, t, y[:-1], self._p
             value = np.asarray(call_model(*given, structure=functions, function=_field_and_density, which=(mode,)))
             if not np.isfinite(value).all():

@@ -18,7 +18,7 @@ from switchfit.engine.native.kernels import STAGES, Curvature
 from switchfit.engine.native.llvm import Module, Program, Value, Variable
 from switchfit.engine.native.program import compile_library
 from switchfit.engine.native.scalars import CHECKED
-from switchfit.engine.native.segments import solve_stages, write_newton
+from switchfit.engine.native.segments import add_curvature, solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.writer import Pointers, Writer
 from switchfit.engine.protocol import Column
@@ -230,7 +230,7 @@ class HypothesisWriter(Writer):
         """Write steps in a mode between two times of a cell."""
         settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
         _, record, mode, cell, parts, begin, end = self.begin(f"void @steps(ptr %table, ptr %record, {settings})")
-        n, width, found, row = self.sizes.n, self.sizes.width, self.find(record), self.allocate("double", 3)
+        found, row = self.find(record), self.allocate("double", 3)
         self.put(begin, row, 1)
         self.put(self.get("double", found["nodes"], cell), row, 2)
         found |= {"row": row, "signal": self.at(found["signals"], cell, 4 * self.sizes.signals)}
@@ -246,10 +246,7 @@ class HypothesisWriter(Writer):
                 if self.library.implicit[k]:
                     solve_stages(self, f"newton_{k}", found)
                 self.call(f"step_{k}", found)
-                name, size, stages = curvatures[k]
-                for j in stages:
-                    entries, tangents = self.at(found["entries"], j * size), self.at(found["XZ"], j * n * width)
-                    self.call(name, found | {"entries": entries, "XZ": tangents})
+                add_curvature(self, curvatures[k], found, moving=False)
         return self.end()
 
     def write_propagation(self) -> str:
