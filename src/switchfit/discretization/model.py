@@ -212,17 +212,15 @@ class Model:
         r = self.sample_residual(k, sample, x, p)
         return weight * influence(sensor.loss, sensor.loss_scale, weight * r * r, jnp)
 
+    def terminal(self, x: Array, p: Array) -> Array:
+        """Return the sum of the terminal costs."""
+        return sum((phi(x, self.parameters(p)) for phi in self.structure.terminal), jnp.zeros(()))
+
     def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
         """Return the reset map R_i(t, x, p) of transition i, which must have one."""
-        return self._at_transition(self.structure.reset_maps[i], f"transition {i + 1} has no reset map.")
-
-    def guard(self, i: int) -> Callable[[Array, Array, Array], Array]:
-        """Return the guard g_i(t, x, p) of transition i, which must have one."""
-        return self._at_transition(self.structure.guards[i], f"transition {i + 1} has no guard.")
-
-    def _at_transition(self, function: Function | None, missing: str) -> Callable[[Array, Array, Array], Array]:
+        function = self.structure.reset_maps[i]
         if function is None:
-            raise ValueError(missing)
+            raise ValueError(f"transition {i + 1} has no reset map.")
         return lambda t, x, p: function(t, x, self.parameters(p))
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:
@@ -281,8 +279,7 @@ def list_transition_functions(model: Model, kind: str) -> list[tuple[int, NodeFu
 
 def get_end_cost(model: Model) -> NodeFunction | None:
     """Return the sum of the terminal costs; None without any."""
-    costs = model.structure.terminal
-    return (lambda t, x, p: sum((phi(x, model.parameters(p)) for phi in costs), jnp.zeros(()))) if costs else None
+    return (lambda t, x, p: model.terminal(x, p)) if model.structure.terminal else None
 
 
 def get_end_constraints(model: Model) -> NodeFunction | None:

@@ -260,7 +260,7 @@ class _Solve:
         branches: Branches | None = None,
     ) -> None:
         self._problem, self._structure, self._coarse, self._branches = run.problem, run.structure, coarse, branches
-        self._experiment, self._settings, self._library = run.experiment, settings, structure
+        self._experiment, self._settings = run.experiment, settings
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
         is_common = coarse is run.coarse
@@ -412,7 +412,7 @@ class _Solve:
             if len(accepted) > most_of_branch:
                 raise BranchError
             # At the pace of the last steps: a stiff mode is given up after thousands of steps, not after MAX_STEPS.
-            if _has_too_many_steps(accepted, stretch.end, self._settings.most):
+            if len(accepted) >= 5 * PACE and _project_steps(accepted, stretch.end) > self._settings.most:
                 if natively and not np.isfinite(steps.y).all():
                     raise _NativeError
                 if watch is not None:
@@ -447,7 +447,7 @@ class _Solve:
 
     def _build_slope(self, stretch: _Stretch, mode: int) -> Slope:
         """Return the slope of a mode of the library by JAX; it raises where it is not finite."""
-        functions = self._library.functions
+        functions = self._structure.functions
         functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
         times, start, end = self._coarse.times, stretch.start, stretch.end
         first, last = np.nextafter(start, end), np.nextafter(end, start)
@@ -485,7 +485,7 @@ class _Solve:
         self, mode: int, t: float, x: FloatArray, value: FloatArray, piece: Piece
     ) -> NotIntegrableError:
         """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
-        name = self._library.mode_names[mode]
+        name = self._structure.mode_names[mode]
         if np.isfinite(value[:-1]).all():
             what, operation = f"a running cost in mode {name!r} returned {value[-1]}", ""
         else:
@@ -500,13 +500,8 @@ class _Solve:
         model = Model(self._library, self._arguments)
         given = [np.asarray(a)[None] for a in (t, x, *model.inputs(t, piece))]  # type: ignore[arg-type]  # of NumPy
         parameters = model.parameters(self._p)  # type: ignore[arg-type]
-        found = find_undefined(self._library.modes[mode], given, parameters, derivatives=False)
+        found = find_undefined(self._structure.modes[mode], given, parameters, derivatives=False)
         return "" if found is None else f" ({' at '.join(filter(None, (found.operation, found.line)))})"
-
-
-def _has_too_many_steps(accepted: Sequence[float], end: float, most: int) -> bool:
-    """Return whether more than `most` steps have been taken, or will be at the pace of the last `PACE` steps."""
-    return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > most
 
 
 def _count_rows(steps: FloatArray, nodes: FloatArray) -> int:

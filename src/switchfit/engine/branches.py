@@ -91,11 +91,6 @@ class Path:
     ends: tuple[tuple[int, ...], ...]
     times: FloatArray
 
-    @property
-    def sequence(self) -> Any:
-        """What a program depends on."""
-        return self.sides, self.ends
-
 
 class Branches:
     """The branches of the modes of a structure that trajectories have run in so far, as one library.

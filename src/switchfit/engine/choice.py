@@ -120,9 +120,8 @@ class SplitEngine:
     @property
     def engine(self) -> Engine:
         """The engine of the path; at the guess, where none is known."""
-        split = self._split or self._recall_path()
-        if split is None:
-            split = self._find_path(*self._run.vectors(self._run.problem.initial_theta))
+        at_guess = self._run.vectors(self._run.problem.initial_theta)
+        split = self._split or self._recall_path() or self._find_path(*at_guess)
         return split.engine.engine
 
     def judge_rows(self) -> None:
@@ -202,7 +201,9 @@ class SplitEngine:
         """Return all rows, with their derivatives if `tangents`; crossings are nodes of the simulation."""
         split, found, times = self._solve(tau, p, 1.0)
         if split is None:
-            split, times = self._last_path(), self._times
+            split, times = self._split, self._times
+        if split is None:
+            raise NotIntegrableError(LOST)
         inner = split.engine.simulate(split.join(tau, times), p, tangents=tangents)
         begins = [0, *(1 + k for k in split.own.tolist())][: len(self._structure.mode_of_segment)]
         own = inner.first_row[[k for k in begins if k < len(inner.first_cell)]]  # without the rest after a free tf
@@ -272,11 +273,6 @@ class SplitEngine:
             engine.judge_rows()
         return engine
 
-    def _last_path(self) -> _Split:
-        if self._split is None:
-            raise NotIntegrableError(LOST)
-        return self._split
-
     def _recall_path(self) -> _Split | None:
         """Return the last path of the experiment on any mesh, None if there is none."""
         path = self._run.path
@@ -290,7 +286,8 @@ class SplitEngine:
         settings = Settings(implicit=[each.mode for each in self._mesh.stiffness])
         path = find_path(self._run, self._branches, tau, p, self._mesh, settings)[1]
         split = self._split
-        if split is None or path.sequence != split.path.sequence or split.corners != self._branches.corners:
+        is_same = split is not None and (path.sides, path.ends) == (split.path.sides, split.path.ends)
+        if split is None or not is_same or split.corners != self._branches.corners:
             split = self._build_split(path)
         self._split = split._replace(path=path)
         self._run.path, self._times = path, path.times
@@ -432,9 +429,7 @@ def _engine_on(
         return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
     if structure is not base:
         reason = reason_for_jax(base, arguments) or reason
-    if mesh.stiffness:
-        stiff = "; ".join(map(str, mesh.stiffness))
-        reason = f"{reason}; {stiff}"
+    reason = "; ".join([reason, *map(str, mesh.stiffness)])
     if asked == "native":
         raise ValueError(REQUIRED.format(reason))
     return JaxEngine(structure, arguments, mesh, reason)

@@ -9,7 +9,6 @@ import ctypes
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache
 from typing import Any, TypeVar
 
 import jax
@@ -50,7 +49,6 @@ _registered: dict[str, Program] = {}
 _one_at_a_time = threading.Lock()
 
 
-@cache
 def _register(library: Structure, sizes: Sizes) -> str:
     """Register the operation of a library with XLA; return its name.
 

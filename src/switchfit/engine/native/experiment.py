@@ -107,9 +107,6 @@ def _find_own_directions(
 LONG = 200_000_000
 """Work of an evaluation, in additions, from which Ctrl-C is handled in the meantime: 20 to 100 ms."""
 
-OF_LATE = ("time", "cell", "segment")
-"""What is read and written of late samples when their delay changes."""
-
 
 class FailedCheckError(Exception):
     """A product with a structural zero was left out whose other factor is not finite: the caller falls back to JAX."""
@@ -184,8 +181,9 @@ class NativeExperiment:
         self._memory = np.zeros(0)  # the workspace that the table points to, after the first call
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
+        of_late = "time", "cell", "segment"
         self._late = [
-            (k, _find_delay(structure, arguments, sensor.delay), *(self._named[f"{name} {k}"] for name in OF_LATE))
+            (k, _find_delay(structure, arguments, sensor.delay), *(self._named[f"{name} {k}"] for name in of_late))
             for k, sensor in enumerate(structure.measurements)
             if sensor.delay is not None
         ]

@@ -137,7 +137,6 @@ class Kernels:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
         self.goes_back = goes_back and order > Order.COST  # else the functions forward check that they are finite
         self.templates = Templates(library, sizes, order)
-        self.with_tangents = order > Order.COST
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
         self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
@@ -455,7 +454,7 @@ class Kernels:
     # Nodes
 
     def nodes(self) -> None:
-        """Write the functions of all nodes but terminal constraints."""
+        """Write the functions of all nodes."""
         library = self.library
         maps = {"start": self.templates.start()}
         maps |= {f"reset_{which}": self.templates.reset(which) for which in range(len(library.reset_maps))}
@@ -476,6 +475,9 @@ class Kernels:
             self._write_node(f"sample_{k}", self._cost, template, inputs, is_late, **lengths)
         if library.terminal:
             self._write_node("end", self._cost, self.templates.end(), ("x", "p"), moving=False)
+        if library.terminal_constraints:
+            template, inputs, m = self.templates.end_constraint(), ("x", "p", "multiplier"), self.sizes.m
+            self._write_node("end_constraint", self._constraint, template, inputs, moving=False, multiplier=m)
 
     def _map_forward(self, name: str, template: Template) -> None:
         graph, n, checked = Graph(), self.sizes.n, not self.goes_back
@@ -483,7 +485,7 @@ class Kernels:
         given = t, x, p, np.full(n, graph.constant(0.0), dtype=object), *constants
         (after,) = template(graph, *given, only=(0,), checked=checked)
         stores = store_all("x_after", 0, after)
-        if self.with_tangents:
+        if self.order > Order.COST:
             # Z is the derivative of x(tau-) at a tau that moves, so that f_{i-1} dtau is in it, and Z+ that of x(tau+):
             #     Z+ = D_x R Z + D_p R p' + D_t R tau'
             # The term -f_i(x+) dtau of X^i, (8), comes from the row behind tau, which starts later.
@@ -522,11 +524,6 @@ class Kernels:
         stores = store_all("late", 0, graph.loads("late", n) + graph.loads("psi", n))
         self.module.write_straight_line("end_of_late", stores)
 
-    def end_constraint(self) -> None:
-        """Write the terminal constraints."""
-        template, inputs = self.templates.end_constraint(), ("x", "p", "multiplier")
-        self._write_node("end_constraint", self._constraint, template, inputs, moving=False, multiplier=self.sizes.m)
-
     def _write_node(
         self,
         name: str,
@@ -553,7 +550,7 @@ class Kernels:
             # 0 times infinity or NaN is NaN: the sum is 0, or NaN if any factor is not finite. LARGE takes large ones
             # there too.
             total = total + graph.certain_product(0.0, x * LARGE)
-        if self.with_tangents:
+        if self.order > Order.COST:
             for k in range(n):
                 for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
                     total = total + graph.certain_product(0.0, Z)
@@ -564,7 +561,7 @@ class Kernels:
         graph = Graph()
         y, *jacobians = self.templates.outputs()(graph, *self._load_inputs(graph, "time", "x", "p"), checked=True)
         stores = store_all("y", 0, y)
-        if self.with_tangents:
+        if self.order > Order.COST:
             h_x, h_p = jacobians
             y_d = times_vector(h_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, h_p)
             stores += store_all("Y", 0, [as_vector(graph, value) for value in y_d])
@@ -578,7 +575,7 @@ class Kernels:
         Kept are values of functions of the C library. The vehicle's sines and cosines take a quarter of an evaluation
         where both steps compute them.
         """
-        outputs = (F, *((F_T, F_X, F_P) if self.with_tangents else ()), *((ELL,) if costs else ()))
+        outputs = (F, *((F_T, F_X, F_P) if self.order > Order.COST else ()), *((ELL,) if costs else ()))
         most = 0 if self.order == Order.COST else most_kept(self.sizes.n)
         return outputs, stage.list_long(outputs)[:most]
 

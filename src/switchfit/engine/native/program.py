@@ -20,7 +20,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import chain
 
 from switchfit.discretization.rows import STIFF
@@ -318,22 +318,16 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
             module.add(write_late_samples(writer, k, curvatures))
         else:
             module.add(write_samples(writer, k))
-    if library.terminal_constraints:
-        kernels.end_constraint()
     for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
         module.add(write_loop(writer, name))
     kernels.state()
-    loops: list[Callable[[Writer], str]] = [write_forward, write_evaluation]
-    if order == Order.COST:
-        loops.append(write_costs)
-    else:
-        loops.append(partial(write_backward, curvatures=curvatures))
     kernels.outputs()
     module.add(write_loop(writer, "outputs"))
+    module.add(write_forward(writer))
+    module.add(write_evaluation(writer))
+    module.add(write_costs(writer) if order == Order.COST else write_backward(writer, curvatures))
     if order == Order.HESSIAN:
-        loops.append(write_handler)
-    for write in loops:
-        module.add(write(writer))
+        module.add(write_handler(writer))
     yield module.take()
 
 
