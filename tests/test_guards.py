@@ -8,7 +8,7 @@ from derivatives import differentiate
 from models import BALL_G, BALL_HEIGHT, ball, ball_system, constrained, decay, rest
 
 import switchfit as sf
-from switchfit.discretization.model import Model
+from switchfit.discretization.model import Model, list_transition_functions
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.fit.evaluator import Evaluator
 
@@ -185,7 +185,8 @@ def by_jax(evaluator, theta, multipliers):
             tau, p = theta[places[:N]], theta[places[N:]]
             model = Model(structure, jax.tree.map(jnp.asarray, arguments))
             path = propagate(model, tau, p, 1.0)
-            c = [model.guard(i)(tau[i], path.at_transition(i)[1], p) for i in structure.guarded]
+            guards = list_transition_functions(model, "guards")
+            c = [guard(tau[i], path.at_transition(i)[1], p) for i, guard in guards]
             if structure.terminal_constraints:
                 c += list(model.terminal_constraint(path.after[-1], p))
             here = slice(last, last := last + len(c))

@@ -15,7 +15,7 @@ from switchfit.discretization.rows import STIFF, STIFF_BEND, measure_jump
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import derivatives_inside_program
 from switchfit.engine.native import elimination, kernels, llvm
-from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.experiment import native_experiment, places_in_library
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.templates import Order
@@ -228,8 +228,9 @@ def test_inside_a_program_of_jax():
     problem, structure = native.problem, native.structures[0]
     tau, p = problem.vectors(problem.initial_theta, 0)
     arguments = Evaluator(problem, meshes=[native.meshes[0].pad_to(native.meshes[0].cells + 7)]).arguments[0]
+    places = places_in_library(structure)
     with use_float64():
-        program = jax.jit(lambda tau, p: derivatives_inside_program(structure, arguments, tau, p, 1, natively=True))
+        program = jax.jit(lambda tau, p: derivatives_inside_program(structure, arguments, tau, p, 1, places))
         J, g, H = map(np.asarray, program(tau, p))
     found = native(problem.initial_theta)
     assert pytest.approx(found.cost, rel=1e-13) == J

@@ -11,7 +11,7 @@ from models import decay as eliminate
 
 import switchfit as sf
 from switchfit.engine.native.engine import foreign_derivatives
-from switchfit.engine.native.experiment import find_directions
+from switchfit.engine.native.experiment import find_directions, places_in_library
 from switchfit.engine.native.templates import Sizes
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.command_line import describe_experiments, summarize_estimate
@@ -159,8 +159,9 @@ def test_the_same_inside_the_programs_of_batches():
     problem = make_changing(simulate_changing(13.3), guess=13.0)
     evaluator, theta = Evaluator(problem), problem.initial_theta
     (structure,), (arguments,), own = problem.structures, evaluator.arguments, problem.own_places[0][0]
+    places = places_in_library(structure)
     with use_float64():
-        program = jax.jit(lambda tau, p, side: foreign_derivatives(structure, arguments, tau, p, side))
+        program = jax.jit(lambda tau, p, side: foreign_derivatives(structure, arguments, tau, p, side, places))
         for side in (-1.0, 1.0):
             J, g, _ = map(np.asarray, program(*problem.vectors(theta, 0), side))
             expected = evaluator(theta, int(side))

@@ -16,7 +16,16 @@ import switchfit as sf
 from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, find_row_ending_cell, pad_length
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
-from switchfit.discretization.rows import ADAPTIVE, ADAPTIVE_ERROR, Progress, Tolerances, judge_step, limit_step
+from switchfit.discretization.rows import (
+    ADAPTIVE,
+    ADAPTIVE_ERROR,
+    EXPONENT,
+    Progress,
+    Tolerances,
+    combine,
+    judge_error,
+    limit_step,
+)
 from switchfit.engine.adaptive import (
     PACE,
     Settings,
@@ -350,18 +359,22 @@ def test_the_last_step_ends_at_the_end_and_one_shorter_than_rounding_is_stuck():
     slopes, y = np.zeros((len(ADAPTIVE_ERROR), 1)), np.zeros(1)
     tolerances = Tolerances(1e-8, 1e-9)
     third = 1.0 / 3.0
+
+    def judge_step(at, end, slopes):
+        return judge_error(at, end, tolerances, y, y, at.step * combine(ADAPTIVE_ERROR, slopes), EXPONENT, np)
+
     with np.errstate(divide="ignore"):
         at = Progress(third, limit_step(third, 5.0, 0.7), False, False)
-        now, _ = judge_step(at, 0.7, tolerances, y, y, slopes)
+        now, _ = judge_step(at, 0.7, slopes)
         assert now.t == 0.7
         bad = slopes + 1e100
         short = Progress(1.0, 3e-15, False, False)
-        now, _ = judge_step(short, 2.0, tolerances, y, y, bad)
+        now, _ = judge_step(short, 2.0, bad)
         assert now.stuck
-        assert not judge_step(short._replace(step=1e-12), 2.0, tolerances, y, y, bad)[0].stuck
+        assert not judge_step(short._replace(step=1e-12), 2.0, bad)[0].stuck
         undefined = Progress(1.0, np.nan, False, False)
-        assert judge_step(undefined, 2.0, tolerances, y, y, slopes)[0].stuck
-        after, _ = judge_step(short._replace(step=1e-30), 2.0, tolerances, y, y, slopes)
+        assert judge_step(undefined, 2.0, slopes)[0].stuck
+        after, _ = judge_step(short._replace(step=1e-30), 2.0, slopes)
         assert 1.0 + after.step > 1.0, "a step after an accepted one changes t"
 
 

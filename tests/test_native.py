@@ -22,7 +22,7 @@ import switchfit as sf
 from switchfit.engine.native import kernels, llvm
 from switchfit.engine.native import program as program_module
 from switchfit.engine.native.engine import foreign_derivatives
-from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.experiment import native_experiment, places_in_library
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph, Node
 from switchfit.engine.native.templates import Order
@@ -222,15 +222,16 @@ def test_inside_a_program_of_jax():
     this = case("resets")
     arguments, tau = this.arguments(), np.array(INSIDE["resets"])
     expected = this.discrete(arguments, tau, P0)
+    places = places_in_library(this.structure)
     with use_float64():
-        one = jax.jit(lambda a, tau, p: foreign_derivatives(this.structure, a, tau, p, 1.0))
+        one = jax.jit(lambda a, tau, p: foreign_derivatives(this.structure, a, tau, p, 1.0, places))
         assert_close(tuple(map(np.asarray, one(arguments, tau, P0))), expected)
         many = jax.jit(
-            lambda a, taus, p: jax.lax.map(lambda t: foreign_derivatives(this.structure, a, t, p, 1.0), taus)
+            lambda a, taus, p: jax.lax.map(lambda t: foreign_derivatives(this.structure, a, t, p, 1.0, places), taus)
         )
         J, g, H = map(np.asarray, many(arguments, np.stack([tau, tau + 0.01]), P0))
         at_once = jax.jit(
-            jax.vmap(lambda a, t, p: foreign_derivatives(this.structure, a, t, p, 1.0), in_axes=(None, 0, None))
+            jax.vmap(lambda a, t, p: foreign_derivatives(this.structure, a, t, p, 1.0, places), in_axes=(None, 0, None))
         )
         together = tuple(map(np.asarray, at_once(arguments, np.stack([tau, tau + 0.01]), P0)))
     for k, shift in enumerate((0.0, 0.01)):

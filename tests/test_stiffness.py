@@ -313,7 +313,7 @@ def test_only_the_stiff_mode_takes_implicit_steps():
         gaps = []
         for tableau in (EXPLICIT, STIFF):
             with use_float64():
-                take_step = partial(step, tableau, model.field(mode, no_signals), None, p=p)
+                take_step = partial(step, tableau, model.field(mode, no_signals), p=p)
                 after = np.asarray(jax.jit(jax.vmap(take_step))(*at)[0])
             gaps.append(np.abs(after - simulation.after[rows]).max())
         own, other = gaps[::-1] if structure.implicit[mode] else gaps

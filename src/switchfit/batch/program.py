@@ -200,7 +200,7 @@ def evaluate_total(
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             (own, sequence), tau, p = given
             found: tuple[jax.Array, jax.Array, jax.Array] = derivatives_inside_program(
-                structure, own, tau, p, side, natively=layout.natively, places=sequence or None
+                structure, own, tau, p, side, sequence
             )
             return found
 

@@ -97,7 +97,10 @@ class Mesh:
     @classmethod
     def from_times(cls, times: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
         """Return the mesh whose nodes are `times`, in any order and with repetitions."""
-        return cls.pad(sort_distinct(times), stiffness)
+        nodes = sort_distinct(times)
+        cells = len(nodes) - 1
+        padding = np.full(pad_length(cells) - cells, nodes[-1])
+        return cls(np.concatenate([nodes, padding]), cells, stiffness)
 
     @classmethod
     def of(cls, experiment: Experiment) -> Mesh:
@@ -109,13 +112,6 @@ class Mesh:
         samples = (item.seen_times for item in experiment.measurements)
         times = np.concatenate([ends, *samples, *(signal.knots for signal in experiment.signals)])
         return cls.from_times(times[(times >= ends[0]) & (times <= ends[1])])
-
-    @classmethod
-    def pad(cls, nodes: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
-        """Return the mesh with these strictly increasing nodes, padded to a length from `pad_length`."""
-        cells = len(nodes) - 1
-        padding = np.full(pad_length(cells) - cells, nodes[-1])
-        return cls(np.concatenate([nodes, padding]), cells, stiffness)
 
     @property
     def times(self) -> FloatArray:
@@ -145,17 +141,15 @@ class Mesh:
         """Return the mesh with every cell cut into equal parts."""
         nodes = self.times
         inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(parts) / parts
-        divided = np.append(inside, nodes[-1])
-        # Parts of a cell that is as short as rounding may coincide.
-        build = Mesh.pad if (divided[1:] > divided[:-1]).all() else Mesh.from_times
-        return build(divided, self.stiffness)
+        # Parts of a cell that is as short as rounding may coincide: such nodes are one.
+        return Mesh.from_times(np.append(inside, nodes[-1]), self.stiffness)
 
     def refine(self, solutions: Sequence[FloatArray], stiffness: tuple[Stiffness, ...], finer: float = 1.0) -> Mesh:
         """Return the mesh with the nodes that the steps of some solutions need, or `finer` times as many."""
-        nodes, steps = self.times, _Steps.from_solutions(solutions)
+        nodes, (times, counts) = self.times, _count_steps(solutions)
         # A twentieth of a step beyond a whole number does not cost a cell more.
-        pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
-        return Mesh.from_times(np.concatenate([nodes, _grade_nodes(nodes, steps, pieces)]), stiffness)
+        pieces = np.maximum(np.ceil(finer * np.diff(np.interp(nodes, times, counts)) - 0.05).astype(int), 1)
+        return Mesh.from_times(np.concatenate([nodes, _grade_nodes(nodes, times, counts, pieces)]), stiffness)
 
     def halve_rows(self, transition_times: FloatArray) -> Mesh:
         """Return the mesh with every row cut in two: every cell, or its parts where transitions (N,) cut it.
@@ -178,42 +172,37 @@ def sort_distinct(times: FloatArray) -> FloatArray:
     return ordered[distinct]
 
 
-class _Steps(NamedTuple):
-    """Number of solver steps up to each time: `counts` (K,) at `times` (K,), linear in between."""
-
-    times: FloatArray
-    counts: FloatArray
-
-    @classmethod
-    def from_solutions(cls, solutions: Sequence[FloatArray]) -> _Steps:
-        """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
-        times = sort_distinct(np.concatenate(solutions))
-        # Between two neighbouring times of all solutions each has one step: 1 / step is the density, whose integral is
-        # counts.
-        middles = times[:-1] + 0.5 * np.diff(times)
-        lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
-        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
-
-    def up_to(self, t: FloatArray) -> FloatArray:
-        """Return the number of steps up to times t."""
-        return np.interp(t, self.times, self.counts)
+def _count_steps(solutions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return times (K,) and the number of solver steps up to each, (K,), linear in between, from the step times of
+    several solutions: at each time, the smallest step of any of them counts.
+    """
+    times = sort_distinct(np.concatenate(solutions))
+    # Between two neighbouring times of all solutions each has one step: 1 / step is the density, whose integral is
+    # counts.
+    middles = times[:-1] + 0.5 * np.diff(times)
+    lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
+    return times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))])
 
 
-def _grade_nodes(nodes: FloatArray, steps: _Steps, pieces: NDArray[np.intp]) -> FloatArray:
+def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, pieces: NDArray[np.intp]) -> FloatArray:
     """Return the nodes that cut each cell between nodes (G + 1,) into its pieces (G,): half of them follow the density
-    of the solver's steps, half are even.
+    of the solver's steps, of which there are `steps` (K,) up to `step_times` (K,), half are even.
 
     The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
     transition times, and the mesh does not.
     """
-    inside = (steps.times > nodes[0]) & (steps.times < nodes[-1])
-    times = sort_distinct(np.concatenate([nodes, steps.times[inside]]))
+    inside = (step_times > nodes[0]) & (step_times < nodes[-1])
+    times = sort_distinct(np.concatenate([nodes, step_times[inside]]))
     cell = np.minimum(np.searchsorted(nodes, times, "right") - 1, len(pieces) - 1)
     # Of all cells at once: k + w in cell k, where w grows from 0 to 1 in it.
-    counts = steps.up_to(nodes)
+    counts = np.interp(nodes, step_times, steps)
     of_steps, of_time = (np.diff(grown)[cell] for grown in (counts, nodes))
     of_steps = np.where(of_steps > 0.0, of_steps, 1.0)  # no solution reaches this cell, which stays whole
-    position = cell + 0.5 * (steps.up_to(times) - counts[cell]) / of_steps + 0.5 * (times - nodes[cell]) / of_time
+    position = (
+        cell
+        + 0.5 * (np.interp(times, step_times, steps) - counts[cell]) / of_steps
+        + 0.5 * (times - nodes[cell]) / of_time
+    )
     cut = np.repeat(np.arange(len(pieces)), pieces - 1)
     turn = np.arange(len(cut)) - np.repeat(np.cumsum(pieces - 1) - (pieces - 1), pieces - 1) + 1
     return np.interp(cut + turn / pieces[cut], position, times)

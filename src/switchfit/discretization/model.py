@@ -214,22 +214,13 @@ class Model:
 
     def terminal(self, x: Array, p: Array) -> Array:
         """Return the sum of the terminal costs."""
-        total = jnp.zeros(())
-        for phi in self.structure.terminal:
-            total = total + phi(x, self.parameters(p))
-        return total
+        return sum((phi(x, self.parameters(p)) for phi in self.structure.terminal), jnp.zeros(()))
 
     def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
         """Return the reset map R_i(t, x, p) of transition i, which must have one."""
-        return self._at_transition(self.structure.reset_maps[i], f"transition {i + 1} has no reset map.")
-
-    def guard(self, i: int) -> Callable[[Array, Array, Array], Array]:
-        """Return the guard g_i(t, x, p) of transition i, which must have one."""
-        return self._at_transition(self.structure.guards[i], f"transition {i + 1} has no guard.")
-
-    def _at_transition(self, function: Function | None, missing: str) -> Callable[[Array, Array, Array], Array]:
+        function = self.structure.reset_maps[i]
         if function is None:
-            raise ValueError(missing)
+            raise ValueError(f"transition {i + 1} has no reset map.")
         return lambda t, x, p: function(t, x, self.parameters(p))
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:
@@ -262,33 +253,17 @@ def apply_weights(W: Array, r: Array) -> Array:
 NodeFunction = Callable[[Any, Any, Any], Any]
 
 
-class TransitionKind(NamedTuple):
-    """A kind of node at transitions.
-
-    Attributes
-    ----------
-    name : str
-        Field of `Structure` with its function for each transition, None for transitions without one.
-    constraint : bool
-        Whether its function has to be zero; else it is a cost.
-    """
-
-    name: str
-    constraint: bool
+AT_TRANSITIONS = "guards", "transition_costs"
+"""Fields of `Structure` with a function for each transition, None for transitions without one. Guards are constraints,
+which have to be zero; the others are costs."""
 
 
-AT_TRANSITIONS = (TransitionKind("guards", constraint=True), TransitionKind("transition_costs", constraint=False))
-"""All kinds of nodes at transitions."""
-
-
-def get_transition_function(
-    model: Model, kind: TransitionKind, i: int, piece: Piece | None = None
-) -> NodeFunction | None:
+def get_transition_function(model: Model, kind: str, i: int, piece: Piece | None = None) -> NodeFunction | None:
     """Return the scalar function of a kind at transition i (from 0); None if the transition has no such function.
 
     One that takes an input gets the one of a `piece`; by default, of the cell that ends at the transition or holds it.
     """
-    function = getattr(model.structure, kind.name)[i]
+    function = getattr(model.structure, kind)[i]
     if function is None:
         return None
     if not function.takes_input:
@@ -296,25 +271,9 @@ def get_transition_function(
     return lambda t, x, p: function(t, x, model.parameters(p), *model.inputs(t, piece or model.find_piece(t)))
 
 
-def list_constrained_transitions(structure: Structure) -> list[tuple[TransitionKind, int]]:
-    """Return the constraints at transitions in the order of their values: kind and transition."""
-    kinds = [kind for kind in AT_TRANSITIONS if kind.constraint]
-    return [(kind, i) for kind in kinds for i, f in enumerate(getattr(structure, kind.name)) if f is not None]
-
-
-def list_costs_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
-    """Return the costs at transitions, each with its transition (from 0)."""
-    return _at_transitions(model, constraint=False)
-
-
-def list_constraints_at_transitions(model: Model) -> list[tuple[int, NodeFunction]]:
-    """Return the constraints at transitions in the order of their values, each with its transition (from 0)."""
-    return _at_transitions(model, constraint=True)
-
-
-def _at_transitions(model: Model, constraint: bool) -> list[tuple[int, NodeFunction]]:
-    kinds = [kind for kind in AT_TRANSITIONS if kind.constraint == constraint]
-    found = [(i, get_transition_function(model, kind, i)) for kind in kinds for i in range(model.structure.N)]
+def list_transition_functions(model: Model, kind: str) -> list[tuple[int, NodeFunction]]:
+    """Return the functions of a kind, each with its transition (from 0)."""
+    found = [(i, get_transition_function(model, kind, i)) for i in range(model.structure.N)]
     return [(i, function) for i, function in found if function is not None]
 
 

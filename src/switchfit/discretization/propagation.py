@@ -19,14 +19,12 @@ from jax import lax
 from switchfit.discretization import implicit_rows, rows
 from switchfit.discretization.mesh import Rows, Samples, build_rows, find_row_ending_cell
 from switchfit.discretization.model import (
-    Density,
     Field,
     Model,
     Piece,
     get_end_constraints,
     get_end_cost,
-    list_constraints_at_transitions,
-    list_costs_at_transitions,
+    list_transition_functions,
 )
 from switchfit.discretization.rows import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau, combine
 
@@ -57,17 +55,10 @@ def compute_stages(
     return rows.Stages(times, states, slopes)
 
 
-def step(
-    tableau: Tableau, f: Field, ell: Density | None, start: Array, end: Array, x: Array, p: Array
-) -> tuple[Array, Array]:
-    """Return the state after one step and the running cost it adds: (n,) and (), 0 if ell is None."""
-    h = end - start
+def step(tableau: Tableau, f: Field, start: Array, end: Array, x: Array, p: Array) -> tuple[Array, rows.Stages]:
+    """Return the state after one step, (n,), and its stages."""
     found = compute_stages(tableau, lambda t, x: f(t, x, p), start, end, x)
-    after = x + h * combine(tableau.b, found.slopes)
-    if ell is None:
-        return after, jnp.zeros(())
-    densities = jax.vmap(ell, in_axes=(0, 0, None))(found.times, found.states, p)
-    return after, rows.cost_of_row(tableau, h, list(densities))
+    return x + (end - start) * combine(tableau.b, found.slopes), found
 
 
 class Path(NamedTuple):
@@ -138,12 +129,9 @@ def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | N
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
 
     def through(mode: int) -> Callable[..., tuple[Array, ...]]:
-        tableau = model.tableaus[mode]
-
         def row(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
-            f = model.field(mode, piece)
-            found = compute_stages(tableau, lambda t, x: f(t, x, p), start, end, x)
-            return x + (end - start) * combine(tableau.b, found.slopes), *found
+            after, found = step(model.tableaus[mode], model.field(mode, piece), start, end, x, p)
+            return after, *found
 
         return row
 
@@ -180,7 +168,9 @@ def compute_path_cost(model: Model, path: Path, p: Array) -> Array:
 
 def compute_path_constraints(model: Model, path: Path, p: Array) -> Array:
     """Return the constraints: those at transitions, then those at the end: (m,)."""
-    parts = [constraint(*path.at_transition(i), p)[None] for i, constraint in list_constraints_at_transitions(model)]
+    parts = [
+        constraint(*path.at_transition(i), p)[None] for i, constraint in list_transition_functions(model, "guards")
+    ]
     at_end = get_end_constraints(model)
     parts += [] if at_end is None else [at_end(*path.at_end(), p)]
     return jnp.concatenate([jnp.zeros(0), *parts])
@@ -221,7 +211,7 @@ def weigh_stages(model: Model, layout: Rows) -> Array:
 def add_point_costs(model: Model, path: Path, p: Array) -> Array:
     """Return the sum of the costs at transitions and at the end: ()."""
     total = jnp.zeros(())
-    for i, cost in list_costs_at_transitions(model):
+    for i, cost in list_transition_functions(model, "transition_costs"):
         total = total + cost(*path.at_transition(i), p)
     final = get_end_cost(model)
     return total if final is None else total + final(*path.at_end(), p)
@@ -273,9 +263,6 @@ def step_to_late_sample(
     there = model.correct_delay(k, sample, p)
 
     def through(mode: int) -> Callable[..., Array]:
-        def state(time: Array, start: Array, x: Array) -> Array:
-            return step(model.tableaus[mode], model.field(mode, piece), None, start, time, x, p)[0]
-
-        return state
+        return lambda time, start, x: step(model.tableaus[mode], model.field(mode, piece), start, time, x, p)[0]
 
     return there, switch_mode(model, segment, through, there.time, start, x)

@@ -408,29 +408,10 @@ def limit_step(t: Array, step: Array, end: Array, xp: Any = np) -> Array:
     return xp.where(end <= t + step, end - t, step)
 
 
-def judge_step(
-    at: Progress,
-    end: Array,
-    tolerances: Tolerances,
-    y: Array,
-    after: Array,
-    slopes: Sequence[Array] | FloatArray,
-    xp: Any = np,
-) -> tuple[Progress, Array]:
-    """Accept or reject an explicit step, and choose the size of the next one.
-
-    Parameters
-    ----------
-    y, after : (n,), before and after the step
-    slopes : (s + 1, n), of the stages and after the step
-    """
-    return judge_error(at, end, tolerances, y, after, at.step * combine(ADAPTIVE_ERROR, slopes), EXPONENT, xp)
-
-
 def judge_error(
     at: Progress, end: Array, tolerances: Tolerances, y: Array, after: Array, error: Array, exponent: float, xp: Any
 ) -> tuple[Progress, Array]:
-    """Accept or reject a step with an error (n,), and choose the size of the next one."""
+    """Accept or reject a step from y to `after`, (n,) each, with an error (n,); choose the size of the next one."""
     norm = error_norm(error, y, after, tolerances, xp)
     accepted = norm < 1.0
     # h+ = h min(largest, max(0.2, 0.9 norm^(-1/q))), q the order of the error; after a rejection it does not grow.

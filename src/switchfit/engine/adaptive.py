@@ -42,7 +42,7 @@ from switchfit.engine.jax import call_model
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
-from switchfit.engine.protocol import Run, runs_of
+from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
 from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
@@ -260,25 +260,23 @@ class _Solve:
         branches: Branches | None = None,
     ) -> None:
         self._problem, self._structure, self._coarse, self._branches = run.problem, run.structure, coarse, branches
-        self._experiment, self._settings, self._library = run.experiment, settings, structure
+        self._experiment, self._settings = run.experiment, settings
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
         is_common = coarse is run.coarse
         whole = run.coarse_arguments if is_common else run.build_arguments(coarse)
-        self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
+        self._whole, self._arguments = whole, whole.without_mesh()
         self._native: NativeExperiment | None = None
-        named = zip(structure.mode_names, structure.implicit, strict=True)
         # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
-        methods = tuple(is_set or name in settings.implicit for name, is_set in named)
+        chosen = take_implicit_steps(structure, settings.implicit)
         if branches is None or branches.count:
             known = run.solvers.__dict__ if is_common else {}
-            key = f"{'' if branches is None else branches.version} {methods}"
+            key = f"{'' if branches is None else branches.version} {chosen.implicit}"
             if key not in known:
-                made = None
-                if methods != structure.implicit:
-                    chosen = replace(structure, implicit=methods)
-                    made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
-                known[key] = made or native_experiment(structure, whole, coarse.times, order=Order.COST)
+                made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
+                if made is None and chosen is not structure:
+                    made = native_experiment(structure, whole, coarse.times, order=Order.COST)
+                known[key] = made
             self._native = known[key]
         self._course: Course | None = None
         self._p = np.zeros(0)
@@ -297,7 +295,7 @@ class _Solve:
         inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
         steps, x = [ends[:1]], self._find_initial_state()
         if self._branches is not None:
-            self._course = Course(self._branches, structure, self._arguments, self._coarse.nodes, self._signals, p)
+            self._course = Course(self._branches, structure, self._whole, p)
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 x = self._apply_reset(i - 1, ends[i], x)
@@ -414,7 +412,7 @@ class _Solve:
             if len(accepted) > most_of_branch:
                 raise BranchError
             # At the pace of the last steps: a stiff mode is given up after thousands of steps, not after MAX_STEPS.
-            if _has_too_many_steps(accepted, stretch.end, self._settings.most):
+            if len(accepted) >= 5 * PACE and _project_steps(accepted, stretch.end) > self._settings.most:
                 if natively and not np.isfinite(steps.y).all():
                     raise _NativeError
                 if watch is not None:
@@ -449,14 +447,14 @@ class _Solve:
 
     def _build_slope(self, stretch: _Stretch, mode: int) -> Slope:
         """Return the slope of a mode of the library by JAX; it raises where it is not finite."""
-        functions = self._library.functions
+        functions = self._structure.functions
         functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
         times, start, end = self._coarse.times, stretch.start, stretch.end
         first, last = np.nextafter(start, end), np.nextafter(end, start)
 
         def slope(t: float, y: FloatArray) -> FloatArray:
             cell = min(int(times.searchsorted(min(max(t, first), last), "right")) - 1, len(times) - 2)
-            piece = Piece(times[cell], self._signals[cell])
+            piece = Piece(times[cell], self._whole.signals[cell])
             given = self._arguments, piece, t, y[:-1], self._p
             value = np.asarray(call_model(*given, structure=functions, function=_field_and_density, which=(mode,)))
             if not np.isfinite(value).all():
@@ -487,7 +485,7 @@ class _Solve:
         self, mode: int, t: float, x: FloatArray, value: FloatArray, piece: Piece
     ) -> NotIntegrableError:
         """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
-        name = self._library.mode_names[mode]
+        name = self._structure.mode_names[mode]
         if np.isfinite(value[:-1]).all():
             what, operation = f"a running cost in mode {name!r} returned {value[-1]}", ""
         else:
@@ -499,16 +497,11 @@ class _Solve:
 
     def _find_operation(self, mode: int, t: float, x: FloatArray, piece: Piece) -> str:
         """Return which operation of the mode is not finite at t and x (n,), " (log at tank.py:5)"; empty if all are."""
-        model = Model(self._library, self._arguments)
+        model = Model(self._structure, self._arguments)
         given = [np.asarray(a)[None] for a in (t, x, *model.inputs(t, piece))]  # type: ignore[arg-type]  # of NumPy
         parameters = model.parameters(self._p)  # type: ignore[arg-type]
-        found = find_undefined(self._library.modes[mode], given, parameters, derivatives=False)
+        found = find_undefined(self._structure.modes[mode], given, parameters, derivatives=False)
         return "" if found is None else f" ({' at '.join(filter(None, (found.operation, found.line)))})"
-
-
-def _has_too_many_steps(accepted: Sequence[float], end: float, most: int) -> bool:
-    """Return whether more than `most` steps have been taken, or will be at the pace of the last `PACE` steps."""
-    return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > most
 
 
 def _count_rows(steps: FloatArray, nodes: FloatArray) -> int:

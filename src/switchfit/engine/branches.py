@@ -91,11 +91,6 @@ class Path:
     ends: tuple[tuple[int, ...], ...]
     times: FloatArray
 
-    @property
-    def sequence(self) -> Any:
-        """What a program depends on."""
-        return self.sides, self.ends
-
 
 class Branches:
     """The branches of the modes of a structure that trajectories have run in so far, as one library.
@@ -267,23 +262,13 @@ class Course:
     branches : Branches
     structure : Structure
     arguments : Arguments
-    nodes, signals : (G + 1,), (G, 4, S)
-        Cells and the signals in them.
     p : (M,)
     """
 
-    def __init__(
-        self,
-        branches: Branches,
-        structure: Structure,
-        arguments: Arguments,
-        nodes: FloatArray,
-        signals: FloatArray,
-        p: FloatArray,
-    ) -> None:
+    def __init__(self, branches: Branches, structure: Structure, arguments: Arguments, p: FloatArray) -> None:
         self.branches, self._structure = branches, structure
         self._named = read_parameters(structure, arguments, p)
-        self._nodes, self._signals = nodes, signals
+        self._nodes, self._signals = np.asarray(arguments.nodes), np.asarray(arguments.signals)
         self._sides: list[list[Sides]] = []
         self._ends: list[list[int]] = []
         self._times: list[float] = []

@@ -18,19 +18,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh
-from switchfit.discretization.model import list_constrained_transitions
 from switchfit.engine.adaptive import Settings, find_path
 from switchfit.engine.branches import Branches, Course, Path, find_dips
 from switchfit.engine.jax import JaxEngine, derivatives
-from switchfit.engine.native.engine import NativeEngine, can_be_foreign, foreign_derivatives
+from switchfit.engine.native.engine import NativeEngine, foreign_derivatives
 from switchfit.engine.native.experiment import reason_for_jax
-from switchfit.engine.native.hypotheses import NativeHypotheses, native_hypotheses
+from switchfit.engine.native.hypotheses import NativeHypotheses
+from switchfit.engine.native.hypothesis_loops import hypotheses_program
+from switchfit.engine.native.templates import Sizes
 from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Run, Simulation, Tangents
 from switchfit.problem.corners import Corners, Sides
 from switchfit.problem.data import FloatArray
@@ -48,7 +50,9 @@ MAY_END = 1e-6
 
 LOST = "the trajectory cannot be followed through the corners of its modes at the guess: use a better guess."
 
-Build = Callable[[Structure], ExperimentEngine]
+REQUIRED = "engine='native' requires machine code, but {}. Leave engine out to evaluate with JAX."
+
+Build = Callable[[Structure], NativeEngine | JaxEngine]
 
 
 class _Split(NamedTuple):
@@ -59,7 +63,7 @@ class _Split(NamedTuple):
     path : Path
     corners : list of Corners, of each mode
     structure : Structure
-    engine : ExperimentEngine
+    engine : NativeEngine or JaxEngine
     own : (N,), the transitions of the experiment
     crossings : (K,), those of the path
     guarded : (K',), those of the crossings that have a guard, by their place in `crossings`
@@ -69,7 +73,7 @@ class _Split(NamedTuple):
     path: Path
     corners: list[Corners]
     structure: Structure
-    engine: ExperimentEngine
+    engine: NativeEngine | JaxEngine
     own: NDArray[np.intp]
     crossings: NDArray[np.intp]
     guarded: NDArray[np.intp]
@@ -111,15 +115,13 @@ class SplitEngine:
         self._arguments, self._mesh, self._build = arguments, mesh, build
         self._split: _Split | None = None
         self._times: FloatArray = np.zeros(0)
-        self._plain: ExperimentEngine | None = None
         self._judges_rows = False
 
     @property
     def engine(self) -> Engine:
         """The engine of the path; at the guess, where none is known."""
-        split = self._split or self._recall_path()
-        if split is None:
-            split = self._find_path(*self._run.vectors(self._run.problem.initial_theta))
+        at_guess = self._run.vectors(self._run.problem.initial_theta)
+        split = self._split or self._recall_path() or self._find_path(*at_guess)
         return split.engine.engine
 
     def judge_rows(self) -> None:
@@ -171,8 +173,7 @@ class SplitEngine:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         split, found, times = self._solve(tau, p, side)
         if split is None:
-            c, A = np.full(len(multipliers), np.nan), np.full((len(multipliers), len(found.gradient)), np.nan)
-            return replace(found, constraints=c, jacobian=A)
+            return _refuse(tau, p, len(multipliers), found.row_errors)
         T, every_multiplier = self._eliminate(split, found, multipliers)
         second = split.engine.constrained(split.join(tau, times), p, side, every_multiplier).hessian
         c, A = found.constraints[split.own_constraints], found.jacobian[split.own_constraints] @ T
@@ -188,26 +189,24 @@ class SplitEngine:
         modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
         return inner._replace(modes=modes)
 
-    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
-        """Return the ends of all rows."""
-        found = self.simulate(tau, p, tangents=False)
-        return found.end, found.after, [segment.start for segment in found.segments]
-
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
-        if self._plain is None:
-            self._plain = self._build(self._structure)
         return self._plain.slopes(times, cells, states, p)
+
+    @cached_property
+    def _plain(self) -> ExperimentEngine:
+        return self._build(self._structure)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`; crossings are nodes of the simulation."""
         split, found, times = self._solve(tau, p, 1.0)
         if split is None:
-            split, times = self._last_path(), self._times
+            split, times = self._split, self._times
+        if split is None:
+            raise NotIntegrableError(LOST)
         inner = split.engine.simulate(split.join(tau, times), p, tangents=tangents)
-        firsts = inner.first_cell + np.arange(len(inner.first_cell))  # first row of each segment
         begins = [0, *(1 + k for k in split.own.tolist())][: len(self._structure.mode_of_segment)]
-        own = firsts[[k for k in begins if k < len(firsts)]]  # without the rest after a free tf
+        own = inner.first_row[[k for k in begins if k < len(inner.first_cell)]]  # without the rest after a free tf
         nodes = np.sort(np.concatenate([inner.nodes, times]))
         simulation = replace(inner, nodes=nodes, first_cell=own - np.arange(len(own)))
         if inner.tangents is None:
@@ -258,24 +257,21 @@ class SplitEngine:
             split = None
         found = None if split is None else self._locate(split, split.path.times, tau, p, side)
         if split is None or found is None:
-            D = len(tau) + len(p)
-            errors = (np.inf,) if self._judges_rows else ()  # another mesh may do
-            return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan), row_errors=errors), np.zeros(0)
+            # Another mesh may do.
+            return None, _refuse(tau, p, 0, (np.inf,) if self._judges_rows else ()), np.zeros(0)
         self._times = found[1]
         return split, *found
 
     def _derive_twice(self, split: _Split) -> _Split:
         """Return a path with an engine of second derivatives, where the Gauss-Newton matrix stands for them."""
         structure = replace(split.structure, has_rough_hessian=False)
+        return split._replace(structure=structure, engine=self._build_engine(structure))
+
+    def _build_engine(self, structure: Structure) -> NativeEngine | JaxEngine:
         engine = self._build(structure)
         if self._judges_rows:
             engine.judge_rows()
-        return split._replace(structure=structure, engine=engine)
-
-    def _last_path(self) -> _Split:
-        if self._split is None:
-            raise NotIntegrableError(LOST)
-        return self._split
+        return engine
 
     def _recall_path(self) -> _Split | None:
         """Return the last path of the experiment on any mesh, None if there is none."""
@@ -290,7 +286,8 @@ class SplitEngine:
         settings = Settings(implicit=[each.mode for each in self._mesh.stiffness])
         path = find_path(self._run, self._branches, tau, p, self._mesh, settings)[1]
         split = self._split
-        if split is None or path.sequence != split.path.sequence or split.corners != self._branches.corners:
+        is_same = split is not None and (path.sides, path.ends) == (split.path.sides, split.path.ends)
+        if split is None or not is_same or split.corners != self._branches.corners:
             split = self._build_split(path)
         self._split = split._replace(path=path)
         self._run.path, self._times = path, path.times
@@ -308,16 +305,12 @@ class SplitEngine:
                 crossings.append(len(own) + len(crossings))
             if i < self._structure.N:
                 own.append(len(own) + len(crossings))
-        constrained = [i for _, i in list_constrained_transitions(structure)]
         times = [crossings[k] for k in guarded]
-        guards = [constrained.index(i) for i in times]
-        count = len(constrained) + structure.terminal_constraint_count
+        guards = [structure.guarded.index(i) for i in times]
+        count = len(structure.guarded) + structure.terminal_constraint_count
         rest = [k for k in range(count) if k not in guards]
         places = (np.array(each, dtype=np.intp) for each in (own, crossings, guarded, rest, guards))
-        engine = self._build(structure)
-        if self._judges_rows:
-            engine.judge_rows()
-        return _Split(path, self._branches.corners.copy(), structure, engine, *places)
+        return _Split(path, self._branches.corners.copy(), structure, self._build_engine(structure), *places)
 
     def _locate(
         self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray, side: float
@@ -358,16 +351,15 @@ class SplitEngine:
 
     def _holds(self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray) -> bool:
         """Return whether the trajectory is inside its branches at the ends of all rows, and in dips between them."""
-        ends, states, first_rows = split.engine.trace(split.join(tau, times), p)
-        course = Course(
-            self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
-        )
+        found = split.engine.trace(split.join(tau, times), p)
+        ends, states = found.end, found.after
+        course = Course(self._branches, self._structure, self._arguments, p)
         # All rows of one branch together: one call evaluates the functions of its ends for all of them.
         pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)
         branches = [(mode, sides) for mode, every in pairs for sides in every]
         in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
-        for branch, first, last in zip(branches, first_rows, [*first_rows[1:], len(ends)], strict=False):
-            in_branch.setdefault(branch, []).append(np.arange(first, last))
+        for branch, part in zip(branches, found.segments, strict=False):
+            in_branch.setdefault(branch, []).append(np.arange(part.start, part.stop))
         corners = self._branches.corners
         rows = {branch: np.concatenate(parts) for branch, parts in in_branch.items() if corners[branch[0]].count}
         rows = {branch: here for branch, here in rows.items() if len(here)}
@@ -392,6 +384,13 @@ class SplitEngine:
         return True
 
 
+def _refuse(tau: FloatArray, p: FloatArray, m: int, row_errors: tuple[float, ...] = ()) -> Evaluation[FloatArray]:
+    """Return an evaluation without numbers, with m constraints."""
+    D = len(tau) + len(p)
+    gradient, hessian, c, A = (np.full(shape, np.nan) for shape in (D, (D, D), m, (m, D)))
+    return Evaluation(np.nan, gradient, hessian, c, A, row_errors)
+
+
 class _PathFallback(JaxEngine):
     """Stands beside machine code of a path through corners: it refuses the points that JAX would evaluate.
 
@@ -402,9 +401,7 @@ class _PathFallback(JaxEngine):
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return an evaluation without numbers."""
-        D, m = len(tau) + len(p), len(multipliers)
-        derivatives = np.full((D + 1 + m, D), np.nan)
-        return Evaluation(np.nan, derivatives[0], derivatives[1 : D + 1], np.full(m, np.nan), derivatives[D + 1 :])
+        return _refuse(tau, p, len(multipliers))
 
 
 def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
@@ -417,13 +414,13 @@ def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
     """
     base = run.get_structure(mesh)
 
-    def build(structure: Structure) -> ExperimentEngine:
-        return _engine_on(run, structure, base, arguments, mesh)
-
+    build = partial(_engine_on, run, base, arguments, mesh)
     return build(base) if run.branches is None else SplitEngine(run, run.branches, base, arguments, mesh, build)
 
 
-def _engine_on(run: Run, structure: Structure, base: Structure, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
+def _engine_on(
+    run: Run, base: Structure, arguments: Arguments, mesh: Mesh, structure: Structure
+) -> NativeEngine | JaxEngine:
     """Return the engine of a structure whose modes are smooth; the `base`, as users wrote it, tells why it is JAX."""
     asked = run.problem.engine
     reason = "engine='jax' is set" if asked == "jax" else reason_for_jax(structure, arguments)
@@ -432,11 +429,9 @@ def _engine_on(run: Run, structure: Structure, base: Structure, arguments: Argum
         return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
     if structure is not base:
         reason = reason_for_jax(base, arguments) or reason
-    if mesh.stiffness:
-        stiff = "; ".join(map(str, mesh.stiffness))
-        reason = f"{reason}; {stiff}"
+    reason = "; ".join([reason, *map(str, mesh.stiffness)])
     if asked == "native":
-        raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
+        raise ValueError(REQUIRED.format(reason))
     return JaxEngine(structure, arguments, mesh, reason)
 
 
@@ -459,9 +454,12 @@ def hypotheses_of(
     """
     if problem.engine == "jax":
         return "engine='jax' is set"
-    found = native_hypotheses(structure, arguments, mesh.times, jumps)
-    if isinstance(found, str) and problem.engine == "native":
-        raise ValueError(f"engine='native' requires machine code, but {found}. Leave engine out to evaluate with JAX.")
+    sizes = Sizes.of(structure, arguments)
+    found = hypotheses_program(structure.library, sizes)
+    if not isinstance(found, str):
+        return NativeHypotheses(found, sizes, arguments, mesh.times, jumps)
+    if problem.engine == "native":
+        raise ValueError(REQUIRED.format(found))
     return found
 
 
@@ -469,42 +467,30 @@ def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engi
     """Return one record for several experiments: "jax" if any is evaluated by JAX; the reason names these."""
     records = [each.engine for each in engines]
     by_jax = [(name, record) for name, record in zip(names, records, strict=True) if record.name == "jax"]
+    implicit_modes = tuple(dict.fromkeys(mode for record in records for mode in record.implicit_modes))
     if not by_jax or len(by_jax) == len(records):
-        return replace(records[0], implicit_modes=_list_implicit_modes(records))
+        return replace(records[0], implicit_modes=implicit_modes)
     which = ", ".join(name for name, _ in by_jax)
     reason = f"{by_jax[0][1].reason} (in {which}; the other experiments run in machine code)"
-    return Engine("jax", reason, _list_implicit_modes(records))
-
-
-def _list_implicit_modes(records: Sequence[Engine]) -> tuple[str, ...]:
-    """Return the modes that take implicit steps in any of several experiments."""
-    return tuple(dict.fromkeys(mode for record in records for mode in record.implicit_modes))
+    return Engine("jax", reason, implicit_modes)
 
 
 def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments]) -> bool:
-    """Return whether machine code can evaluate all experiments inside a JAX program."""
-    given = zip(structures, arguments, strict=True)
-    return all(can_be_foreign(s) and reason_for_jax(s, a) is None for s, a in given)
+    """Return whether machine code can evaluate all experiments inside a JAX program: none may have late samples."""
+    if any(sensor.delay is not None for structure in structures for sensor in structure.measurements):
+        return False
+    return all(reason_for_jax(s, a) is None for s, a in zip(structures, arguments, strict=True))
 
 
 def derivatives_inside_program(
-    structure: Structure,
-    arguments: Arguments,
-    tau: Any,
-    p: Any,
-    side: Any,
-    *,
-    natively: bool,
-    places: Mapping[str, Any] | None = None,
+    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, places: Mapping[str, Any]
 ) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program.
 
-    `natively` selects machine code, on a CPU and if `runs_natively`; else JAX computes them. `side` is +1 or -1: the
-    right or left derivative in a transition time that lies on a node. `places` are for machine code only: with the
-    result of `places_in_library`, the structure may be a library, and one program serves all its sequences.
+    `side` is +1 or -1: the right or left derivative in a transition time that lies on a node. With the `places` of
+    `places_in_library`, machine code computes them, on a CPU and if `runs_natively`: the structure may be a library,
+    and one program serves all its sequences. Without any, JAX does.
     """
-    if natively:
+    if places:
         return foreign_derivatives(structure, arguments, tau, p, side, places)
-    if places is not None:
-        raise ValueError("JAX programs are written for one sequence: pass its structure, and no places.")
     return derivatives(arguments, tau, p, side, structure=structure, method="discrete-adjoint")

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh, Rows, build_rows
-from switchfit.discretization.model import Model, Piece, apply_weights, get_end_cost, list_costs_at_transitions
+from switchfit.discretization.model import Model, Piece, apply_weights
 from switchfit.discretization.propagation import (
     Path,
+    add_point_costs,
     compute_path_constraints,
     compute_path_cost,
     map_stages,
@@ -40,23 +41,6 @@ from switchfit.problem.structure import Structure, pad_length
 from switchfit.runtime.cache import use_compilation_cache
 
 Array = jax.Array
-
-
-class Points(NamedTuple):
-    """What costs without residuals depend on.
-
-    Attributes
-    ----------
-    stages : (R, s, n), the states at the stages
-    transitions : list of (), (n,): time and state of each transition with a cost
-    end : (n,), x(tf)
-    p : (M,)
-    """
-
-    stages: Array
-    transitions: list[tuple[Array, Array]]
-    end: Array
-    p: Array
 
 
 def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Array, Array, Array]:
@@ -82,8 +66,7 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
             found = [residual(t, x, p) for residual in model.reference_residuals(piece)]
             return [0.0 * r for r in found] if structure.is_rest(mode) else found
 
-        transitions = [path.at_transition(i) for i, _ in list_costs_at_transitions(model)]
-        points = Points(path.stages, transitions, path.after[-1], p)
+        points = path.stages, path.after, path.layout.end, p
         cost, tracked = compute_path_cost(model, path, p), map_stages(model, path, track, path.stages)
         return (cost, residuals, log_sigmas, tracked, points), (cost, path, points, information)
 
@@ -94,7 +77,9 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
     # the second derivatives of the trajectory.
     def add_other_costs(e: Array) -> Array:
         """Return the costs without residuals at theta + e, to first order in the points."""
-        return sum_other_costs(model, path, jax.tree.map(lambda value, slope: value + slope @ e, points, points_d))
+        stages, after, end, p = jax.tree.map(lambda value, slope: value + slope @ e, points, points_d)
+        moved = path._replace(stages=stages, after=after, layout=path.layout._replace(end=end))
+        return sum_other_costs(model, moved, weigh_stages(model, path.layout), p)
 
     H = jax.hessian(add_other_costs)(jnp.zeros_like(theta))
     for r_d, weight in zip(residuals_d, information, strict=True):
@@ -109,21 +94,16 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
     return cost, gradient, H
 
 
-def sum_other_costs(model: Model, path: Path, at: Points) -> Array:
-    """Return the running costs, and those at transitions and at the end."""
-    total, final = jnp.zeros(()), get_end_cost(model)
-    for (_, cost), (t, x) in zip(list_costs_at_transitions(model), at.transitions, strict=True):
-        total = total + cost(t, x, at.p)
-    if final is not None:
-        total = total + final(path.at_end()[0], at.end, at.p)
+def sum_other_costs(model: Model, path: Path, weights: Array, p: Array) -> Array:
+    """Return the running costs, with weights of the stages (R, s), and the costs at transitions and at the end."""
     if not model.structure.running:
-        return total
+        return add_point_costs(model, path, p)
 
     def ell(mode: int, piece: Piece, t: Array, x: Array) -> Array:
-        rates = [jnp.asarray(ell(t, x, model.parameters(at.p))).reshape(()) for ell in model.structure.running]
+        rates = [jnp.asarray(ell(t, x, model.parameters(p))).reshape(()) for ell in model.structure.running]
         return jnp.zeros(()) if model.structure.is_rest(mode) else sum(rates, jnp.zeros(()))
 
-    return total + (weigh_stages(model, path.layout) * map_stages(model, path, ell, at.stages)).sum()
+    return add_point_costs(model, path, p) + (weights * map_stages(model, path, ell, path.stages)).sum()
 
 
 Method = Literal["forward", "discrete-adjoint"]
@@ -204,12 +184,17 @@ def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta
 
 def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
     """Do what `_differentiate_forward` does, backward; forward through a loop of unknown length, as JAX cannot else."""
+    return _try_backward(function, theta) or _differentiate_forward(function, theta)
+
+
+def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> tuple[Array, Any] | None:
+    """Return the derivative of the first result, and the second; None if there is a loop of unknown length."""
     try:
-        derivative, other = jax.grad(function, has_aux=True)(theta)
+        derivative, other = jax.grad(function, has_aux=True)(at)
     except ValueError as error:
         if NOT_BACKWARD not in str(error):
             raise
-        return _differentiate_forward(function, theta)
+        return None
     return derivative, other
 
 
@@ -233,15 +218,13 @@ def differentiate_in_states(
         return compute_path_cost(model, path, p) + multipliers @ compute_path_constraints(model, path, p), path.before
 
     rows = arguments.nodes.shape[0] - 1 + structure.N
-    try:
-        costates, states = jax.grad(lagrangian, has_aux=True)(jnp.zeros((rows, structure.n)))
-    except ValueError as error:
-        if NOT_BACKWARD not in str(error):
-            raise
+    found = _try_backward(lagrangian, jnp.zeros((rows, structure.n)))
+    if found is None:
         raise ValueError(
             "costates, from which insertion rates follow, need derivatives that JAX does not have through a loop of "
             "unknown length, as jax.lax.while_loop: write jax.lax.scan, or jax.lax.fori_loop with fixed ends."
-        ) from error
+        )
+    costates, states = found
     return states, costates
 
 
@@ -330,7 +313,6 @@ class JaxEngine:
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, reason: str = "") -> None:
         self._structure, self._arguments, self._mesh = structure, arguments, mesh
         self._reason = reason
-        self._on_device: Arguments | None = None
         self._compiled: set[tuple[Method, Matrix]] = set()
         # The last simulation without tangents, since J and the trajectory are often requested at the same point.
         self._last: tuple[bytes, Simulation] | None = None
@@ -359,7 +341,7 @@ class JaxEngine:
         """Return J and its derivatives, by one of the methods of `derivatives`."""
         compiled = (method, matrix) in self._compiled
         with use_float64(), nullcontext() if compiled else use_compilation_cache():
-            given = self._given(), tau, p, float(side)
+            given = self._on_device, tau, p, float(side)
             found = derivatives(*given, structure=self._any_sequence, method=method, matrix=matrix)
         self._compiled.add((method, matrix))
         J, g, H = found
@@ -370,7 +352,7 @@ class JaxEngine:
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         with use_float64(), use_compilation_cache():
-            given = self._given(), tau, p, float(side), multipliers
+            given = self._on_device, tau, p, float(side), multipliers
             found = derivatives(*given, structure=self._any_sequence, method="discrete-adjoint")
         J, slope, H, c, A = map(np.array, found)
         return Evaluation(float(J), slope - multipliers @ A, H, c, A)
@@ -378,7 +360,7 @@ class JaxEngine:
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
         with use_float64(), use_compilation_cache():
-            found = differentiate_in_states(self._given(), tau, p, multipliers, structure=self._any_sequence)
+            found = differentiate_in_states(self._on_device, tau, p, multipliers, structure=self._any_sequence)
         layout, rows = self._cut_rows(tau)
         states, costates = (np.asarray(values)[rows] for values in found)
         return Costates.of_rows(self._structure, layout.first_row, layout.start[rows], states, costates)
@@ -393,10 +375,9 @@ class JaxEngine:
             found = call_model(*given, structure=self._structure.functions, function=_compute_fields)
         return np.asarray(found)[:count]
 
-    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
-        """Return the ends of all rows."""
-        found = self.simulate(tau, p, tangents=False)
-        return found.end, found.after, [segment.start for segment in found.segments]
+    def trace(self, tau: FloatArray, p: FloatArray) -> Simulation:
+        """Return all rows."""
+        return self.simulate(tau, p, tangents=False)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
@@ -404,7 +385,7 @@ class JaxEngine:
         if not tangents and self._last is not None and self._last[0] == key:
             return self._last[1]
         with use_float64(), use_compilation_cache():
-            found = simulate_rows(self._given(), tau, p, structure=self._any_sequence, tangents=tangents)
+            found = simulate_rows(self._on_device, tau, p, structure=self._any_sequence, tangents=tangents)
         layout, rows = self._cut_rows(tau)
         J, late, values, derivatives = jax.tree.map(np.asarray, found)
         before, after, y_before, y_after = (each[rows] for each in values)
@@ -432,9 +413,8 @@ class JaxEngine:
         layout = build_rows(self._mesh.nodes, tau, self._structure.fix_sides(1.0, np), np)
         return layout, slice(self._mesh.cells + len(tau))
 
-    def _given(self) -> Arguments:
-        if self._on_device is None:
-            with use_float64():
-                sequence = np.array(self._structure.mode_of_segment)
-                self._on_device = jax.device_put(self._arguments._replace(sequence=sequence))  # type: ignore[arg-type]
-        return self._on_device
+    @cached_property
+    def _on_device(self) -> Arguments:
+        with use_float64():
+            sequence = np.array(self._structure.mode_of_segment)
+            return jax.device_put(self._arguments._replace(sequence=sequence))  # type: ignore[arg-type]

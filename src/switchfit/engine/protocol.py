@@ -6,7 +6,7 @@ An experiment of a problem, prepared once: what all its meshes, adaptive solves 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
@@ -52,11 +52,6 @@ class Engine:
     name: str
     reason: str | None = None
     implicit_modes: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, reason: str | None) -> Engine:
-        """Return machine code if the reason is None, else JAX."""
-        return cls("native") if reason is None else cls("jax", reason)
 
     def __str__(self) -> str:
         if self.reason is not None:
@@ -158,11 +153,15 @@ class Simulation:
     tangents: Tangents | None = None
 
     @property
+    def first_row(self) -> NDArray[np.intp]:
+        """The row in which each segment begins."""
+        return self.first_cell + np.arange(len(self.first_cell))
+
+    @property
     def segments(self) -> list[slice]:
         """Slice of rows of each segment."""
-        first = self.first_cell + np.arange(len(self.first_cell))
-        ends = [*first[1:].tolist(), len(self.start)]
-        return [slice(a, b) for a, b in zip(first.tolist(), ends, strict=True)]
+        first = self.first_row.tolist()
+        return [slice(a, b) for a, b in zip(first, [*first[1:], len(self.start)], strict=True)]
 
     def row_ending(self, cells: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the last row that ends in each of the cells (K,), before any jump at its end; -1 for cell -1."""
@@ -243,18 +242,11 @@ def cut_at_tf(simulation: Simulation, structure: Structure) -> Simulation:
     if not structure.has_free_tf:
         return simulation
     rows = slice(0, simulation.segments[-1].start)
-    tangents = simulation.tangents
-    return replace(
-        simulation,
-        first_cell=simulation.first_cell[:-1],
-        start=simulation.start[rows],
-        end=simulation.end[rows],
-        before=simulation.before[rows],
-        after=simulation.after[rows],
-        y_before=simulation.y_before[rows],
-        y_after=simulation.y_after[rows],
-        tangents=None if tangents is None else Tangents(*(values[rows] for values in tangents)),
-    )
+    by_row = ("start", "end", "before", "after", "y_before", "y_after")
+    cut: dict[str, Any] = {name: getattr(simulation, name)[rows] for name in by_row}
+    if simulation.tangents is not None:
+        cut["tangents"] = Tangents(*(values[rows] for values in simulation.tangents))
+    return replace(simulation, first_cell=simulation.first_cell[:-1], **cut)
 
 
 class ExperimentEngine(Protocol):
@@ -289,10 +281,6 @@ class ExperimentEngine(Protocol):
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
-        ...
-
-    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
-        """Return the times (R,) and states (R, n) at the ends of all rows, and the first row of each segment."""
         ...
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
@@ -372,6 +360,13 @@ class Limits(NamedTuple):
     most: FloatArray
 
 
+def take_implicit_steps(structure: Structure, modes: Container[str]) -> Structure:
+    """Return a structure in which these modes take implicit steps too; itself if they do already."""
+    named = zip(structure.mode_names, structure.implicit, strict=True)
+    implicit = tuple(is_set or name in modes for name, is_set in named)
+    return structure if implicit == structure.implicit else replace(structure, implicit=implicit)
+
+
 class Run:
     """One experiment of a problem, from 0.
 
@@ -419,11 +414,7 @@ class Run:
 
     def get_structure(self, mesh: Mesh) -> Structure:
         """Return its structure with the method of the steps of each mode on a mesh."""
-        stiff = {each.mode for each in mesh.stiffness}
-        if not stiff:
-            return self.structure
-        methods = zip(self.structure.mode_names, self.structure.implicit, strict=True)
-        return replace(self.structure, implicit=tuple(implicit or name in stiff for name, implicit in methods))
+        return take_implicit_steps(self.structure, [each.mode for each in mesh.stiffness])
 
 
 @keep_with_problem

@@ -91,7 +91,7 @@ class _ModeSteps:
     @cached_property
     def rates(self) -> list[float]:
         """The largest ``|lambda|`` of a component that decays at each look."""
-        return _measure_all_rates(self.looks)
+        return _measure_rates(self.looks)
 
     @property
     def limited(self) -> list[float]:
@@ -208,7 +208,7 @@ class Watch:
         if self.refused is None or self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
             return False
         last = looks[-LOOKS_TO_STOP:]
-        rates = _measure_all_rates(last)
+        rates = _measure_rates(last)
         return all(rate * look.step > LIMITED for rate, look in zip(rates, last, strict=True))
 
     def add_rows(self, rows: int) -> None:
@@ -298,28 +298,22 @@ class Choice:
             log.info("%s.", text[0].upper() + text[1:])
 
 
-def _measure_all_rates(looks: Sequence[_Look]) -> list[float]:
-    """Return what `_measure_rates` does for looks of several stretches."""
-    # The looks of one stretch together: their slopes are one call of machine code.
-    return [rate for slopes, own in groupby(looks, _get_slopes) for rate in _measure_rates(slopes, [*own])]
-
-
-def _get_slopes(look: _Look) -> Slopes:
-    return look.slopes
-
-
-def _measure_rates(slopes: Slopes, looks: Sequence[_Look]) -> list[float]:
+def _measure_rates(looks: Sequence[_Look]) -> list[float]:
     """Return the largest ``|lambda|`` of a component that decays at each look; 0 if none does, or the model is
     undefined.
     """
-    y, times = np.array([look.y for look in looks]), np.array([look.t for look in looks])
-    with np.errstate(all="ignore"):
-        jacobians = _differentiate(slopes, times, y, np.array([look.smallest for look in looks]))
-    rates = np.zeros(len(looks))
-    defined = np.isfinite(jacobians).all(axis=(1, 2))  # beside the trajectory the model need not be
-    eigenvalues = np.linalg.eigvals(jacobians[defined])
-    rates[defined] = np.where(eigenvalues.real < 0, np.abs(eigenvalues), 0.0).max(axis=1, initial=0.0)
-    return rates.tolist()
+    found: list[float] = []
+    # The looks of one stretch together: their slopes are one call of machine code.
+    for slopes, own in groupby(looks, lambda look: look.slopes):
+        steps, _, times, y, smallest = (np.array(each) for each in zip(*own, strict=True))
+        with np.errstate(all="ignore"):
+            jacobians = _differentiate(slopes, times, y, smallest)
+        rates = np.zeros(len(steps))
+        defined = np.isfinite(jacobians).all(axis=(1, 2))  # beside the trajectory the model need not be
+        eigenvalues = np.linalg.eigvals(jacobians[defined])
+        rates[defined] = np.where(eigenvalues.real < 0, np.abs(eigenvalues), 0.0).max(axis=1, initial=0.0)
+        found += rates.tolist()
+    return found
 
 
 def _differentiate(slopes: Slopes, times: FloatArray, y: FloatArray, smallest: FloatArray) -> FloatArray:

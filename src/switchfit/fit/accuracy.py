@@ -39,7 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.mesh import Arguments, Mesh
-from switchfit.discretization.model import Model
+from switchfit.discretization.model import Model, list_transition_functions
 from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import SplitEngine
 from switchfit.engine.protocol import Evaluation, Matrix, Simulation
@@ -133,8 +133,8 @@ def _evaluate_constraints(
     """Return guards, then terminal constraints c (m,) at the ends (N + 1, n) of the segments; and D c, (m, n)."""
     model = Model(structure, arguments)
     values, slopes = [], []
-    for i in structure.guarded:
-        value, slope = jax.value_and_grad(model.guard(i), argnums=1)(tau[i], ends[i], p)
+    for i, guard in list_transition_functions(model, "guards"):
+        value, slope = jax.value_and_grad(guard, argnums=1)(tau[i], ends[i], p)
         values.append(value[None])
         slopes.append(slope[None])
     if structure.terminal_constraints:

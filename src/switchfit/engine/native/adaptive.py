@@ -10,13 +10,14 @@ import numpy as np
 from switchfit.discretization.implicit_rows import estimate_error
 from switchfit.discretization.rows import (
     ADAPTIVE,
+    ADAPTIVE_ERROR,
+    EXPONENT,
     STIFF,
     STIFF_EXPONENT,
     Progress,
     Tolerances,
     combine,
     judge_error,
-    judge_step,
 )
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels
@@ -59,10 +60,9 @@ def _evaluate(
     kernels: Kernels, graph: Graph, stage: Template, number: str = "", checked: bool = True
 ) -> Callable[[Objects, Sequence[int]], list[Objects]]:
     """Return some outputs of a mode as a function of the state, at the time of a `moment` with this number."""
-    (p, constants), zero, sizes = kernels.inputs(graph), graph.constant(0.0), kernels.sizes
-    (t, origin), signal = graph.loads(f"moment{number}", 2), graph.loads(f"signal{number}", 4 * sizes.signals)
-    after = p, np.full(sizes.n, zero, dtype=object), zero, origin, signal, *constants
-    return lambda x, only: stage(graph, t, x, *after, only=only, checked=checked)
+    t, origin = graph.loads(f"moment{number}", 2)
+    at = kernels.take_inputs(graph, origin, f"signal{number}")
+    return lambda x, only: stage(graph, *at(t, x), only=only, checked=checked)
 
 
 @np.errstate(divide="ignore")  # the error of a mode at rest is the number zero
@@ -93,7 +93,7 @@ def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
         for row, evaluate in zip((*ADAPTIVE.a, ADAPTIVE.b), points, strict=True):
             after = y + h * combine(row, K)
             K.append(np.concatenate([np.ravel(value) for value in evaluate(after[:n], (F, ELL))]))
-        now, y_now = judge_step(*given, after, K, xp)
+        now, y_now = judge_error(*given, after, h * combine(ADAPTIVE_ERROR, K), EXPONENT, xp)
     stores = [("state", at.t, now.t), ("state", at.step, now.step), *(("y", k, node) for k, node in enumerate(y_now))]
     for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))

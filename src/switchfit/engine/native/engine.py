@@ -8,21 +8,22 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Callable, Mapping
-from functools import cache
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import sequential_vmap
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh, count_passed
+from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.experiment import (
     FailedCheckError,
     NativeExperiment,
     find_directions,
     native_experiment,
-    places_in_library,
 )
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import program_of, second_order
@@ -32,7 +33,6 @@ from switchfit.engine.protocol import (
     Costates,
     Engine,
     Evaluation,
-    ExperimentEngine,
     Matrix,
     Simulation,
     Tangents,
@@ -49,7 +49,6 @@ _registered: dict[str, Program] = {}
 _one_at_a_time = threading.Lock()
 
 
-@cache
 def _register(library: Structure, sizes: Sizes) -> str:
     """Register the operation of a library with XLA; return its name.
 
@@ -69,28 +68,22 @@ def _register(library: Structure, sizes: Sizes) -> str:
     return name
 
 
-def can_be_foreign(structure: Structure) -> bool:
-    """Return whether a JAX program can call the machine code of an experiment: it must have no late samples."""
-    return all(sensor.delay is None for sensor in structure.measurements)
-
-
 def foreign_derivatives(
-    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, places: Mapping[str, Any] | None = None
+    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, places: Mapping[str, Any]
 ) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program that runs on a CPU.
 
-    The experiment must satisfy `can_be_foreign` and have machine code. `side` is +1 or -1: the right or left
-    derivative in a transition time that lies on a node.
+    The experiment must have machine code, and no late samples. `side` is +1 or -1: the right or left derivative in a
+    transition time that lies on a node.
 
-    With `places`, the result of `places_in_library`, only the library of the structure is used. A JAX program that
-    takes the places as arguments then serves all sequences of a library with the same number of transitions, and
+    `places` are the result of `places_in_library`: only the library of the structure is used. A JAX program that takes
+    the places as arguments serves all sequences of a library with the same number of transitions, and
     ``structure.library`` may be passed in place of the structure, as the key of that program.
     """
     sizes, library = Sizes.of(structure, arguments), structure.library
     name = _register(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
     idle = N - tau.shape[0]  # number of segments that the sequence does not need: they begin and end at tf
-    places = places_in_library(structure) if places is None else places
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])
@@ -114,13 +107,14 @@ def foreign_derivatives(
     given |= places
     buffers = [given[key] for key in GIVEN]
     for samples in arguments.samples:
-        buffers += [*samples, np.zeros(1, dtype=np.int64)]
+        buffers += [*samples, np.zeros(1, dtype=np.int64), np.zeros(1)]  # none is late
     lengths = layout.sums
     of_memory = sum(length.at(cells + N) for length in layout.memory.values())
     results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
-    totals = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")(*buffers)[0]
-    ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
-    J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
+    # A batch is a loop: all of its entries use one scratch space, which stays in the CPU caches.
+    totals = sequential_vmap(lambda *given: jax.ffi.ffi_call(name, results)(*given)[0])(*buffers)
+    parts = dict(zip(lengths, jnp.split(totals, np.cumsum([*lengths.values()])[:-1].tolist()), strict=True))
+    J, g, H = parts["J"], parts["g"], parts["H"]
     cost = J[0] + totals[-1]  # NaN if a finiteness check failed: the finisher of a batch then falls back to JAX
     gradient, hessian = g[own], H.reshape(D, width)[own[:, None], own]
     return cost, jnp.where(there, gradient, 0.0), jnp.where(there[:, None] & there[None], hessian, 0.0)
@@ -134,11 +128,11 @@ class NativeEngine:
     structure : Structure
     arguments : Arguments
     mesh : Mesh
-    fallback : ExperimentEngine
+    fallback : JaxEngine
         Evaluates where machine code cannot: a product with zero was left out whose other factor is not finite.
     """
 
-    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, fallback: ExperimentEngine) -> None:
+    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, fallback: JaxEngine) -> None:
         self._structure, self._arguments, self._mesh, self._fallback = structure, arguments, mesh, fallback
         self._second = second_order(structure)
         self._experiments: dict[Order, NativeExperiment | None] = {}
@@ -200,8 +194,8 @@ class NativeEngine:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
 
         def simulate(native: NativeExperiment) -> Costates:
-            found = native.simulate(tau, p, multipliers)
-            return Costates.of_rows(self._structure, found.first_row, found.times[:-1], found.before, found.costates)
+            found, costates, _ = native.simulate(tau, p, multipliers)
+            return Costates.of_rows(self._structure, found.first_row, found.start, found.before, costates)
 
         return self._try(self._second, simulate, lambda: self._fallback.costates(tau, p, multipliers))
 
@@ -210,57 +204,41 @@ class NativeEngine:
         given = times, cells, states, p
         return self._try(Order.COST, lambda native: native.slopes(*given), lambda: self._fallback.slopes(*given))
 
-    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
-        """Return the ends of all rows."""
-
-        def simulate(native: NativeExperiment) -> tuple[FloatArray, FloatArray, list[int]]:
-            found = native.simulate(tau, p)
-            first_rows = found.first_row.tolist()
-            last = first_rows.pop() if self._structure.has_free_tf else len(found.after)
-            return found.times[1 : last + 1], found.after[:last], first_rows
-
-        return self._try(Order.COST, simulate, lambda: self._fallback.trace(tau, p))
+    def trace(self, tau: FloatArray, p: FloatArray) -> Simulation:
+        """Return all rows, without outputs."""
+        return self._try(
+            Order.COST,
+            lambda native: cut_at_tf(native.simulate(tau, p)[0], self._structure),
+            lambda: self._fallback.trace(tau, p),
+        )
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         return self._try(
             self._second if tangents else Order.COST,
-            lambda native: self._simulate(native, tau, p, tangents),
+            lambda native: self._simulate(native, tau, p),
             lambda: self._fallback.simulate(tau, p, tangents=tangents),
         )
 
-    def _simulate(self, native: NativeExperiment, tau: FloatArray, p: FloatArray, tangents: bool) -> Simulation:
+    def _simulate(self, native: NativeExperiment, tau: FloatArray, p: FloatArray) -> Simulation:
         """Return all rows by machine code.
 
         It has the derivatives at the ends of rows, which move with theta where they are transitions. The derivative at
         fixed time is this one minus dx/dt, in the column of the transition time. Those in the times of jumps, which
         are known, are 0.
         """
-        structure, found = self._structure, native.simulate(tau, p)
-        start, end, opening = found.times[:-1], found.times[1:], found.first_row[1:]
-        if tangents:
+        structure, (found, _, late) = self._structure, native.simulate(tau, p)
+        before_d = after_d = np.zeros(0)
+        if found.tangents is not None:
+            before_d, after_d, opening = found.tangents.before, found.tangents.after, found.first_row[1:]
             moving, modes = np.setdiff1d(np.arange(structure.N), structure.jumps), np.array(structure.mode_of_segment)
-            beside = (
-                (found.after_d, found.after, opening - 1, modes[:-1]),
-                (found.before_d, found.before, opening, modes[1:]),
-            )
+            beside = (after_d, found.after, opening - 1, modes[:-1]), (before_d, found.before, opening, modes[1:])
             for derivative, states, rows, own in beside:
                 slopes = self.slopes(tau, found.first_cell[1:], states[rows], p)
                 derivative[rows[moving], :, moving] -= slopes[moving, own[moving]]
-        y_before, y_before_d = native.outputs(start, found.before, p, found.before_d)
-        y_after, y_after_d = native.outputs(end, found.after, p, found.after_d)
-        simulation = Simulation(
-            cost=found.cost,
-            nodes=native.times,
-            first_cell=found.first_cell,
-            start=start,
-            end=end,
-            before=found.before,
-            after=found.after,
-            y_before=y_before,
-            y_after=y_after,
-            tangents=Tangents(found.before_d, found.after_d, y_before_d, y_after_d) if tangents else None,
-        )
-        none = np.zeros(0)
-        late = {k: native.outputs(times, states, p, none)[0] for k, (times, states) in found.late.items()}
-        return cut_at_tf(add_samples(simulation, structure, self._arguments, late), structure)
+        y_before, y_before_d = native.outputs(found.start, found.before, p, before_d)
+        y_after, y_after_d = native.outputs(found.end, found.after, p, after_d)
+        tangents = None if found.tangents is None else Tangents(before_d, after_d, y_before_d, y_after_d)
+        simulation = replace(found, y_before=y_before, y_after=y_after, tangents=tangents)
+        seen = {k: native.outputs(each[:, 0], each[:, 1:], p, np.zeros(0))[0] for k, each in late.items()}
+        return cut_at_tf(add_samples(simulation, structure, self._arguments, seen), structure)

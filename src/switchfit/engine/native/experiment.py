@@ -6,19 +6,19 @@ import ctypes
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Samples
-from switchfit.discretization.model import AT_TRANSITIONS, list_constrained_transitions, read_parameters
+from switchfit.discretization.model import AT_TRANSITIONS, read_parameters
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import PREFIX, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, ZEROED, layout_of
-from switchfit.engine.protocol import Evaluation
+from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, layout_of
+from switchfit.engine.protocol import Evaluation, Simulation, Tangents
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -54,7 +54,7 @@ def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     modes = list(structure.mode_of_segment)
     found = {"modes": modes + modes[-1:] * idle, "resets": find(structure.reset_maps, library.reset_maps)}
     for kind in AT_TRANSITIONS:
-        found[kind.name] = find(getattr(structure, kind.name), getattr(library, kind.name))
+        found[kind] = find(getattr(structure, kind), getattr(library, kind))
     if structure.jumps:
         found["jumps"] = [int(i in structure.jumps) for i in range(structure.N)] + [0] * idle
     return {name: np.array([*which, -1], dtype=np.int64) for name, which in found.items()}
@@ -107,44 +107,9 @@ def _find_own_directions(
 LONG = 200_000_000
 """Work of an evaluation, in additions, from which Ctrl-C is handled in the meantime: 20 to 100 ms."""
 
-OF_LATE = ("time", "cell", "segment")
-"""What is read and written of late samples when their delay changes."""
-
 
 class FailedCheckError(Exception):
     """A product with a structural zero was left out whose other factor is not finite: the caller falls back to JAX."""
-
-
-class Simulated(NamedTuple):
-    """A simulation: R = cells + N rows, one after the other.
-
-    Attributes
-    ----------
-    cost : J
-    first_cell : (N + 1,) int, cell in which each segment begins
-    times : (R + 1,), t0, then the end of each row
-    before, after : (R, n), states at the start of each row, after a reset map, and at its end, before one
-    before_d, after_d : (R, n, D)
-        With derivatives: tangents of these, at a start or an end that moves with theta where it is a transition.
-    costates : (R, n)
-        With derivatives: those of the cost to go, with constraints, in the state at each start.
-    late : for each late Measurements, by its index, the times at which its samples saw the state, and the states then
-    """
-
-    cost: float
-    first_cell: NDArray[np.intp]
-    times: FloatArray
-    before: FloatArray
-    after: FloatArray
-    before_d: FloatArray
-    after_d: FloatArray
-    costates: FloatArray
-    late: dict[int, tuple[FloatArray, FloatArray]]
-
-    @property
-    def first_row(self) -> NDArray[np.intp]:
-        """The row in which each segment begins: (N + 1,)."""
-        return self.first_cell + np.arange(len(self.first_cell))
 
 
 class NativeExperiment:
@@ -202,21 +167,23 @@ class NativeExperiment:
             cell, *values = (np.asarray(a)[:count] for a in samples)
             whole |= {f"cell {k}": cell, f"segment {k}": np.zeros(count, int)}
             floats |= zip((f"time {k}", f"value {k}", f"weight {k}"), values, strict=True)
+            is_late = structure.measurements[k].delay is not None
+            floats[f"seen {k}"] = np.zeros(is_late * count * (1 + sizes.n))
         self._named: dict[str, Any] = {}
         self._addresses: dict[str, int] = {}
         # One block of memory per type: the addresses of its parts follow from one that is looked up.
         for arrays, kind in ((whole, np.int64), (floats, np.float64)):
             block = np.concatenate(list(arrays.values()), axis=None, dtype=kind)
             self._divide(block, {name: a.size for name, a in arrays.items()})
-        self._sums = np.zeros(sum(layout.sums.values()))
-        self._divide(self._sums, layout.sums)
+        self._divide(np.zeros(sum(layout.sums.values())), layout.sums)
         of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
         self._pointers = [*layout.pointers, *of_samples]
-        self._memory = np.zeros(0)  # the workspace that the table points to, after the first `_bind`
+        self._memory = np.zeros(0)  # the workspace that the table points to, after the first call
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
+        of_late = "time", "cell", "segment"
         self._late = [
-            (k, _find_delay(structure, arguments, sensor.delay), *(self._named[f"{name} {k}"] for name in OF_LATE))
+            (k, _find_delay(structure, arguments, sensor.delay), *(self._named[f"{name} {k}"] for name in of_late))
             for k, sensor in enumerate(structure.measurements)
             if sensor.delay is not None
         ]
@@ -251,8 +218,7 @@ class NativeExperiment:
         # No jumps and no idle transitions: the unknowns of the program are those of the experiment, in their order.
         self._has_all = len(self._places) == self.sizes.D
         self._tau, self._begins = self._named["bounds"][1 : N + 1], self._named["first_cell"][1 : N + 1]
-        own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
-        self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
+        self._constraint_rows = np.array([*structure.guarded, *range(rows["end"], rows["count"])], dtype=np.intp)
 
     def __call__(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None
@@ -336,11 +302,7 @@ class NativeExperiment:
         # The loop in machine code writes each schedule over the arrays of this one, which are restored at the end.
         kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
         with self._workspace.lock:
-            self._workspace.finish()
-            self._own_p[:] = p
-            self._workspace.reserve(self._size)
-            if self._memory is not self._workspace.memory:
-                self._bind()
+            self._prepare(p)
             at_once = max(1, LONG // self._work)
             for before in range(0, B, at_once):  # Ctrl-C is handled after each call
                 given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
@@ -356,10 +318,19 @@ class NativeExperiment:
             self._named[name][:] = which
         self._named["modes"][-1] = self._judged
 
-    def simulate(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray | None = None) -> Simulated:
-        """Return the states at the starts and ends of all rows, with tangents and costates if it has derivatives.
+    def simulate(
+        self, tau: FloatArray, p: FloatArray, multipliers: FloatArray | None = None
+    ) -> tuple[Simulation, FloatArray, dict[int, FloatArray]]:
+        """Return all rows, without outputs and up to the last node, what is known with derivatives, and late samples.
 
-        The costates are those of ``J + multipliers . c``.
+        Returns
+        -------
+        rows : Simulation
+            Its tangents are those at starts and ends that move with theta where they are transitions.
+        costates : (R, n)
+            With derivatives: those of ``J + multipliers . c`` in the state at each start.
+        late : for each late Measurements, by its index, the times at which its samples saw the state, and the states
+            then, (K, 1 + n)
         """
         with self._workspace.lock:
             self._evaluate(tau, p, 1.0, multipliers)
@@ -374,33 +345,30 @@ class NativeExperiment:
                 values = self._named[name].reshape(-1, *shape)[:count]
                 return self._spread(values) if len(shape) > 1 else np.array(values)
 
-            def of_starts(ends: FloatArray, name: str, *shape: int) -> FloatArray:
-                """Return the values at the starts of rows: those before, or of reset maps."""
-                found, resets = ends[:-1].copy(), list(self.structure.resets)
+            def beside_rows(name: str, *shape: int) -> tuple[FloatArray, FloatArray]:
+                """Return the values at the starts of rows, those before or of reset maps, and at their ends."""
+                ends, resets = of_rows(name, cells + N + 1, *shape), list(self.structure.resets)
+                starts = ends[:-1].copy()
                 if resets:
-                    found[(first_cell[1:] + np.arange(1, N + 1))[resets]] = of_rows(name, N, *shape)[resets]
-                return found
+                    after = of_rows(f"reset_{name}", N, *shape)
+                    starts[(first_cell[1:] + np.arange(1, N + 1))[resets]] = after[resets]
+                return starts, ends[1:]
 
-            rows, derives = cells + N, self.order > Order.COST
-            states = of_rows("states", rows + 1, n)
-            tangents = of_rows("tangents", rows + 1, n, width) if derives else np.zeros((rows + 1, n, 0))
-            return Simulated(
+            none, times = np.zeros((cells + N, 0)), np.concatenate([self.times[:1], *inside])
+            derives = self.order > Order.COST
+            simulation = Simulation(
                 self._J.item(0),
+                self.times,
                 first_cell,
-                times=np.concatenate([self.times[:1], *inside]),
-                before=of_starts(states, "reset_states", n),
-                after=states[1:],
-                before_d=of_starts(tangents, "reset_tangents", n, width) if derives else tangents[1:],
-                after_d=tangents[1:],
-                costates=of_rows("costates", rows if derives else 0, n),
-                late={k: self._find_late_states(k, len(seen)) for k, _, seen, _, _ in self._late},
+                times[:-1],
+                times[1:],
+                *beside_rows("states", n),
+                none,
+                none,
+                tangents=Tangents(*beside_rows("tangents", n, width), none, none) if derives else None,
             )
-
-    def _find_late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return the times (K,) at which late samples of the k-th Measurements saw the state, and the states (K, n)."""
-        times, states = np.zeros(count), np.zeros((count, self.sizes.n))
-        self._find(f"late_states_{k}", 4)(self._address, count, get_address(times), get_address(states))
-        return times, states
+            late = {k: self._named[f"seen {k}"].reshape(-1, 1 + n).copy() for k, *_ in self._late}
+            return simulation, of_rows("costates", cells + N if derives else 0, n), late
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
@@ -504,19 +472,9 @@ class NativeExperiment:
 
     def _evaluate(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
         """Evaluate J and, of a program with derivatives, those of ``J + multipliers . c``."""
-        self._workspace.finish()
+        self._prepare(p)
         self._tau[:] = tau
-        self._own_p[:] = p
         self._find_first_cells(tau, side)
-        # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
-        # call.
-        self._workspace.reserve(self._size)
-        if self._memory is not self._workspace.memory:
-            self._bind()
-        # Results are sums, and costates of nodes too. All other scratch space is written before it is read.
-        self._sums.fill(0.0)
-        for part in self._zeroed:
-            part.fill(0.0)
         if self._late:
             self._find_late_cells(p)
         if multipliers is not None:
@@ -534,11 +492,17 @@ class NativeExperiment:
         if check != check and math.isfinite(self._J.item(0)):
             raise FailedCheckError
 
-    def _bind(self) -> None:
-        """Store the addresses of another workspace in the table."""
+    def _prepare(self, p: FloatArray) -> None:
+        """Store p, and the addresses of the workspace in the table."""
+        self._workspace.finish()
+        self._own_p[:] = p
+        # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
+        # call.
+        self._workspace.reserve(self._size)
+        if self._memory is self._workspace.memory:
+            return
         self._memory = self._workspace.memory
         self._divide(self._memory, self._lengths)
-        self._zeroed = [self._named[name] for name in ZEROED if self._lengths[name]]
         self._table[:] = [self._addresses[name] for name in self._pointers]
 
     def _divide(self, block: NDArray[Any], lengths: Mapping[str, int]) -> None:

@@ -16,7 +16,6 @@ from switchfit.engine.native.hypothesis_loops import (
     OF_SAMPLES,
     PER_PLACE,
     divide_record,
-    hypotheses_program,
     measure_record,
     scratch_sizes,
 )
@@ -25,21 +24,11 @@ from switchfit.engine.native.program import PREFIX
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
-from switchfit.problem.structure import Structure
 
 SLOT = int(Column.SLOT)
 
 CELLS_AT_ONCE = 1000
 """Cells, of all hypotheses together, that one call propagates."""
-
-
-def native_hypotheses(
-    structure: Structure, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
-) -> NativeHypotheses | str:
-    """Return the propagation of hypotheses in machine code, or the reason why it cannot be compiled."""
-    sizes = Sizes.of(structure, arguments)
-    program = hypotheses_program(structure.library, sizes)
-    return program if isinstance(program, str) else NativeHypotheses(program, sizes, arguments, times, jumps)
 
 
 class Reserved(NamedTuple):
@@ -102,7 +91,6 @@ class NativeHypotheses:
         self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
         self._shape = sizes.n, sizes.D, sizes.width
-        self._shape = sizes.n, sizes.D, sizes.width
         # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
@@ -128,7 +116,6 @@ class NativeHypotheses:
         self._propagate = program.function(
             f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 8
         )
-
         self._follow_order = program.function(
             f"{PREFIX[Order.GAUSS_NEWTON]}follow_order", *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 5
         )

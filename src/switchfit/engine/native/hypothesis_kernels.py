@@ -110,10 +110,8 @@ class HypothesisKernels(Kernels):
         stores = [("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)), ("g", 0, as_vector(graph, g))]
         for j, X_d in enumerate(tangents):
             stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
-        chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
-        for j, entries in enumerate(second):
-            stores += [("entries", j * len(chosen) + k, entries[key]) for k, key in enumerate(chosen)]
-        return stores, chosen
+        chosen, entries = self._store_entries(graph, tableau, second)
+        return stores + entries, chosen
 
     def move(self, name: str, sign: float, costs: bool) -> None:
         """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.

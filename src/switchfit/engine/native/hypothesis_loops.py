@@ -6,8 +6,7 @@ births, computes its score, and moves its point of linearisation to the minimum.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -18,7 +17,7 @@ from switchfit.engine.native.kernels import STAGES, Curvature
 from switchfit.engine.native.llvm import Module, Program, Value, Variable
 from switchfit.engine.native.program import compile_library
 from switchfit.engine.native.scalars import CHECKED
-from switchfit.engine.native.segments import solve_stages, write_newton
+from switchfit.engine.native.segments import add_curvature, solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.writer import Pointers, Writer
 from switchfit.engine.protocol import Column
@@ -113,16 +112,12 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     writer = HypothesisWriter(library, sizes, module)
     for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
         module.add(write_newton(writer, f"newton_{mode}"))
-    loops: list[Callable[[], str]] = [
-        partial(writer.write_steps, curvatures),
-        writer.write_node,
-        writer.write_score,
-        writer.write_birth,
-        writer.write_propagation,
-        writer.write_following,
-    ]
-    for write in loops:
-        module.add(write())
+    module.add(writer.write_steps(curvatures))
+    module.add(writer.write_node())
+    module.add(writer.write_score())
+    module.add(writer.write_birth())
+    module.add(writer.write_propagation())
+    module.add(writer.write_following())
     yield module.take()
 
 
@@ -230,7 +225,7 @@ class HypothesisWriter(Writer):
         """Write steps in a mode between two times of a cell."""
         settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
         _, record, mode, cell, parts, begin, end = self.begin(f"void @steps(ptr %table, ptr %record, {settings})")
-        n, width, found, row = self.sizes.n, self.sizes.width, self.find(record), self.allocate("double", 3)
+        found, row = self.find(record), self.allocate("double", 3)
         self.put(begin, row, 1)
         self.put(self.get("double", found["nodes"], cell), row, 2)
         found |= {"row": row, "signal": self.at(found["signals"], cell, 4 * self.sizes.signals)}
@@ -246,10 +241,7 @@ class HypothesisWriter(Writer):
                 if self.library.implicit[k]:
                     solve_stages(self, f"newton_{k}", found)
                 self.call(f"step_{k}", found)
-                name, size, stages = curvatures[k]
-                for j in stages:
-                    entries, tangents = self.at(found["entries"], j * size), self.at(found["XZ"], j * n * width)
-                    self.call(name, found | {"entries": entries, "XZ": tangents})
+                add_curvature(self, curvatures[k], found, moving=False)
         return self.end()
 
     def write_propagation(self) -> str:
@@ -369,7 +361,8 @@ class HypothesisWriter(Writer):
                         birth, before = self.at(children, place, COLUMNS), self.at(records, parent, size)
                         whole = (table, record, before, birth, time_at, own_counts, 1, here, there, 0, 0, 1, at_end, 1)
                         self.invoke("propagate", *whole)
-                        self._copy_each(own_births, past, length)
+                        with self.loop(0, length) as k:
+                            self.put(self.get("double", past, k), own_births, k)
                         with self.when(born > 0):
                             self.store(time, own_births)
                             self.put(time, own_births, entry)
@@ -383,11 +376,6 @@ class HypothesisWriter(Writer):
 
     def _load_score(self, record: Value) -> Value:
         return self.get("double", record, divide_record(self.sizes)["score"].start)
-
-    def _copy_each(self, target: Value, source: Value, length: Value) -> None:
-        """Emit the copy of so many doubles, a number that is not known."""
-        with self.loop(0, length) as k:
-            self.put(self.get("double", source, k), target, k)
 
     def _insert(self, records: Value, ranks: Value, count: Value, child: Value, score: Value) -> None:
         """Emit the insertion of a record behind those of its place, `count` of them, whose scores are no higher."""

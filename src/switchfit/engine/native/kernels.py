@@ -38,7 +38,7 @@ import numpy as np
 
 from switchfit.discretization import implicit_rows
 from switchfit.discretization import rows as explicit_rows
-from switchfit.discretization.model import AT_TRANSITIONS, TransitionKind
+from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.discretization.rows import (
     EXPLICIT,
     EXPLICIT_BEND,
@@ -108,7 +108,7 @@ def count_kept(library: Structure, n: int, order: Order) -> int:
 
 def has_jumps(library: Structure) -> bool:
     """Return whether the costate may jump at the end of a row: at samples and nodes of transitions."""
-    return bool(library.measurements) or any(getattr(library, kind.name) for kind in AT_TRANSITIONS)
+    return bool(library.measurements) or any(getattr(library, kind) for kind in AT_TRANSITIONS)
 
 
 class Curvature(NamedTuple):
@@ -137,7 +137,6 @@ class Kernels:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
         self.goes_back = goes_back and order > Order.COST  # else the functions forward check that they are finite
         self.templates = Templates(library, sizes, order)
-        self.with_tangents = order > Order.COST
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
         self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
@@ -145,11 +144,6 @@ class Kernels:
     def tableau(self, mode: int) -> Tableau:
         """Return the method of a mode."""
         return STIFF if self.library.implicit[mode] else EXPLICIT
-
-    @property
-    def adds_all_stages(self) -> bool:
-        """Whether one function adds all stages of a row to the Hessian, else one, since it would be too long."""
-        return self.sizes.n * self.sizes.D * len(self.library.modes) <= SHORT
 
     # Rows
 
@@ -391,13 +385,19 @@ class Kernels:
                 factor_d = length_factor(tableau, psi, found.states, K_d, ell_d)
                 stores.append(("length", 0, as_vector(graph, factor_d)))
         stores.append(("g", 0, as_vector(graph, g)))
-        # One list of entries for all stages: what is a structural zero at each is neither stored nor multiplied.
-        chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
-        for j in range(count):
-            values = [second[j][key] for key in chosen] + [graph.constant(tableau.c[j])] * _has_time(chosen)
-            stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
-        self.module.write_straight_line(name, stores + graph.check())
+        chosen, entries = self._store_entries(graph, tableau, second)
+        self.module.write_straight_line(name, stores + entries + graph.check())
         return chosen
+
+    def _store_entries(
+        self, graph: Graph, tableau: Tableau, second: Sequence[dict[tuple[int, int], Node]]
+    ) -> tuple[list[tuple[int, int]], list[Store]]:
+        """Return which entries of the second derivatives at the stages of a row are stored, and the stores."""
+        # One list of entries for all stages: what is a structural zero at each is neither stored nor multiplied.
+        chosen, stores = sorted({key for each in second for key, node in each.items() if node.number != 0.0}), []
+        for c_j, each in zip(tableau.c.tolist(), second, strict=True):
+            stores += [each[key] for key in chosen] + [graph.constant(c_j)] * _has_time(chosen)
+        return chosen, store_all("entries", 0, stores)
 
     def share_curvature(self, name: str, chosen: list[tuple[int, int]], tableau: Tableau) -> Curvature:
         """Return the function for entries from `backward_row`; write it unless an earlier row has the same entries.
@@ -421,7 +421,8 @@ class Kernels:
         H = [graph.load("H", d, vector=True) for d in range(D)]
         sums = H
         moving = _has_time(chosen)
-        size, at_once = len(chosen) + moving, len(tableau.b) if self.adds_all_stages else 1
+        # One function for all stages of a row, else for each, since it would be too long.
+        size, at_once = len(chosen) + moving, len(tableau.b) if n * D * len(self.library.modes) <= SHORT else 1
         for j in range(at_once):
             second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
             of_time = graph.constant(0.0), [graph.constant(0.0)] * D
@@ -453,32 +454,38 @@ class Kernels:
     # Nodes
 
     def nodes(self) -> None:
-        """Write the functions of all nodes but terminal constraints."""
+        """Write the functions of all nodes."""
         library = self.library
-        self._map("start", "start_back", self.templates.start(), of_start=True)
-        for which in range(len(library.reset_maps)):
-            self._map(f"reset_{which}", f"reset_back_{which}", self.templates.reset(which), of_start=False)
+        maps = {"start": self.templates.start()}
+        maps |= {f"reset_{which}": self.templates.reset(which) for which in range(len(library.reset_maps))}
+        for name, template in maps.items():
+            self._map_forward(name, template)
+            if self.goes_back:
+                self._map_back(name, template, of_start=name == "start")
         for kind in AT_TRANSITIONS:
-            for which in range(len(getattr(library, kind.name))):
-                self.transition(kind, which)
-        for k in range(len(library.measurements)):
-            self.sample(k)
+            inputs: tuple[str, ...] = ("time", "x", "p", "multiplier", "origin", "signal")
+            add = self._constraint if kind == "guards" else self._cost
+            for which in range(len(getattr(library, kind))):
+                template = self.templates.transition(kind, which)
+                self._write_node(f"{kind}_{which}", add, template, inputs, moving=True, multiplier=1)
+        for k, sensor in enumerate(library.measurements):
+            template, inputs = self.templates.sample(k), ("time", "value", "weight", "x", "p")
+            lengths = dict.fromkeys(("value", "weight"), sensor.channels)
+            is_late = sensor.delay is not None  # its time depends on theta then
+            self._write_node(f"sample_{k}", self._cost, template, inputs, is_late, **lengths)
         if library.terminal:
-            self.end()
+            self._write_node("end", self._cost, self.templates.end(), ("x", "p"), moving=False)
+        if library.terminal_constraints:
+            template, inputs, m = self.templates.end_constraint(), ("x", "p", "multiplier"), self.sizes.m
+            self._write_node("end_constraint", self._constraint, template, inputs, moving=False, multiplier=m)
 
-    def _map(self, name: str, back: str, template: Template, of_start: bool) -> None:
-        """Write the initial state or a reset map, forward and backward."""
-        self._map_forward(name, template, checked=not self.goes_back)
-        if self.goes_back:
-            self._map_back(back, template, of_start)
-
-    def _map_forward(self, name: str, template: Template, checked: bool) -> None:
-        graph, n = Graph(), self.sizes.n
+    def _map_forward(self, name: str, template: Template) -> None:
+        graph, n, checked = Graph(), self.sizes.n, not self.goes_back
         t, x, p, *constants = self._load_inputs(graph, "time", "x", "p")
         given = t, x, p, np.full(n, graph.constant(0.0), dtype=object), *constants
         (after,) = template(graph, *given, only=(0,), checked=checked)
         stores = store_all("x_after", 0, after)
-        if self.with_tangents:
+        if self.order > Order.COST:
             # Z is the derivative of x(tau-) at a tau that moves, so that f_{i-1} dtau is in it, and Z+ that of x(tau+):
             #     Z+ = D_x R Z + D_p R p' + D_t R tau'
             # The term -f_i(x+) dtau of X^i, (8), comes from the row behind tau, which starts later.
@@ -500,15 +507,7 @@ class Kernels:
         derivatives = template(graph, t, x, p, psi, *constants, only=range(4, len(template.shapes)), checked=True)
         stores = [] if of_start else store_all("psi", 0, derivatives[1])
         stores += self._scalar(graph, derivatives, moving=not of_start)
-        self.module.write_straight_line(name, stores + graph.check())
-
-    def sample(self, k: int) -> None:
-        """Write the cost of a sample of the k-th Measurements; the time of a late sample depends on theta."""
-        sensor, inputs = self.library.measurements[k], ("time", "value", "weight", "x", "p")
-        lengths = {"value": sensor.channels, "weight": sensor.channels}
-        self._write_node(
-            f"sample_{k}", self._cost, self.templates.sample(k), inputs, sensor.delay is not None, **lengths
-        )
+        self.module.write_straight_line(f"{name}_back", stores + graph.check())
 
     def late_time(self, k: int) -> None:
         """Write the time at which a late sample saw the state, which is the end of its row, and its derivative."""
@@ -524,21 +523,6 @@ class Kernels:
         graph, n = Graph(), self.sizes.n
         stores = store_all("late", 0, graph.loads("late", n) + graph.loads("psi", n))
         self.module.write_straight_line("end_of_late", stores)
-
-    def end(self) -> None:
-        """Write the terminal costs."""
-        self._write_node("end", self._cost, self.templates.end(), ("x", "p"), moving=False)
-
-    def transition(self, kind: TransitionKind, which: int) -> None:
-        """Write one of the functions at transitions."""
-        add, template = self._constraint if kind.constraint else self._cost, self.templates.transition(kind, which)
-        inputs = ("time", "x", "p", "multiplier", "origin", "signal")
-        self._write_node(f"{kind.name}_{which}", add, template, inputs, moving=True, multiplier=1)
-
-    def end_constraint(self) -> None:
-        """Write the terminal constraints."""
-        template, inputs = self.templates.end_constraint(), ("x", "p", "multiplier")
-        self._write_node("end_constraint", self._constraint, template, inputs, moving=False, multiplier=self.sizes.m)
 
     def _write_node(
         self,
@@ -566,7 +550,7 @@ class Kernels:
             # 0 times infinity or NaN is NaN: the sum is 0, or NaN if any factor is not finite. LARGE takes large ones
             # there too.
             total = total + graph.certain_product(0.0, x * LARGE)
-        if self.with_tangents:
+        if self.order > Order.COST:
             for k in range(n):
                 for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
                     total = total + graph.certain_product(0.0, Z)
@@ -577,7 +561,7 @@ class Kernels:
         graph = Graph()
         y, *jacobians = self.templates.outputs()(graph, *self._load_inputs(graph, "time", "x", "p"), checked=True)
         stores = store_all("y", 0, y)
-        if self.with_tangents:
+        if self.order > Order.COST:
             h_x, h_p = jacobians
             y_d = times_vector(h_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, h_p)
             stores += store_all("Y", 0, [as_vector(graph, value) for value in y_d])
@@ -591,11 +575,11 @@ class Kernels:
         Kept are values of functions of the C library. The vehicle's sines and cosines take a quarter of an evaluation
         where both steps compute them.
         """
-        outputs = (F, *((F_T, F_X, F_P) if self.with_tangents else ()), *((ELL,) if costs else ()))
+        outputs = (F, *((F_T, F_X, F_P) if self.order > Order.COST else ()), *((ELL,) if costs else ()))
         most = 0 if self.order == Order.COST else most_kept(self.sizes.n)
         return outputs, stage.list_long(outputs)[:most]
 
-    def inputs(self, graph: Graph) -> tuple[Objects, list[Objects]]:
+    def _load_constants(self, graph: Graph) -> tuple[Objects, list[Objects]]:
         """Load p and the constants."""
         p, offset, constants = graph.loads("p", self.sizes.M), 0, []
         for shape in self.sizes.constants:
@@ -606,15 +590,18 @@ class Kernels:
 
     def _load_inputs(self, graph: Graph, *names: str, **lengths: int) -> list[Objects]:
         """Load the inputs of the template of a node, and the constants."""
-        p, constants = self.inputs(graph)
+        p, constants = self._load_constants(graph)
         lengths = {"time": 1, "x": self.sizes.n, "origin": 1, "signal": 4 * self.sizes.signals} | lengths
         return [*(p if name == "p" else graph.loads(name, lengths[name]) for name in names), *constants]
 
     def _row(self, graph: Graph) -> Any:
+        """Return the inputs of a stage of a row as a function, as `take_inputs` does."""
+        return self.take_inputs(graph, graph.load("row", 2), "signal")
+
+    def take_inputs(self, graph: Graph, origin: Node, signal_at: str) -> Any:
         """Return the inputs of a stage as a function of (t, x, w, hb); w and hb default to zero."""
-        p, constants = self.inputs(graph)
-        origin, signal = graph.load("row", 2), graph.loads("signal", 4 * self.sizes.signals)
-        zero = graph.constant(0.0)
+        (p, constants), zero = self._load_constants(graph), graph.constant(0.0)
+        signal = graph.loads(signal_at, 4 * self.sizes.signals)
         zeros = np.full(self.sizes.n, zero, dtype=object)
         return lambda t, x, w=zeros, hb=zero: (t, x, p, w, hb, origin, signal, *constants)
 

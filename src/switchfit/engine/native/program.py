@@ -20,9 +20,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from functools import lru_cache, partial, reduce
+from functools import lru_cache
 from itertools import chain
-from operator import mul
 
 from switchfit.discretization.rows import STIFF
 from switchfit.engine.native.adaptive import TIMES, Adaptive, write_slope, write_step
@@ -37,7 +36,6 @@ from switchfit.engine.native.segments import (
     write_backward,
     write_forward,
     write_late_samples,
-    write_late_states,
     write_newton,
     write_samples,
 )
@@ -53,22 +51,17 @@ MAJOR, MINOR = 0, 1
 EXTENSION, ARGUMENTS, RESULTS = 8, 72, 112
 """Byte offsets in the frame of the pointers to the first extension, to the arguments and to the results."""
 
-DATA, RANK, DIMENSIONS = 24, 32, 40
-"""Byte offsets in a buffer of its data, its rank and its dimensions."""
-
-RANKS = {"signals": 3, "units": 2, "value": 2, "weight": 2}
-"""Ranks of the arguments of one experiment that are not 1."""
+DATA, DIMENSIONS = 24, 40
+"""Byte offsets in a buffer of its data and its dimensions."""
 
 
 def write_handler(writer: Writer) -> str:
-    """Return the text of the handler, which fills the table of pointers and calls `evaluate` for each entry of a batch.
+    """Return the text of the handler, which fills the table of pointers and calls `evaluate`.
 
     Arguments are those of `writer.GIVEN`, then those of the samples; results are all accumulators in one array, and
-    the scratch space. In a batch, each has one more dimension in front, of length 1 if all entries share it. All
-    entries use the scratch space of the first one after another, so that it stays in the CPU caches.
+    the scratch space.
     """
-    library, sizes = writer.library, writer.sizes
-    measurements = len(library.measurements)
+    N, measurements = writer.sizes.N, len(writer.library.measurements)
     names = [*GIVEN, *(f"{name} {k}" for k in range(measurements) for name in OF_SAMPLES)]
     (frame,) = writer.begin("ptr @xla_handler(ptr %frame)")
     table = writer.allocate("ptr", len(writer.names) + len(OF_SAMPLES) * measurements)
@@ -80,41 +73,25 @@ def write_handler(writer: Writer) -> str:
         writer.line("ret ptr null")
     arguments, results = (writer.load("ptr", writer.into(frame, place)) for place in (ARGUMENTS, RESULTS))
 
-    def buffer(buffers: Value, k: int) -> tuple[Value, Value, Value]:
-        """Load data, rank and dimensions of a buffer."""
-        pointer = writer.get("ptr", buffers, k)
-        data, dimensions = (writer.load("ptr", writer.into(pointer, place)) for place in (DATA, DIMENSIONS))
-        return data, writer.load("i64", writer.into(pointer, RANK)), dimensions
+    def of_buffer(buffers: Value, k: int, offset: int) -> Value:
+        """Load the address of the data or of the dimensions of a buffer."""
+        return writer.load("ptr", writer.into(writer.get("ptr", buffers, k), offset))
 
-    totals, rank, dimensions = buffer(results, 0)
-    batched = rank.equals(2)
-    leading = batched.to("i64")  # number of batch dimensions
-    repeats = batched.choose(writer.load("i64", dimensions), 1)
-    between = buffer(results, 1)[0]
-    data, strides, lengths = {}, {}, {}
-    for k, name in enumerate(names):
-        data[name], _, dimensions = buffer(arguments, k)
-        own = [writer.get("i64", dimensions, leading + axis) for axis in range(RANKS.get(name.split()[0], 1))]
-        lengths[name] = own[0]
-        strides[name] = (batched & (writer.load("i64", dimensions) > 1)).choose(reduce(mul, own), 0)
-    with writer.loop(0, repeats) as which:
-        found = {name: writer.at(data[name], which, strides[name]) for name in names}
-        rows = writer.get("i64", found["first_cell"], sizes.N + 1) + (sizes.N + 1)
-        parts = writer.layout.sums
-        own_totals, position = writer.at(totals, which, sum(parts.values())), 0
-        for name, length in parts.items():
-            found[name] = writer.at(own_totals, position)
-            position += length
-        writer.zero(own_totals, position)
-        place: Operand = 0
-        for name, extent in writer.layout.memory.items():
-            found[name], count = writer.at(between, place), rows * extent.each_row + extent.fixed
-            if name in ZEROED:
-                writer.zero(found[name], count)
-            place = count + place
-        for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
-            writer.put(found[name], table, k)
-        writer.invoke("evaluate", table, *(lengths[f"{OF_SAMPLES[0]} {k}"] for k in range(measurements)))
+    found = {name: of_buffer(arguments, k, DATA) for k, name in enumerate(names)}
+    totals, between = (of_buffer(results, k, DATA) for k in (0, 1))
+    position = 0
+    for name, length in writer.layout.sums.items():
+        found[name] = writer.at(totals, position)
+        position += length
+    rows = writer.get("i64", found["first_cell"], N + 1) + (N + 1)
+    place: Operand = 0
+    for name, extent in writer.layout.memory.items():
+        found[name] = writer.at(between, place)
+        place = rows * extent.each_row + extent.fixed + place
+    for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
+        writer.put(found[name], table, k)
+    of_cells = (names.index(f"{OF_SAMPLES[0]} {k}") for k in range(measurements))
+    writer.invoke("evaluate", table, *(writer.get("i64", of_buffer(arguments, k, DIMENSIONS), 0) for k in of_cells))
     return writer.end("ptr null")
 
 
@@ -125,7 +102,12 @@ def write_evaluation(writer: Writer) -> str:
     N = writer.sizes.N
     of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
     table, *counts = writer.begin(f"void @evaluate(ptr %table{of_samples})")
-    found = writer.pointers()
+    found, layout = writer.pointers(), writer.layout
+    rows = writer.get("i64", found["first_cell"], N + 1) + (N + 1)
+    # The sums are one block of memory, so that one call clears all of them.
+    writer.zero(found[next(iter(layout.sums))], sum(layout.sums.values()))
+    for name in ZEROED:
+        writer.zero(found[name], rows * layout.memory[name].each_row + layout.memory[name].fixed)
     first = state_pointers(writer, found, 0)
     writer.call("start", found | {f"{name}_after": pointer for name, pointer in first.items()})
     with writer.loop(0, N + 1) as segment:
@@ -171,12 +153,6 @@ def write_costs(writer: Writer) -> str:
             place = writer.at(place, length)
         for name, source in (("bounds", bounds), ("first_cell", first_cell)):
             writer.copy(pointers[name], writer.at(source, which, N + 2), N + 2)
-        parts = writer.layout.sums
-        # The sums are one block of memory, so that one call clears all of them.
-        writer.zero(pointers[next(iter(parts))], sum(parts.values()))
-        for name, extent in writer.layout.memory.items():
-            if name in ZEROED and extent.fixed:
-                writer.zero(pointers[name], extent.fixed)
         writer.invoke("evaluate", table, *counts)
         for entry, name in enumerate(("J", CHECKED)):
             writer.put(writer.load("double", pointers[name]), writer.at(results, which, 2), entry)
@@ -340,25 +316,18 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
         if k in late:
             kernels.late_time(k)
             module.add(write_late_samples(writer, k, curvatures))
-            module.add(write_late_states(writer, k))
         else:
             module.add(write_samples(writer, k))
-    if library.terminal_constraints:
-        kernels.end_constraint()
     for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
         module.add(write_loop(writer, name))
     kernels.state()
-    loops: list[Callable[[Writer], str]] = [write_forward, write_evaluation]
-    if order == Order.COST:
-        loops.append(write_costs)
-    else:
-        loops.append(partial(write_backward, curvatures=curvatures))
     kernels.outputs()
     module.add(write_loop(writer, "outputs"))
+    module.add(write_forward(writer))
+    module.add(write_evaluation(writer))
+    module.add(write_costs(writer) if order == Order.COST else write_backward(writer, curvatures))
     if order == Order.HESSIAN:
-        loops.append(write_handler)
-    for write in loops:
-        module.add(write(writer))
+        module.add(write_handler(writer))
     yield module.take()
 
 

@@ -205,11 +205,11 @@ def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, 
         "jump": writer.at(found["jumps"], after, writer.sizes.n),
     }
     for kind in AT_TRANSITIONS:
-        count = len(getattr(writer.library, kind.name))
-        if kind.constraint and count:
-            given |= constraint_pointers(writer, found, segment + writer.layout.constraint_rows[kind.name])
-        for k in writer.cases(writer.get("i64", found[kind.name], segment), count):
-            writer.call(f"{kind.name}_{k}", given)
+        count = len(getattr(writer.library, kind))
+        if kind == "guards" and count:
+            given |= constraint_pointers(writer, found, segment)
+        for k in writer.cases(writer.get("i64", found[kind], segment), count):
+            writer.call(f"{kind}_{k}", given)
 
 
 def constraint_pointers(writer: Writer, found: Pointers, row: Operand) -> Pointers:
@@ -239,7 +239,7 @@ def write_backward(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -
         for k in writer.cases(which, len(writer.library.reset_maps)):
             # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
             # before.
-            writer.call(f"reset_back_{k}", found | state | given)
+            writer.call(f"reset_{k}_back", found | state | given)
     return writer.end()
 
 
@@ -305,6 +305,9 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
     found, own = writer.pointers(), writer.samples_of(k)
     with writer.loop(0, count) as sample:
         given, mode = _write_late_row(writer, k, found, own, sample)
+        seen = writer.at(own["seen"], sample, 1 + writer.sizes.n)
+        writer.copy(seen, writer.at(found["late_row"], 1), 1)
+        writer.copy(writer.at(seen, 1), found["late_state"], writer.sizes.n)
         # A late sample is forward and backward at once, as nothing follows it: psi = D_x l at its end, and what is left
         # at its start waits in `late` for the backward step of the row around it.
         at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]}
@@ -316,16 +319,4 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
                 writer.call(f"backward_late_{m}", given)
                 add_curvature(writer, curvatures[m]["late"], given, moving=True)
             writer.call("end_of_late", given)
-    return writer.end()
-
-
-def write_late_states(writer: Writer, k: int) -> str:
-    """Write a loop that stores the times at which late samples saw the state, and these states."""
-    signature = f"void @late_states_{k}(ptr %table, i64 %count, ptr %times, ptr %states)"
-    _, count, times, states = writer.begin(signature)
-    n, found, own = writer.sizes.n, writer.pointers(), writer.samples_of(k)
-    with writer.loop(0, count) as sample:
-        _write_late_row(writer, k, found, own, sample)
-        writer.copy(writer.at(times, sample), writer.at(found["late_row"], 1), 1)
-        writer.copy(writer.at(states, sample, n), found["late_state"], n)
     return writer.end()

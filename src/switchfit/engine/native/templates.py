@@ -16,7 +16,6 @@ from switchfit.discretization.mesh import Arguments, Samples
 from switchfit.discretization.model import (
     Model,
     Piece,
-    TransitionKind,
     apply_weights,
     get_end_constraints,
     get_end_cost,
@@ -211,7 +210,7 @@ class Templates:
 
         return self._trace(end, (self.sizes.n,), (self.sizes.M,), name="a terminal cost")
 
-    def transition(self, kind: TransitionKind, which: int) -> Template:
+    def transition(self, kind: str, which: int) -> Template:
         """Trace a function at transitions: a cost, or a constraint and ``weight`` times it.
 
         The outputs of a constraint are its value and first derivatives, then those of the weighted one.
@@ -221,13 +220,13 @@ class Templates:
             function = get_transition_function(model, kind, which, Piece(origin, coefficients))
             if function is None:
                 raise ValueError("there is no function at this transition")
-            if kind.constraint:
+            if kind == "guards":
                 return self._map(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
             # The second derivatives of a cost belong to the Gauss-Newton matrix too.
             return self._cost(function, t, x, p, lambda: _differentiate_twice(function, t, x, p))
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,), (), (4, self.sizes.signals)
-        return self._trace(at, *shapes, name=f"one of the {kind.name}")
+        return self._trace(at, *shapes, name=f"one of the {kind}")
 
     def end_constraint(self) -> Template:
         """Trace all terminal constraints and their first derivatives, then those of the weighted sum."""

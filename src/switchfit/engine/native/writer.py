@@ -22,7 +22,7 @@ from switchfit.problem.structure import Structure
 
 GIVEN = (
     *("nodes", "signals", "c", "p", "bounds", "first_cell", "modes", "resets"),
-    *(kind.name for kind in AT_TRANSITIONS),
+    *AT_TRANSITIONS,
     *("multipliers", "units"),
 )
 """Arguments: nodes (G + 1,), signals (G, 4, S), constants, p (M,); the transition times between t0 and tf (N + 2,);
@@ -30,17 +30,18 @@ the cell in which each segment begins, then the last cell (N + 2,); the mode of 
 reset map and of the function of each kind at each transition, -1 without one (N,); multipliers of all constraints; the
 derivatives of the transition times, after a row of zeros (D + 1, width)."""
 
-WHOLE_NUMBERS = ("first_cell", "modes", "resets", *(kind.name for kind in AT_TRANSITIONS))
+WHOLE_NUMBERS = ("first_cell", "modes", "resets", *AT_TRANSITIONS)
 """Arguments that are 64-bit integers."""
 
-OF_SAMPLES = ("cell", "time", "value", "weight", "segment")
+OF_SAMPLES = ("cell", "time", "value", "weight", "segment", "seen")
 """Arguments of each Measurements: the cell at whose end a sample lies, or that holds a late sample, (K,); times (K,),
-values (K, q), weights (K, q); the segment that holds a late sample, (K,)."""
+values (K, q), weights (K, q); the segment that holds a late sample, (K,); results: the time at which a late sample saw
+the state, and this state, (K, 1 + n)."""
 
 
 def list_place_lengths(N: int) -> dict[str, int]:
     """Return the lengths of the arrays that say what is active where: modes, then functions at N transitions."""
-    return {"modes": N + 1, "resets": N} | {kind.name: N for kind in AT_TRANSITIONS}
+    return {"modes": N + 1, "resets": N} | dict.fromkeys(AT_TRANSITIONS, N)
 
 
 class Length(NamedTuple):
@@ -55,16 +56,12 @@ class Length(NamedTuple):
 
 
 def constraint_rows(library: Structure, sizes: Sizes) -> dict[str, int]:
-    """Return the first row of each kind of constraints, one row per transition; "end" is the first terminal one.
+    """Return the rows of constraints: those of guards, one per transition, come first, "end" is the first terminal one.
 
     "count" is the number of all rows.
     """
-    first, count = {}, 0
-    for kind in AT_TRANSITIONS:
-        if kind.constraint and getattr(library, kind.name):
-            first[kind.name] = count
-            count += sizes.N
-    return first | {"end": count, "count": count + sizes.m}
+    end = sizes.N if library.guards else 0
+    return {"end": end, "count": end + sizes.m}
 
 
 def sums(library: Structure, sizes: Sizes) -> dict[str, int]:
@@ -117,7 +114,7 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
 
 
 ZEROED = ("jumps", "late")
-"""Parts of the scratch space that start at zero."""
+"""Parts of the scratch space that start at zero, as the accumulators do; others are written before they are read."""
 
 
 class Layout(NamedTuple):
