@@ -178,7 +178,7 @@ def test_version_and_help():
     result = run("--version")
     assert result.exit_code == 0
     assert result.stdout == f"switchfit {sf.__version__}\n"
-    for name in ("", "init", "fit", "check", "simulate", "validate", "compare", "rerun", "examples", "paper"):
+    for name in ("", "init", "fit", "check", "simulate", "validate", "compare", "examples", "paper"):
         arguments = [name, "--help"] if name else ["--help"]
         result = run(*arguments)
         assert result.exit_code == 0
