@@ -82,7 +82,7 @@ columns = ["T"]
     ("command", "mistake"),
     [
         *((["fit"], mistake) for mistake in MISTAKES),
-        (["check", "--no-run"], "column"),
+        (["check"], "column"),
         (["modes"], "column"),
         (["simulate", "--json"], "column"),
     ],
