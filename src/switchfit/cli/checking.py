@@ -196,12 +196,12 @@ def design(
 
 def _write(plan: Any, folder: Path, figures: str) -> None:
     """Write table, design and figure, and the input and the samples as CSV."""
+    from switchfit.io.result_tables import write_rows, zip_rows
+
     terminal.write_result(plan, folder / "design", figures, saved=True)
     knots = plan.problem.experiments[plan.experiment].inputs
     if knots is not None:
-        rows = zip(knots.times, *plan.inputs.values(), strict=True)
-        lines = [",".join(("t", *plan.inputs)), *(",".join(map(repr, map(float, row))) for row in rows)]
-        terminal.write_file(folder / "input.csv", "\n".join(lines) + "\n")
-    lines = ["sensor,t"] + [f'"{name}",{float(time)!r}' for name, times in plan.sample_times.items() for time in times]
-    terminal.write_file(folder / "samples.csv", "\n".join(lines) + "\n")
+        terminal.write_file(folder / "input.csv", write_rows(zip_rows({"t": knots.times, **plan.inputs})))
+    samples = [{"sensor": name, "t": time} for name, times in plan.sample_times.items() for time in times]
+    terminal.write_file(folder / "samples.csv", write_rows(samples, ("sensor", "t")))
     terminal.print_note(f"written to {folder}")
