@@ -15,8 +15,7 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 from switchfit.paper import convergence, drawing, horizon, lti, magic, noise, starts, trials
 from switchfit.paper.vehicle import Found, Part, Row, Say
@@ -24,18 +23,16 @@ from switchfit.runtime.errors import InputError, get_first_line
 from switchfit.runtime.files import write_atomically
 
 #: Name -> part, in the order of the paper.
-PARTS: Mapping[str, Part] = MappingProxyType(
-    {
-        "vehicle": cast(Part, drawing),
-        "lti": cast(Part, lti),
-        "magic-formula": cast(Part, magic),
-        "convergence": cast(Part, convergence),
-        "noise": cast(Part, noise),
-        "trials": cast(Part, trials),
-        "starts": cast(Part, starts),
-        "horizon": cast(Part, horizon),
-    }
-)
+PARTS: Mapping[str, Part] = {
+    "vehicle": drawing,
+    "lti": lti,
+    "magic-formula": magic,
+    "convergence": convergence,
+    "noise": noise,
+    "trials": trials,
+    "starts": starts,
+    "horizon": horizon,
+}
 RESULTS, TABLE = "results.json", "table.md"
 
 
