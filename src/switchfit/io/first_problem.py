@@ -125,17 +125,17 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     if log is None:
         files |= {name: find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")}
     else:
-        content = read_log(log)
-        channels, others = choose_channels(content)
+        read = read_log(log)
+        channels, others = choose_channels(read)
         size = log.stat().st_size if log.is_file() else LARGEST_COPY + 1
         named = log.name if size <= LARGEST_COPY else Path(os.path.relpath(log, folder)).as_posix()
-        files["problem.toml"] = write_problem(content, channels, others, named)
+        files["problem.toml"] = write_problem(read, channels, others, named)
         files["model.py"] = _fill_template(
             "model.py.template",
             source=log.name,
             count=len(channels),
             names=tuple(channels),
-            units=tuple(content.units.get(name, "") for name in channels),
+            units=tuple(read.units.get(name, "") for name in channels),
         )
         if size <= LARGEST_COPY:
             files[log.name] = log

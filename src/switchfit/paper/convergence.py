@@ -53,7 +53,7 @@ def thin(fit: Estimate) -> list[list[Any]]:
 
 def fit_kinds(problem: Problem, kinds: Sequence[HessianKind], say: Say) -> dict[str, Found]:
     """Return the fit of a problem by each algorithm, to 1e-7, with its history."""
-    found = {}
+    found: dict[str, Found] = {}
     for kind in kinds:
         say(kind)
         fit = fit_locally(problem, hessian=kind, max_iterations=20000)
