@@ -121,7 +121,7 @@ def test_a_model_that_has_changed_since_the_fit_is_named(project):
 def test_a_model_that_no_longer_suits_the_saved_problem_is_named(project):
     """As where a model is written over the one that was fitted, and both fits are then to be compared."""
     Path("room.py").write_text(ROOM.replace('"on"', '"heating"'))
-    for result in (run("validate", FIT, "other.csv"), run("rerun", FIT), run("compare", FIT, FIT)):
+    for result in (run("validate", FIT, "other.csv"), run("compare", FIT, FIT)):
         assert (result.exit_code, result.stdout) == (2, "")
         assert "estimate.json cannot be built again, since room.py in " in result.stderr
         assert "mode_sequence names the unknown mode 'on'" in result.stderr
@@ -129,7 +129,7 @@ def test_a_model_that_no_longer_suits_the_saved_problem_is_named(project):
     Path("before").mkdir()
     Path("before", "room.py").write_text(ROOM)
     shutil.copy("log.csv", "before")
-    result = run("rerun", FIT, "--folder", "before")
+    result = run("compare", FIT, NEVER, "--folder", "before")
     assert result.exit_code == 0, result.stderr
 
 

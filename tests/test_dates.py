@@ -411,7 +411,7 @@ def test_tables_and_notebooks(fits):
     dated, plain = fits
     row, *_ = csv.DictReader(write_unknowns(dated).splitlines())
     assert dt.datetime.fromisoformat(row["date"]) == dated.transition_dates[0][0]
-    low, high = (dt.datetime.fromisoformat(row[f"date {side} 95 %"]) for side in ("low", "high"))
+    low, high = (dt.datetime.fromisoformat(row[f"date_{side}"]) for side in ("low", "high"))
     assert low < dated.transition_dates[0][0] < high
     assert "date" not in write_unknowns(plain)
     assert next(csv.DictReader(write_runs(dated).splitlines()))["origin"] == "2020-03-20T00:00:00+01:00"

@@ -82,7 +82,7 @@ columns = ["T"]
     ("command", "mistake"),
     [
         *((["fit"], mistake) for mistake in MISTAKES),
-        (["check", "--no-run"], "column"),
+        (["check"], "column"),
         (["modes"], "column"),
         (["simulate", "--json"], "column"),
     ],
@@ -105,7 +105,7 @@ def test_a_mistake_in_a_problem_file_is_named_before_jax_is_imported(tmp_path, c
         (["fitt", "problem.toml"], "No such command 'fitt'"),
         (["fit", "--strategi", "auto"], "No such option: --strategi"),
         (["fit", "nothing.toml"], "There is no problem file nothing.toml"),
-        (["rerun", "nothing.json"], "There is no saved estimate nothing.json"),
+        (["validate", "nothing.json", "log.csv"], "There is no saved estimate nothing.json"),
         (["compare", "nothing.json", "other.json"], "There is no saved estimate nothing.json"),
     ],
 )

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import switchfit as sf
 from switchfit import cli, io
 from switchfit.io import find_examples, first_problem
-from switchfit.io.first_problem import plan_problem, write_first_problem
+from switchfit.io.first_problem import choose_channels, write_first_problem
 from switchfit.io.problem_file import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -140,8 +140,8 @@ def test_positions_are_east_and_north(tmp_path):
     (tmp_path / "track.gpx").write_text(
         f'<gpx version="1.1" creator="t" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
     )
-    plan = plan_problem(sf.read_log(tmp_path / "track.gpx"))
-    assert plan.channels == ["east", "north"]
+    channels, _ = choose_channels(sf.read_log(tmp_path / "track.gpx"))
+    assert channels == ["east", "north"]
     write_first_problem(tmp_path / "new", tmp_path / "track.gpx")
     assert load_problem(tmp_path / "new" / "problem.toml").problem
 

@@ -57,17 +57,17 @@ def read(text):
 
 def test_unknowns_are_all_there_to_the_last_digit(estimate):
     rows = read(write_unknowns(estimate))
-    assert [row["name"] for row in rows] == list(estimate.theta_names)
+    assert [row["unknown"] for row in rows] == list(estimate.theta_names)
     assert [row["unit"] for row in rows] == list(estimate.theta_units)
     assert [float(row["value"]) for row in rows] == estimate.theta.tolist()
-    assert [float(row["first guess"]) for row in rows] == estimate.initial_theta.tolist()
+    assert [float(row["guess"]) for row in rows] == estimate.initial_theta.tolist()
     free = [k for k, row in enumerate(rows) if not row["held"]]
-    errors = [float(rows[k]["std. error"]) for k in free]
+    errors = [float(rows[k]["std_error"]) for k in free]
     np.testing.assert_array_equal(errors, estimate.corrected_standard_errors[free])
-    assert [float(rows[k]["naive"]) for k in free] == estimate.standard_errors[free].tolist()
-    ends = [[float(rows[k][f"{end} 95 %"]) for end in ("low", "high")] for k in free]
+    assert [float(rows[k]["naive_std_error"]) for k in free] == estimate.standard_errors[free].tolist()
+    ends = [[float(rows[k][end]) for end in ("low", "high")] for k in free]
     np.testing.assert_array_equal(ends, correct_intervals(estimate)[free])
-    held = {row["name"]: row["held"] for row in rows if row["held"]}
+    held = {row["unknown"]: row["held"] for row in rows if row["held"]}
     assert held["power_4"] == "at upper bound"
     assert rows[0]["transition"] == "on -> off"
 

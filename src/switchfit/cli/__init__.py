@@ -30,7 +30,6 @@ COMMANDS = {
     "simulate": "checking",
     "validate": "comparison",
     "compare": "comparison",
-    "rerun": "comparison",
     "examples": "starting",
     "paper": "comparison",
 }

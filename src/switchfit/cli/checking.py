@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 
 def check(
     problem: terminal.ProblemPath,
-    no_run: Annotated[
-        bool, typer.Option("--no-run", help="Read the problem file and its data; run no Python file that it names.")
-    ] = False,
     full: Annotated[
         bool,
         typer.Option("--full", help="List all runs and unknowns, and compare with the paper's equations too: seconds."),
@@ -39,9 +36,6 @@ def check(
     Exit code 0: the derivatives are right. 1: they are not. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        if no_run:
-            _check_files(problem, full)
-            return
         from switchfit.io.problem_file import load_problem
 
         loaded = load_problem(problem)
@@ -67,22 +61,6 @@ def check(
         terminal.fail_for_refused(loaded.issues)
         if not derivatives.passed:
             raise typer.Exit(terminal.NOT_CONVERGED)
-
-
-def _check_files(problem: Path, full: bool) -> None:
-    """Print the parts of a problem that are known without running a Python file."""
-    from switchfit.io.problem_file import read_experiments
-
-    runs = read_experiments(problem)
-    from switchfit.io.command_line import describe_experiments
-
-    if runs.experiments:
-        terminal.print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
-        terminal.print_list("Logs", runs.issues)
-    terminal.print_text("No Python file was run: modes, states, functions and names of parameters are not checked.")
-    names = [run.name for run in runs.experiments]
-    terminal.print_json({"runs": names, "issues": [str(issue) for issue in runs.issues]})
-    terminal.fail_for_refused(runs.issues)
 
 
 OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
@@ -218,12 +196,12 @@ def design(
 
 def _write(plan: Any, folder: Path, figures: str) -> None:
     """Write table, design and figure, and the input and the samples as CSV."""
+    from switchfit.io.result_tables import write_rows, zip_rows
+
     terminal.write_result(plan, folder / "design", figures, saved=True)
     knots = plan.problem.experiments[plan.experiment].inputs
     if knots is not None:
-        rows = zip(knots.times, *plan.inputs.values(), strict=True)
-        lines = [",".join(("t", *plan.inputs)), *(",".join(map(repr, map(float, row))) for row in rows)]
-        terminal.write_file(folder / "input.csv", "\n".join(lines) + "\n")
-    lines = ["sensor,t"] + [f'"{name}",{float(time)!r}' for name, times in plan.sample_times.items() for time in times]
-    terminal.write_file(folder / "samples.csv", "\n".join(lines) + "\n")
+        terminal.write_file(folder / "input.csv", write_rows(zip_rows({"t": knots.times, **plan.inputs})))
+    samples = [{"sensor": name, "t": time} for name, times in plan.sample_times.items() for time in times]
+    terminal.write_file(folder / "samples.csv", write_rows(samples, ("sensor", "t")))
     terminal.print_note(f"written to {folder}")

@@ -1,6 +1,5 @@
-"""``switchfit validate``, a fit on another run, and ``switchfit compare``, several fits to the same data.
-
-``switchfit rerun``, a saved fit once more, and ``switchfit paper``, the paper's experiments.
+"""``switchfit validate``, a fit on another run, ``switchfit compare``, several fits to the same data, and
+``switchfit paper``, the paper's experiments.
 """
 
 from __future__ import annotations
@@ -47,13 +46,13 @@ def validate(
         check_saved(saved)
         from switchfit.estimation.estimator import Estimate
         from switchfit.io.command_line import summarize_validation
-        from switchfit.io.rerun import list_changed_files, load_other_run
+        from switchfit.io.saved_problem import list_changed_models, load_other_run
 
         estimate = Estimate.load(saved)
         given = estimate.provenance
         loaded = load_other_run(saved, given, other, folder)
         terminal.make_folder(out)
-        changes = [] if given is None else list_changed_files(given, loaded, models_only=True)
+        changes = [] if given is None else list_changed_models(given, loaded)
         terminal.print_list("Changed since", changes)
         terminal.print_list("Logs", loaded.issues)
         found = estimate.validate(loaded.problem)
@@ -90,7 +89,7 @@ def compare(
         import switchfit as sf
         from switchfit.io.command_line import summarize_comparison
         from switchfit.io.logs import name_files
-        from switchfit.io.rerun import list_changed_files, load_with_problem
+        from switchfit.io.saved_problem import list_changed_models, load_with_problem
 
         terminal.make_folder(out)
         names = name_files(saved)
@@ -99,7 +98,7 @@ def compare(
             estimate, loaded = load_with_problem(path, folder)
             estimates.append(estimate)
             if estimate.provenance is not None:
-                changes += [f"{name}: {change}" for change in list_changed_files(estimate.provenance, loaded)]
+                changes += [f"{name}: {change}" for change in list_changed_models(estimate.provenance, loaded)]
         terminal.print_list("Changed since", changes)
         found = sf.compare(estimates, names=names)
         _show(found, summarize_comparison(found) | {"changes": changes, "out": out}, out, "comparison", figures)
@@ -117,36 +116,6 @@ def _show(found: Any, summary: dict[str, Any], folder: Path | None, name: str, f
         terminal.write_result(found, folder / name, figures)
         terminal.print_note(f"written to {folder}")
     terminal.print_json(summary)
-
-
-def rerun(
-    saved: terminal.SavedPath,
-    folder: terminal.Folder = None,
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    debug: terminal.Debug = False,
-) -> None:
-    """Fit again what a saved estimate was made from, and compare the answers.
-
-    The problem is the one that was saved with the estimate; data and models are read from where they were. What has
-    changed since, by its hash or its version, is said first. Exit code 0: the answer is the same; 1: it is another one;
-    2: it cannot be run again.
-    """
-    with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.user_files import check_saved
-
-        check_saved(saved)
-        from switchfit.cli.fitting import estimate_problem
-        from switchfit.io.rerun import compare_fits, prepare_rerun
-
-        prepared = prepare_rerun(saved, folder)
-        terminal.print_list("Changed since", prepared.changes)
-        estimate = estimate_problem(prepared.loaded, prepared.loaded.options, prepare_figures=False)
-        answers = compare_fits(prepared, estimate)
-        terminal.print_text(answers.text)
-        terminal.print_json({"same": answers.same, "changes": list(prepared.changes), "text": answers.text})
-        if not answers.same:
-            raise typer.Exit(terminal.NOT_CONVERGED)
 
 
 PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]

@@ -34,7 +34,7 @@ ProblemForLogs = Annotated[
 ]
 LogTable = Annotated[
     Path | None,
-    option(metavar="FILE.csv", help="With --problem: a table with a row for each log; FILE.parquet too."),
+    option(metavar="FILE.csv", help="With --problem: a table with a row for each log."),
 ]
 Strategy = Annotated[
     Literal["local", "auto", "thorough"] | None,
@@ -117,7 +117,7 @@ def fit(
         terminal.make_folder(out)
         options = loaded.options | overrides
         estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
-        write_estimate(estimate, loaded, options, output, output.folder)
+        write_estimate(estimate, loaded, options, output)
         from switchfit.io.command_line import summarize_estimate
         from switchfit.report.formats import add_dates
 
@@ -179,7 +179,6 @@ def write_estimate(
     loaded: ProblemFile,
     options: dict[str, Any],
     output: Output,
-    folder: Path | None,
     *,
     show: bool = True,
 ) -> None:
@@ -189,7 +188,7 @@ def write_estimate(
     from switchfit.runtime.presentation import format_text
 
     checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
-    tables = _choose_tables(estimate, folder)
+    folder, tables = output.folder, _choose_tables(estimate, output.folder)
     # The report after the certificate, which is part of the verdict.
     files = {name: str(path) for name, path in tables.items()}
     report = f"{format_text(estimate, full=output.full, files=files)}{checked}"
@@ -212,11 +211,10 @@ def write_estimate(
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
     from switchfit.io.command_line import summarize_estimate
-    from switchfit.io.result_tables import ResultTable, check_table, list_logs
+    from switchfit.io.result_tables import ResultTable, list_logs
 
     logs = list_logs(paths)
     if table is not None:
-        check_table(table)
         terminal.make_folder(table.parent)
     results, fitted = ResultTable(), []
     for name, path in logs:
@@ -229,9 +227,9 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         fitted.append({"log": str(path)} | shown)
         if loaded is not None and estimate is not None and folder is not None:
             terminal.make_folder(folder)
-            write_estimate(estimate, loaded, loaded.options | overrides, output, folder, show=False)
+            write_estimate(estimate, loaded, loaded.options | overrides, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
-            terminal.write_file(table, results.write(table))
+            terminal.write_file(table, results.write())
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
     terminal.print_note(results.summarize(len(logs)))

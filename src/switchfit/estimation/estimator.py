@@ -596,8 +596,8 @@ class Estimate(Fit, Tabular, Displayed):
         ----------
         path : path
         provenance : Provenance, optional
-            What the fit was made from, ``load_problem("problem.toml").provenance``, so that ``switchfit rerun`` can run
-            it again. Left out, the file keeps hashes of the data, and versions.
+            What the fit was made from, ``load_problem("problem.toml").provenance``, from which ``switchfit validate``
+            and ``compare`` build the problem again. Left out, the file keeps hashes of the data, and versions.
 
         See Also
         --------

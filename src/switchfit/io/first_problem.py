@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -126,10 +125,18 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     if log is None:
         files |= {name: find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")}
     else:
-        plan = plan_problem(read_log(log))
+        read = read_log(log)
+        channels, others = choose_channels(read)
         size = log.stat().st_size if log.is_file() else LARGEST_COPY + 1
         named = log.name if size <= LARGEST_COPY else Path(os.path.relpath(log, folder)).as_posix()
-        files |= {"problem.toml": write_problem(plan, named), "model.py": write_model(plan, log.name)}
+        files["problem.toml"] = write_problem(read, channels, others, named)
+        files["model.py"] = _fill_template(
+            "model.py.template",
+            source=log.name,
+            count=len(channels),
+            names=tuple(channels),
+            units=tuple(read.units.get(name, "") for name in channels),
+        )
         if size <= LARGEST_COPY:
             files[log.name] = log
     try:
@@ -145,43 +152,8 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     return [folder / name for name in files]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What the first problem file says.
-
-    Attributes
-    ----------
-    log : Log
-    channels : list of str
-        Those of the model.
-    others : list of str
-        Channels of the log that vary, too.
-    time_unit : str
-    time_scale : float
-        From the log's times to `time_unit`.
-    repairs : list of str
-    tau, horizon : float
-        Guess of the transition, and the length of the log, in `time_unit`.
-    first, before, after, noise : (q,) arrays
-        Of each channel: where it begins, its level before and after the transition, and how far it is off these.
-    """
-
-    log: Log
-    channels: list[str]
-    others: list[str]
-    time_unit: str
-    time_scale: float
-    repairs: list[str]
-    tau: float
-    horizon: float
-    first: FloatArray
-    before: FloatArray
-    after: FloatArray
-    noise: FloatArray
-
-
-def plan_problem(log: Log) -> Plan:
-    """Choose the channels of a first model, and first guesses.
+def choose_channels(log: Log) -> tuple[list[str], list[str]]:
+    """Return the channels of a first model, and the others that vary.
 
     Parameters
     ----------
@@ -192,15 +164,9 @@ def plan_problem(log: Log) -> Plan:
     InputError
         If no channel of the log changes, or it is too short.
     """
-    unit = log.time_unit if log.time_unit in ("s", "min", "h", "d") else "s"
-    scale = SECONDS[log.time_unit] / SECONDS[unit] if log.time_unit else 1.0
-    known = np.isfinite(log.times)
-    steps = np.diff(log.times[known])
-    twice = len(np.unique(log.times[known])) < known.sum()
-    flaws = {"drop-missing-times": not known.all(), "sort": np.any(steps < 0), "drop-duplicates": twice}
-    order = np.flatnonzero(known)[np.argsort(log.times[known], kind="stable")]
-    varying = [name for name in log.values if _is_varying(log.values[name][order])]
-    if log.has_positions and {"east", "north"} <= set(varying):
+    varying = [name for name, values in log.values.items() if _is_varying(values)]
+    is_track = log.has_positions and {"east", "north"} <= set(varying)
+    if is_track:
         varying.sort(key=lambda name: name not in ("east", "north"))
     usable = [name for name in varying if not name.startswith("sigma")]
     if not usable:
@@ -208,29 +174,8 @@ def plan_problem(log: Log) -> Plan:
             f"{log.source} has no channel with {FEWEST_SAMPLES} samples or more that changes; its channels are "
             f"{', '.join(log.values) or 'none'}."
         )
-    count = 2 if log.has_positions and usable[:2] == ["east", "north"] else MOST_CHANNELS
-    channels = usable[:count]
-    picked = order[:: -(-len(order) // MOST_POINTS)]
-    times = log.times[picked] * scale
-    values = np.stack([_fill_gaps(log.values[name][picked]) for name in channels], axis=1)
-    k = _find_change(values)
-    half = k + (len(values) - k) // 2
-    before, after = values[:k].mean(0), values[half:].mean(0)
-    off = np.concatenate([values[:k] - before, values[half:] - after]).std(0)
-    return Plan(
-        log=log,
-        channels=channels,
-        others=usable[count:],
-        time_unit=unit,
-        time_scale=scale,
-        repairs=[repair for repair, needed in flaws.items() if needed],
-        tau=float(0.5 * (times[k - 1] + times[k])),
-        horizon=float(times[-1] - times[0]),
-        first=values[0],
-        before=before,
-        after=after,
-        noise=np.where(off > 0, off, np.abs(after - before) * 1e-3 + 1e-12),
-    )
+    count = 2 if is_track else MOST_CHANNELS
+    return usable[:count], usable[count:]
 
 
 def _is_varying(values: FloatArray) -> bool:
@@ -257,60 +202,80 @@ def _find_change(values: FloatArray) -> int:
     return int(k[inside][explained[inside].argmax()])
 
 
-def write_problem(plan: Plan, file: str) -> str:
-    """Return the problem file of a plan.
+def _guess_levels(values: FloatArray) -> tuple[int, FloatArray, FloatArray, FloatArray]:
+    """Return the row of the transition, the levels before and after it, (q,), and how far values (K, q) are off them.
+
+    The second level is that of the second half of the rows after it.
+    """
+    k = _find_change(values)
+    half = k + (len(values) - k) // 2
+    before, after = values[:k].mean(0), values[half:].mean(0)
+    off = np.concatenate([values[:k] - before, values[half:] - after]).std(0)
+    return k, before, after, np.where(off > 0, off, np.abs(after - before) * 1e-3 + 1e-12)
+
+
+def write_problem(log: Log, channels: list[str], others: list[str], file: str) -> str:
+    """Return a problem file with first guesses that are computed from a log.
 
     Parameters
     ----------
-    plan : Plan
+    log : Log
+    channels, others : list of str
+        As from `choose_channels`.
     file : str
         The log, relative to the problem file.
     """
-    log, several = plan.log, len(plan.channels) > 1
-    unit = "" if several else log.units.get(plan.channels[0], "")
-    sigmas = [f"sigma_{k}" for k in range(1, len(plan.channels) + 1)] if several else []
-    noise = [f'{s} = {{ value = {_format(v)}, scale = "log" }}\n' for s, v in zip(sigmas, plan.noise, strict=False)]
-    states = [f"{{ value = {_format(v)} }},  # {s}" for s, v in zip(plan.channels, plan.first, strict=True)]
-    issues = [f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues]
-    sigma = f"sigma = {write_value(sigmas)}   # <- standard deviations of the noise; numbers, if they are known"
-    lines = {
-        f"file = {write_value(file)}": True,
-        f"time = {write_value(log.time_name)}": log.time_name and log.place in ("line", "row"),
-        f"time_scale = {plan.time_scale:.12g}   # the times of the log are in {log.time_unit}": plan.time_scale != 1,
-        f"columns = {write_value(plan.channels)}   # <- each measures the state of its name": True,
-        f"# further channels: {', '.join(plan.others)}": plan.others,
-        "\n".join(issues): issues,
-        f"repair = {write_value(plan.repairs)}   # what may be changed of that": plan.repairs,
-        sigma if several else "# sigma = 0.1   # <- standard deviation of the noise, if it is known": True,
-    }
+    time_unit = log.time_unit if log.time_unit in ("s", "min", "h", "d") else "s"
+    scale = SECONDS[log.time_unit] / SECONDS[time_unit] if log.time_unit else 1.0
+    picked = np.argsort(log.times, kind="stable")[:: -(-len(log) // MOST_POINTS)]
+    times = log.times[picked] * scale
+    values = np.stack([_fill_gaps(log.values[name][picked]) for name in channels], axis=1)
+    k, before, after, noise = _guess_levels(values)
+    horizon = float(times[-1] - times[0])
+    several = len(channels) > 1
+    unit = "" if several else log.units.get(channels[0], "")
+    sigmas = [f"sigma_{number}" for number in range(1, len(channels) + 1)] if several else []
+    states = [f"{{ value = {_format(v)} }},  # {s}" for s, v in zip(channels, values[0], strict=True)]
     return _fill_template(
         "problem.toml.template",
         source=Path(file).name,
-        before=_format(plan.before),
-        after=_format(plan.after),
+        before=_format(before),
+        after=_format(after),
         level_unit=f", unit = {write_value(unit)}" if unit else "",
-        time_constant=_format(np.full(len(plan.channels), 0.05 * plan.horizon)),
-        shortest=_format(0.1 * plan.horizon / max(len(log) - 1, 1)),
-        longest=_format(10 * plan.horizon),
-        unit=write_value(plan.time_unit),
-        noise="".join(noise),
-        tau=_format(plan.tau, 6),
+        time_constant=_format(np.full(len(channels), 0.05 * horizon)),
+        shortest=_format(0.1 * horizon / max(len(log) - 1, 1)),
+        longest=_format(10 * horizon),
+        unit=write_value(time_unit),
+        noise="".join(
+            f'{s} = {{ value = {_format(v)}, scale = "log" }}\n' for s, v in zip(sigmas, noise, strict=False)
+        ),
+        tau=_format(0.5 * (times[k - 1] + times[k]), 6),
         states="\n    ".join(states),
-        data="\n".join(line for line, is_said in lines.items() if is_said),
+        data="\n".join(_describe_data(log, channels, others, file, scale, sigmas)),
     )
 
 
-def write_model(plan: Plan, source: str) -> str:
-    """Return the Python file of the model of a plan.
-
-    Parameters
-    ----------
-    plan : Plan
-    source : str
-        Name of the log.
-    """
-    names, units = plan.channels, tuple(plan.log.units.get(name, "") for name in plan.channels)
-    return _fill_template("model.py.template", source=source, count=len(names), names=tuple(names), units=units)
+def _describe_data(
+    log: Log, channels: list[str], others: list[str], file: str, scale: float, sigmas: list[str]
+) -> Iterator[str]:
+    """Yield the lines of the table of data."""
+    yield f"file = {write_value(file)}"
+    if log.time_name and log.place in ("line", "row"):
+        yield f"time = {write_value(log.time_name)}"
+    if scale != 1:
+        yield f"time_scale = {scale:.12g}   # the times of the log are in {log.time_unit}"
+    yield f"columns = {write_value(channels)}   # <- each measures the state of its name"
+    if others:
+        yield f"# further channels: {', '.join(others)}"
+    yield from (f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues)
+    flaws = {
+        "sort": np.any(np.diff(log.times) < 0),
+        "drop-duplicates": len(np.unique(log.times)) < len(log),
+    }
+    if repairs := [repair for repair, is_needed in flaws.items() if is_needed]:
+        yield f"repair = {write_value(repairs)}   # what may be changed of that"
+    sigma = f"sigma = {write_value(sigmas)}   # <- standard deviations of the noise; numbers, if they are known"
+    yield sigma if sigmas else "# sigma = 0.1   # <- standard deviation of the noise, if it is known"
 
 
 def _fill_template(name: str, **values: object) -> str:

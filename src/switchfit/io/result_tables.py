@@ -1,6 +1,6 @@
 """Tables of all runs and all unknowns of a fit as CSV, however many.
 
-Fit many logs one by one: find and load them, and write a table with a row for each, as CSV or Parquet.
+Fit many logs one by one: find and load them, and write a table with a row for each.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.io.logs import find_logs, import_library, name_files
+from switchfit.io.logs import find_logs, name_files
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
-from switchfit.report.formats import add_dates, format_iso, format_rounded, list_dated
+from switchfit.report.formats import add_dates, format_iso, format_rounded, label_quantity, list_dated
 from switchfit.report.frames import ERROR, list_holds
 from switchfit.report.verdict import write_reason
+from switchfit.runtime.frames import describe_frame
 from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.answers import UNLIKELY
 from switchfit.uncertainty.residuals import ChannelQuality, correct_errors, correct_intervals, measure_quality
@@ -66,31 +67,16 @@ def zip_rows(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
     return [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
 
 
-HEADERS = {
-    "standard_error": "std. error",
-    "naive_standard_error": "naive",
-    "low": "low 95 %",
-    "high": "high 95 %",
-    "first_guess": "first guess",
-    "date_low": "date low 95 %",
-    "date_high": "date high 95 %",
-}
-"""What unknowns.csv calls the numbers of `list_unknowns`."""
-
-
-def write_unknowns(fit: Fit) -> str:
-    """Return a CSV table with a line for each unknown: its numbers, the modes that it joins, and what holds it.
+def write_unknowns(estimate: Estimate) -> str:
+    """Return a CSV table with a line for each unknown, with the columns of `Estimate.to_pandas`.
 
     Parameters
     ----------
-    fit : Fit
+    estimate : Estimate
     """
-    joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in fit.transitions}
-    rows = []
-    for i, row in enumerate(list_unknowns(fit)):
-        numbers = {HEADERS.get(name, name): entry for name, entry in row.items()}
-        rows.append(numbers | {"transition": joins.get(i, ""), "held": "; ".join(list_holds(fit, row["name"]))})
-    return write_rows(rows)
+    frame = describe_frame(estimate)
+    columns = (*frame.index, *(each for each in frame.variables if each.dimensions == (frame.rows,)))
+    return write_rows(zip_rows({each.name: each.values.tolist() for each in columns}))
 
 
 def write_runs(estimate: Estimate) -> str:
@@ -152,18 +138,8 @@ def _name_own_unknowns(problem: Problem, fit: Fit) -> Iterator[dict[str, int]]:
                 continue
             else:
                 column = name.removeprefix(f"{fit.run_names[e]}.")
-            found[name_column(column, fit.theta_units[i])] = i
+            found[label_quantity(column, fit.theta_units[i])] = i
         yield found
-
-
-def name_column(name: str, unit: str) -> str:
-    """Return the name of the column of an unknown, with its unit in parentheses.
-
-    Parameters
-    ----------
-    name, unit : str
-    """
-    return f"{name} ({unit})" if unit and unit != "1" else name
 
 
 def _list_flags(
@@ -235,26 +211,6 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
     return list(zip(name_files(found), map(Path, found), strict=True))
 
 
-PARQUET = (".parquet", ".pq")
-"""Endings of tables that are written as Parquet; all others are CSV."""
-
-
-def check_table(path: Path) -> None:
-    """Raise for a table that cannot be written, before any log is fitted.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    InputError
-        If it is to be Parquet, and pyarrow is not installed.
-    """
-    if path.suffix.lower() in PARQUET:
-        import_library("pyarrow.parquet", "parquet", str(path), "or give the table a name that ends in .csv")
-
-
 @dataclass
 class ResultTable:
     """Results of fits to logs, in the order in which they were fitted.
@@ -263,13 +219,13 @@ class ResultTable:
     ----------
     rows : list of dict
         Of each log its columns; a column that does not apply to it is left out.
-    unknowns : dict of str to str
-        Names of the columns of the unknowns of all logs, with the unit in parentheses, and their units.
+    unknowns : dict of str to None
+        Names of the columns of the unknowns of all logs, with the unit in parentheses.
     refused, failed : int
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    unknowns: dict[str, str] = field(default_factory=dict)
+    unknowns: dict[str, None] = field(default_factory=dict)
     refused: int = 0
     failed: int = 0
 
@@ -312,8 +268,8 @@ class ResultTable:
         }
         unknowns = list_unknowns(estimate)
         for unknown in unknowns:
-            shown = name_column(unknown["name"], unknown["unit"])
-            self.unknowns[shown] = unknown["unit"]
+            shown = label_quantity(unknown["name"], unknown["unit"])
+            self.unknowns[shown] = None
             row |= {shown: float(unknown["value"]), ERROR.format(shown): float(unknown["standard_error"])}
         row |= {f"{unknown['name']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
         self.rows.append({**row, "message": message})
@@ -342,23 +298,6 @@ class ResultTable:
         fitted = len(self) - self.refused - self.failed
         return f"{format_count(total, 'log')}: {fitted} fitted, {self.failed} not, {self.refused} refused{left}"
 
-    def write(self, path: Path) -> str | bytes:
-        """Return the content of the table's file, with the columns that any of the logs has.
-
-        Parameters
-        ----------
-        path : Path
-            Its ending says whether it is Parquet or CSV.
-        """
-        columns = sorted(list_columns(self.rows), key=lambda name: name == "message")  # which comes last
-        return self._write_parquet(columns) if path.suffix.lower() in PARQUET else write_rows(self.rows, columns)
-
-    def _write_parquet(self, columns: Sequence[str]) -> bytes:
-        """Return Parquet; an empty cell is null, and the fields of unknowns have their units as metadata."""
-        import pyarrow.parquet
-
-        table, file = pyarrow.table({name: [row.get(name) for row in self.rows] for name in columns}), io.BytesIO()
-        units = [self.unknowns.get(name.removesuffix(ERROR.format("")), "") for name in columns]
-        fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
-        pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
-        return file.getvalue()
+    def write(self) -> str:
+        """Return the table as CSV, with the columns that any of the logs has."""
+        return write_rows(self.rows, sorted(list_columns(self.rows), key=lambda name: name == "message"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from switchfit.paper.vehicle import (
     summary,
     tidy,
 )
+from switchfit.problem.problem import Problem
 
 TITLE = "Convergence (Fig. 4)"
 KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact", "descent-first")
@@ -49,18 +51,24 @@ def thin(fit: Estimate) -> list[list[Any]]:
     return [kept.tolist(), [norms[k] for k in kept]]
 
 
+def fit_kinds(problem: Problem, kinds: Sequence[HessianKind], say: Say) -> dict[str, Found]:
+    """Return the fit of a problem by each algorithm, to 1e-7, with its history."""
+    found: dict[str, Found] = {}
+    for kind in kinds:
+        say(kind)
+        fit = fit_locally(problem, hessian=kind, max_iterations=20000)
+        found[kind] = {**summary(fit), "history": thin(fit)}
+    return found
+
+
 def compute(quick: bool, folder: Path, say: Say) -> Found:
     """Fit with every algorithm, to 1e-7."""
     problem = build_simulated_problem()
     found: Found = {
         "truth": list(TRUTH),
         "eigenvalues_at_start": np.linalg.eigvalsh(evaluate(problem).hessian).tolist(),
-        "fits": {},
+        "fits": fit_kinds(problem, KINDS, say),
     }
-    for kind in KINDS:
-        say(kind)
-        fit = fit_locally(problem, hessian=kind, max_iterations=20000)
-        found["fits"][kind] = {**summary(fit), "history": thin(fit)}
     first = fit_locally(problem, hessian="descent-first")
     positive = [np.linalg.eigvalsh(evaluate(problem, record.theta).hessian)[0] > 0 for record in first.history]
     found["descents"] = positive.index(True)

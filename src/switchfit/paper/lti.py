@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import expm
 
-from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.fit.trajectory import simulate
 from switchfit.optimize.problem import HessianKind
-from switchfit.paper.convergence import convergence_figure, thin
-from switchfit.paper.vehicle import Figure, Found, Row, Say, conditions, summary
+from switchfit.paper.convergence import convergence_figure, fit_kinds
+from switchfit.paper.vehicle import Figure, Found, Row, Say, conditions
 from switchfit.problem.data import FloatArray, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64
@@ -118,12 +117,8 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
             float(np.linalg.norm(ours.gradient - gradient) / np.linalg.norm(gradient)),
             float(np.linalg.norm(ours.hessian - hessian) / np.linalg.norm(hessian)),
         ],
-        "fits": {},
+        "fits": fit_kinds(here, KINDS, say),
     }
-    for kind in KINDS:
-        say(kind)
-        fit = fit_locally(here, hessian=kind, max_iterations=20000)
-        found["fits"][kind] = {**summary(fit), "history": thin(fit)}
     exact_fit = found["fits"]["exact"]["theta"]
     found["error"] = float(np.max(np.abs(np.array(list(exact_fit.values())) - TRUTH)))
     path = simulate(problem(TRUTH))

@@ -141,10 +141,10 @@ def simulate_drive(
     return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
 
 
-def build_simulated_problem(start: tuple[float, float, float] = START, tf: float = HORIZON) -> Problem:
+def build_simulated_problem() -> Problem:
     """Return the simulated problem of Section V-A 2: the whole state of (18) at TRUTH is the reference signal."""
-    path = simulate_drive(tf=tf)
-    return stick_slip(ReferenceSignal.from_samples(path.times, path.states), start, tf=tf)
+    path = simulate_drive()
+    return stick_slip(ReferenceSignal.from_samples(path.times, path.states))
 
 
 def wheel_speeds(

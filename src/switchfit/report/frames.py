@@ -67,8 +67,9 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
     }
     dated = list_dated(estimate)
     if any(run is not None for run in dated):
-        dates = ["" if run is None else format_iso(t, run) for t, run in zip(estimate.theta, dated, strict=True)]
-        columns["date"] = np.array(dates, dtype=str)
+        for name, times in {"date": estimate.theta, "date_low": low, "date_high": high}.items():
+            dates = ["" if run is None else format_iso(t, run) for t, run in zip(times, dated, strict=True)]
+            columns[name] = np.array(dates, dtype=str)
     variables = [Variable(name, values, rows) for name, values in columns.items()]
     square = ("unknown", "unknown_2")
     named = ("covariance", "correlation", "hessian")

@@ -44,7 +44,7 @@ def read_gpx(path: Path, options: Options) -> Log:
     points = [point for track in gpx.tracks for segment in track.segments for point in segment.points]
     if not any(point.time for point in points):
         raise InputError(f"{path} has no track with times: of {len(points)} points, none has a time.")
-    times, offset = subtract_first([None if p.time is None else _count_micros(p.time) for p in points], 1e-6)
+    times, offset = subtract_first([None if p.time is None else _count_micros(p.time) for p in points], 10**6)
     fields = {
         "latitude": "latitude", "longitude": "longitude", "altitude": "elevation", "speed": "speed", "course": "course",
         "hdop": "horizontal_dilution",
@@ -84,7 +84,7 @@ def read_nmea(path: Path, options: Options) -> Log:
             f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
         )
     micros = _count_fixes(fixes)
-    times, offset = subtract_first(micros, 1e-6) if day else (np.array(micros) * 1e-6, 0.0)
+    times, offset = subtract_first(micros, 10**6) if day else (np.array(micros) * 1e-6, 0.0)
     columns = {name: _make_column([fix.get(name) for fix in fixes]) for name in UNITS}
     rows = np.array([fix["line"] for fix in fixes], dtype=np.intp)
     issues: tuple[Issue, ...] = ()

@@ -26,6 +26,7 @@ from switchfit.io.logs.log import (
     normalize_time_unit,
     split_unit,
 )
+from switchfit.problem.dates import NANOSECONDS
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -87,17 +88,17 @@ def interpret_times(
     return (numbers, epoch, 0.0) if keep_epoch else (numbers - finite[0], epoch, float(finite[0]))
 
 
-def subtract_first(counts: Sequence[int | None], length: float = 1.0) -> tuple[FloatArray, float]:
+def subtract_first(counts: Sequence[int | None], unit: int = 1) -> tuple[FloatArray, float]:
     """Return integers since 1970 from the first one on, NaN for None, and the first one; doubles would round them.
 
     Parameters
     ----------
     counts : sequence of int or None
-    length : float
-        What both are multiplied by.
+    unit : int
+        What both are divided by.
     """
     first = next(count for count in counts if count is not None)
-    return np.array([np.nan if count is None else (count - first) * length for count in counts]), first * length
+    return np.array([np.nan if count is None else (count - first) / unit for count in counts]), first / unit
 
 
 def _are_uptimes(times: FloatArray) -> bool:
@@ -176,11 +177,14 @@ def build_log(
 
 def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
     if column.dtype.kind == "M":
-        times, first = subtract_first(column.astype("datetime64[ns]").astype(object).tolist(), SECONDS["ns"])
+        times, first = subtract_first(column.astype("datetime64[ns]").astype(object).tolist(), NANOSECONDS["s"])
         return times, "s", first
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.int64) * SECONDS["ns"], "s", 0.0
-    return interpret_times(np.asarray(column, dtype=np.float64), name, unit, keep_epoch=keep_epoch)
+    times, unit, offset = interpret_times(np.asarray(column, dtype=np.float64), name, unit, keep_epoch=keep_epoch)
+    if offset and column.dtype.kind in "iu":
+        times, offset = subtract_first(column.tolist())
+    return times, unit, offset
 
 
 def read_parquet(path: Path, options: Options) -> Log:

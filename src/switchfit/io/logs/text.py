@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from switchfit.io.logs.geodesy import FRAME, find_position
 from switchfit.io.logs.log import Event, FloatArray, Log, Options, is_unit, split_unit, strip_brackets
-from switchfit.io.logs.tables import find_time_name, interpret_times, subtract_first
+from switchfit.io.logs.tables import build_log, find_time_name
 from switchfit.problem.dates import read_date_text
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
@@ -198,9 +198,8 @@ def is_date(cell: str) -> bool:
     return bool(_WHOLE_DATE.fullmatch(cell) or _CLOCK.fullmatch(cell))
 
 
-def parse_dates(cells: Sequence[str], places: Sequence[str]) -> tuple[FloatArray, float, str]:
-    """Return the seconds since the first date, NaN where one is missing, the first one in seconds since 1970, and the
-    zone: "" if none states one, "UTC" if they state several.
+def parse_dates(cells: Sequence[str], places: Sequence[str]) -> tuple[NDArray[np.datetime64], str]:
+    """Return dates in UTC, NaT where one is missing, and their zone: "" if none states one, "UTC" for several.
 
     Parameters
     ----------
@@ -216,8 +215,8 @@ def parse_dates(cells: Sequence[str], places: Sequence[str]) -> tuple[FloatArray
     """
     found = [None if is_missing(cell) else _read_date(cell, place) for cell, place in zip(cells, places, strict=True)]
     zones = {entry[1] for entry in found if entry is not None}
-    seconds, first = subtract_first([None if entry is None else entry[0] // 1000 for entry in found], 1e-6)
-    return seconds, first, zones.pop() if len(zones) == 1 else "UTC"
+    dates = np.array([None if entry is None else entry[0] for entry in found], dtype="datetime64[ns]")
+    return dates, zones.pop() if len(zones) == 1 else "UTC"
 
 
 def parse_clock(cells: Sequence[str], places: Sequence[str]) -> FloatArray:
@@ -328,7 +327,7 @@ def read_text(path: Path, options: Options) -> Log:
     column = _find_time(table, wanted or ()) if time is None else _find_column(table, time)
     if options.drop_broken:
         table = _drop_text(table, column, wanted)
-    times, time_unit, offset, zone = _read_times(table, column, options.keep_epoch)
+    log = _read_times(table, column, options)
     values: dict[str, FloatArray] = {}
     events: list[Event] = []
     issues = list(table.broken)
@@ -344,7 +343,7 @@ def read_text(path: Path, options: Options) -> Log:
         elif names.count(names[k]) > 1:
             issues.append(Issue("log: repeated name", (table.source, names[k])))
         elif _is_text(table.list_cells(k), bad):
-            events += _list_changes(names[k], table.list_cells(k), times)
+            events += _list_changes(names[k], table.list_cells(k), log.times)
         else:
             first = int(bad.argmax())
             figures = {"line": float(table.lines[first]), "count": float(bad.sum())}
@@ -352,22 +351,10 @@ def read_text(path: Path, options: Options) -> Log:
     units = {name: table.header.units[names.index(name)] for name in values}
     labels = {label: names[k] for label, k in table.header.labels.items() if names[k] in values}
     events.sort(key=lambda event: event.time)
-    return Log(
-        times=times,
-        values=values,
-        units=units,
-        time_unit=time_unit,
-        source=table.source,
-        issues=tuple(issues),
-        events=tuple(events),
-        offset=offset,
-        labels=labels,
-        rows=table.lines,
+    return replace(
+        log, values=values, units=units, issues=tuple(issues), events=tuple(events), labels=labels, rows=table.lines,
         place="line",
-        time_name=names[column],
-        time_zone="UTC" if zone is None else zone,
-        has_dates=zone is not None,
-    )
+    )  # fmt: skip
 
 
 # --- from bytes to cells ----------------------------------------------------------------------------------------------
@@ -558,36 +545,35 @@ def _find_time(table: _Table, channels: Sequence[int]) -> int:
     )
 
 
-def _read_times(table: _Table, column: int, keep_epoch: bool) -> tuple[FloatArray, str, float, str | None]:
-    """Return times, their unit, what was subtracted from them, and the time zone of dates, None if they are numbers."""
-    cells = table.list_cells(column)
+def _read_times(table: _Table, column: int, options: Options) -> Log:
+    """Return a log with the times of a table, and no channels."""
+    name, cells = table.header.names[column], table.list_cells(column)
+    unit, zone = table.header.units[column], ""
+    times: NDArray[Any]
     sample = next((cell for cell in cells if not is_missing(cell)), "")
     if is_date(sample):
-        return _parse_dated(table, column, cells, sample)
-    numbers, bad = table.parse_column(column)
-    if bad.any():
-        _refuse_cell(table, column, int(bad.argmax()))
-    times, unit, offset = interpret_times(
-        numbers, table.header.names[column], table.header.units[column], keep_epoch=keep_epoch
-    )
-    if offset and cells and all(map(_LONG_INTEGER.fullmatch, cells)):
-        times, offset = subtract_first(list(map(int, cells)))
-    return times, unit, offset, None
+        places = [f"{table.source}, line {line}, column {name!r}" for line in table.lines]
+        is_clock = "-" not in sample and "/" not in sample and sample.count(".") < 2
+        days = _list_days(table) if is_clock else []
+        if is_clock and not days:
+            times, unit = parse_clock(cells, places), "s"
+        else:
+            dated = [f"{day} {clock}" for day, clock in zip(days, cells, strict=True)] if is_clock else cells
+            times, zone = parse_dates(dated, places)
+    elif cells and all(map(_LONG_INTEGER.fullmatch, cells)):
+        times = np.array(list(map(int, cells)))
+    else:
+        times, bad = table.parse_column(column)
+        if bad.any():
+            _refuse_cell(table, column, int(bad.argmax()))
+    return build_log(table.source, {name: times}, {name: unit}, options._replace(time=name), {name: zone})
 
 
-def _parse_dated(
-    table: _Table, column: int, cells: list[str], sample: str
-) -> tuple[FloatArray, str, float, str | None]:
-    """Return seconds since the first of dates; those of times of day since midnight, unless a column has the date."""
-    places = [f"{table.source}, line {line}, column {table.header.names[column]!r}" for line in table.lines]
-    if "-" not in sample and "/" not in sample and sample.count(".") < 2:
-        lower = [name.lower() for name in table.header.names]
-        day = next((lower.index(name) for name in _DATE_NAMES if name in lower), None)
-        if day is None:
-            return parse_clock(cells, places), "s", 0.0, None
-        cells = [f"{date} {clock}" for date, clock in zip(table.list_cells(day), cells, strict=True)]
-    seconds, offset, zone = parse_dates(cells, places)
-    return seconds, "s", offset, zone
+def _list_days(table: _Table) -> list[str]:
+    """Return the cells of the column with the dates of times of day; none if there is no such column."""
+    lower = [name.lower() for name in table.header.names]
+    day = next((lower.index(name) for name in _DATE_NAMES if name in lower), None)
+    return [] if day is None else table.list_cells(day)
 
 
 def _refuse_cell(table: _Table, column: int, row: int) -> None:

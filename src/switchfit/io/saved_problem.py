@@ -1,0 +1,167 @@
+"""Saved estimates as the command line takes them: what they were made from, and the problem built again from that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.saved import FileDigest, Provenance, load_saved
+from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.building import ProblemFile, digest_file
+from switchfit.problem.data import Measurements
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import join_names
+from switchfit.runtime.errors import InputError
+
+
+def check_provenance(path: Path, given: Provenance | None, python: str) -> Provenance:
+    """Return the provenance of a saved estimate, whose problem can be built again.
+
+    Parameters
+    ----------
+    path : Path
+    given : Provenance or None
+    python : str
+        What to do with a problem that was built in Python, for the message.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be built again.
+    """
+    if given is None:
+        raise InputError(f"{path} does not say what it was made from: fit its problem file again.")
+    if not given.problem_file:
+        raise InputError(
+            f"{path} does not have its problem, which was built in Python: functions are not saved, only hashes of the "
+            f"data. {python} switchfit fit PROBLEM.toml --out DIR saves what is needed."
+        )
+    return given
+
+
+def rebuild_problem(
+    path: Path, given: Provenance, folder: Path | None = None, log: Path | None = None
+) -> tuple[ProblemFile, Path]:
+    """Return the problem of a saved estimate, built from the text that was saved with it, and its folder.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    given : Provenance
+        As from `check_provenance`.
+    folder : Path, optional
+        Where the files are; left out, where the problem file was, seen from the folder of the saved estimate.
+    log : Path, optional
+        A log in place of that which was fitted.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or wrong.
+    """
+    where = Path(given.folder) if folder is None else folder
+    own = where / given.log if given.log else None
+    try:
+        return load_problem(where / given.problem_file, own if log is None else log, text=given.text), where
+    except InputError as error:
+        needed = [digest.name for digest in given.files if log is None or digest.name.endswith(".py")]
+        missing = [name for name in needed if not (where / name).exists()]
+        if missing:
+            raise InputError(
+                f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it "
+                "is in with --folder."
+            ) from error
+        now = {digest.name: digest_file(where, where / digest.name).sha256 for digest in given.files}
+        changed = [d.name for d in given.files if d.name in needed and now[d.name] not in ("", d.sha256)]
+        if not changed:
+            raise
+        raise InputError(
+            f"{path} cannot be built again, since {join_names(changed)} in {where} has changed: {error} Fit again; or "
+            "put the files as they were into a folder, and name it with --folder."
+        ) from error
+
+
+PYTHON_VALIDATE = "Validate in the script that fitted it: estimate.validate(...)."
+PYTHON_COMPARE = "Compare in the script that fitted it: sf.compare([...])."
+
+
+def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Path | None) -> ProblemFile:
+    """Return the problem of another run: that of a problem file, or that of the saved estimate with another log.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    given : Provenance or None
+        Of the saved estimate.
+    other : Path
+        A problem file, whose name ends in .toml, or a log.
+    folder : Path or None
+        As in `rebuild_problem`.
+    """
+    if other.suffix.lower() == ".toml":
+        return load_problem(other)
+    return rebuild_problem(path, check_provenance(path, given, PYTHON_VALIDATE), folder, other)[0]
+
+
+def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, ProblemFile]:
+    """Return a saved estimate with its problem, and the problem file.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    folder : Path, optional
+        As in `rebuild_problem`.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be built again, or its data are no longer those that were fitted.
+    """
+    given = check_provenance(path, load_saved(path).provenance, PYTHON_COMPARE)
+    loaded, where = rebuild_problem(path, given, folder)
+    estimate = Estimate.load(path, problem=loaded.problem)
+    if not _has_data(estimate, loaded.problem):
+        raise InputError(f"{path} was fitted to other values than the files in {where} have now: fit them again.")
+    return estimate, loaded
+
+
+def _has_data(estimate: Estimate, problem: Problem) -> bool:
+    """Return whether the measurements of a problem are those that an estimate was fitted to."""
+    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
+    fitted = [each for run in estimate.comparisons for each in run if each.kind == "measurements"]
+    return len(items) == len(fitted) and all(
+        np.array_equal(item.times, each.times) and np.array_equal(item.values, each.measured, equal_nan=True)
+        for item, each in zip(items, fitted, strict=True)
+    )
+
+
+def list_changed_models(given: Provenance, loaded: ProblemFile) -> list[str]:
+    """Return the Python files that are not as they were when a fit was saved, a line for each.
+
+    Parameters
+    ----------
+    given : Provenance
+        Of the saved fit.
+    loaded : ProblemFile
+        The problem that was built again.
+    """
+    before, now = (
+        {digest.name: digest for digest in each.files if digest.name.endswith(".py")}
+        for each in (given, loaded.provenance)
+    )
+    return [change for name in {**before, **now} if (change := _describe_change(name, before.get(name), now.get(name)))]
+
+
+def _describe_change(name: str, before: FileDigest | None, now: FileDigest | None) -> str:
+    if before is None:
+        return f"{name} is new"
+    if now is None:
+        return f"{name} is no longer there"
+    if before.sha256 == now.sha256:
+        return ""
+    return f"{name} has changed: {before.size:,} bytes with SHA-256 {before.sha256[:12]}..., now {now.size:,} bytes"
