@@ -24,7 +24,7 @@ OFTEN = (
     *("decisions: plus or minus one", "decisions: integer division", "decisions: select", "decisions: cond of several"),
     *("decisions: hysteresis", "arrays: einsum of a batch", "arrays: solve", "arrays: sum of nothing"),
     *("arrays: interp", "tables: interp of 500", "tables: map", "matrices: solve 3", "matrices: lu"),
-    *("matrices: solve 6", "order: argsort 8", "order: top_k 4", "places: at set by the state"),
+    *("matrices: solve 6", "order: argsort 8", "places: at set by the state"),
     *("arrays: interp by hand", "arrays: cumprod", "places: optimization_barrier", "places: at add twice"),
     *("places: negative pad", "loops: scan of length 0", "loops: custom_jvp", "loops: while", "special: ndtr"),
 )

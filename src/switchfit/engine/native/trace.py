@@ -8,7 +8,7 @@ An array whose entries are all known is a NumPy array of numbers, any other an o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -27,7 +27,6 @@ from switchfit.engine.native.arrays import (
     scatter,
     search,
     sort,
-    top_k,
     triangular_solve,
 )
 from switchfit.engine.native.entries import (
@@ -36,12 +35,12 @@ from switchfit.engine.native.entries import (
     Unsupported,
     choose,
     from_double,
-    is_traced,
+    known_number,
     less,
-    of_type,
+    within,
 )
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
-from switchfit.problem.jaxprs import find_line, find_public_name
+from switchfit.problem.jaxprs import find_line, find_public_name, list_jaxprs
 
 __all__ = ["Unsupported", "trace_scalars"]
 
@@ -143,7 +142,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
-            places = search(graph, args[0], args[1], right="lt_to" in _primitives(inner.jaxpr))
+            places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner.jaxpr))
             return [np.asarray(places, dtype=object)]
         if hasattr(inner, "consts"):
             return _run(graph, inner.jaxpr, inner.consts, args)
@@ -209,17 +208,13 @@ def _is_search(equation: Any) -> bool:
     if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) < 2:
         return False
     table, query = (variable.aval for variable in equation.invars[:2])
-    sides = {"lt_to", "le_to"} & set(_primitives(equation.params["jaxpr"].jaxpr))
+    sides = {"lt_to", "le_to"} & _find_primitives(equation.params["jaxpr"].jaxpr)
     types = table.dtype == query.dtype == np.float64 and len(equation.outvars) == len(sides) == 1
     return bool(types and table.ndim == 1 and equation.outvars[0].aval.shape == query.shape)
 
 
-def _primitives(jaxpr: Any) -> Iterator[str]:
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for value in equation.params.values():
-            if hasattr(value, "jaxpr"):
-                yield from _primitives(value.jaxpr)
+def _find_primitives(jaxpr: Any) -> set[str]:
+    return {equation.primitive.name for inner in list_jaxprs(jaxpr) for equation in inner.eqns}
 
 
 OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
@@ -381,7 +376,7 @@ def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any],
         return from_double(graph, kind)
     if kind.kind == "f":
         return lambda a: Integer.of(graph, a).node
-    return lambda a: of_type(graph, Integer.of(graph, a), kind)
+    return lambda a: within(graph, Integer.of(graph, a), kind)
 
 
 def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
@@ -526,16 +521,14 @@ def _find_first(name: str) -> Callable[..., Any]:
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
-        beyond = _get_meaning(graph, name, {}, dtype)
+        reaches = _get_meaning(graph, name, {}, dtype)  # false for NaN, which is beyond any number
 
         def first(row: Any) -> Any:
             best, found = row[0], 0
             for k, value in enumerate(row[1:], start=1):
-                better = beyond(value, best)
+                better = graph.apply("not", reaches(best, value))
                 if dtype.kind == "f":
-                    # NaN is beyond any number, and the first NaN stays.
-                    undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
-                    better = graph.apply("or", better, undefined)
+                    better = graph.apply("and", better, graph.apply("eq", best, best))  # the first NaN stays
                 best, found = choose(graph, better, value, best), choose(graph, better, k, found)
             return found
 
@@ -555,12 +548,9 @@ def _scatter(name: str | None) -> Callable[..., Any]:
             if name is None:
                 return choose(graph, here, update, old)
             # Known place, known numbers: no node at all.
-            if name == "add" and here is True and not is_traced(old) and not is_traced(update):
-                return old + update
-            apply = _get_meaning(graph, name, {}, dtype)
-            if name == "add" and dtype.kind == "f":
-                return apply(old, choose(graph, here, update, 0.0))
-            return choose(graph, here, apply(old, update), old)
+            if known_number(here) is True and not any(isinstance(a, Node | Integer) for a in (old, update)):
+                return OPERATIONS[name].value(old, update)
+            return choose(graph, here, _get_meaning(graph, name, {}, dtype)(old, update), old)
 
         return scatter(graph, equation, a, indices, updates, combine)
 
@@ -582,13 +572,12 @@ INDEXED: dict[str, Callable[..., Any]] = {
 """Operations at indices."""
 
 RULES: dict[str, Callable[..., Any]] = {
-    "argmax": _find_first("gt"),
-    "argmin": _find_first("lt"),
+    "argmax": _find_first("ge"),
+    "argmin": _find_first("le"),
     "lu": lu,
     "cholesky": cholesky,
     "triangular_solve": triangular_solve,
     "sort": sort,
-    "top_k": top_k,
     "dot_general": _dot,
     **{f"reduce_{name}": _reduce(op) for name, op in SUMS.items()},
     **{f"reduce_{name}": _reduce(name) for name in ("and", "or", "xor")},
