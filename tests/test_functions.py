@@ -58,7 +58,7 @@ def machine_code_of(template, count):
     module = llvm.Module(4)
     stores = [("y", k, node) for k, node in enumerate(nodes)] + graph.check()
     module.write_straight_line("f", stores, ("x", "w", "y", CHECKED))
-    program = llvm.compile_module(module.take())  # the code is gone with it
+    program = llvm.compile_modules([module.take()])  # the code is gone with it
 
     def evaluate(x, w):
         y, wrong = np.full(ends[-1], 7e77), np.zeros(1)
