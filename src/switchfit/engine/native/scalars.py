@@ -119,6 +119,8 @@ OPERATIONS = {
         Operation("neg", np.negative, "fneg {type} {0}", 1, primitives=("neg",)),
         _comparison("lt", np.less, "olt"),
         _comparison("le", np.less_equal, "ole"),
+        _comparison("gt", np.greater, "ogt"),
+        _comparison("ge", np.greater_equal, "oge"),
         _comparison("eq", np.equal, "oeq", commutes=True),
         _comparison("ne", np.not_equal, "une", commutes=True),
         _logic("and", np.bitwise_and, ("and", "min"), known_alike=True),

@@ -32,6 +32,7 @@ from switchfit.engine.native.arrays import (
 from switchfit.engine.native.entries import (
     OF_INTEGERS,
     Integer,
+    Meaning,
     Unsupported,
     choose,
     from_double,
@@ -40,7 +41,7 @@ from switchfit.engine.native.entries import (
     within,
 )
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
-from switchfit.problem.jaxprs import find_line, find_public_name, list_jaxprs
+from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
 
 __all__ = ["Unsupported", "trace_scalars"]
 
@@ -70,7 +71,7 @@ def trace_scalars(
         # Without what has no use: there, no operation has to be finite.
         jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
         with np.errstate(all="ignore"):
-            outputs = _run(graph, jaxpr, closed.consts, inputs)
+            outputs = _Tracing(graph).run(jaxpr, closed.consts, inputs)
         if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
             raise Unsupported("returns something else than float64")
     except Unsupported as error:
@@ -86,25 +87,28 @@ def _make_jaxpr(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) 
         raise Unsupported(f"cannot be traced with its derivatives: {type(error).__name__}: {line}") from error
 
 
-def _run(graph: Graph, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-    known: dict[Any, Any] = {}
-    for variables, values in ((jaxpr.constvars, consts), (jaxpr.invars, inputs)):
-        for variable, value in zip(variables, values, strict=True):
-            known[variable] = _as_array(value)
+class _Tracing(Walk):
+    """Follows arrays through a jaxpr; what is done to entries that are not known becomes nodes of a graph."""
 
-    def of(atom: Any) -> Any:
-        return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
 
-    for equation in jaxpr.eqns:
+    def constant(self, value: Any) -> Any:
+        return _as_array(value)
+
+    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
         try:
-            if len(graph.nodes) > MOST_NODES:
+            if len(self._graph.nodes) > MOST_NODES:
                 raise Unsupported(f"takes more than {MOST_NODES} operations")
-            results = _apply(graph, equation, [of(a) for a in equation.invars])
+            return [_as_array(value) for value in _apply(self._graph, equation, given)]
         except Unsupported as error:
             raise _add_location(error, equation) from None
-        for variable, value in zip(equation.outvars, results, strict=True):
-            known[variable] = _as_array(value)
-    return [of(a) for a in jaxpr.outvars]
+
+
+def _run(graph: Graph, inner: Any, inputs: Sequence[Any]) -> list[Any]:
+    """Return the results of a jaxpr that an operation calls, with its constants or without."""
+    jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+    return _Tracing(graph).run(jaxpr, consts, [_as_array(value) for value in inputs])
 
 
 def _as_array(value: Any) -> Any:
@@ -142,11 +146,9 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
-            places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner.jaxpr))
+            places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
             return [np.asarray(places, dtype=object)]
-        if hasattr(inner, "consts"):
-            return _run(graph, inner.jaxpr, inner.consts, args)
-        return _run(graph, inner, (), args)
+        return _run(graph, inner, args)
     if known and name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
         with suppress(Unsupported):
             dtype = equation.outvars[0].aval.dtype
@@ -183,15 +185,11 @@ def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
 def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries of arrays of a type."""
     _check_type(dtype)
-    if name in OF_ALL:
-        return OF_ALL[name](graph, params, dtype)
-    if dtype.kind != "f" and name in OF_INTEGERS and (dtype.kind != "b" or name not in OF_TRUTH):
-        return OF_INTEGERS[name](graph, params, dtype)  # truth values are compared as integers are
+    table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, OF_INTEGERS)
+    if name in table:
+        return table[name](graph, params, dtype)
     if dtype.kind in "iu":
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
-    table = MEANINGS if dtype.kind == "f" else OF_TRUTH
-    if name in table:
-        return table[name](graph, params)
     raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
 
 
@@ -208,13 +206,13 @@ def _is_search(equation: Any) -> bool:
     if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) < 2:
         return False
     table, query = (variable.aval for variable in equation.invars[:2])
-    sides = {"lt_to", "le_to"} & _find_primitives(equation.params["jaxpr"].jaxpr)
+    sides = {"lt_to", "le_to"} & _find_primitives(equation.params["jaxpr"])
     types = table.dtype == query.dtype == np.float64 and len(equation.outvars) == len(sides) == 1
     return bool(types and table.ndim == 1 and equation.outvars[0].aval.shape == query.shape)
 
 
-def _find_primitives(jaxpr: Any) -> set[str]:
-    return {equation.primitive.name for inner in list_jaxprs(jaxpr) for equation in inner.eqns}
+def _find_primitives(closed: Any) -> set[str]:
+    return {equation.primitive.name for inner in list_jaxprs(closed.jaxpr) for equation in inner.eqns}
 
 
 OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
@@ -231,9 +229,7 @@ def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     consts, carry, columns = args[:fixed], list(args[fixed : fixed + carried]), args[fixed + carried :]
     made: list[list[Any]] = []
     for k in reversed(range(length)) if params["reverse"] else range(length):
-        results = _run(
-            graph, params["jaxpr"].jaxpr, params["jaxpr"].consts, [*consts, *carry, *(c[k] for c in columns)]
-        )
+        results = _run(graph, params["jaxpr"], [*consts, *carry, *(c[k] for c in columns)])
         carry = results[:carried]
         made.append(results[carried:])
     if not made:
@@ -245,16 +241,15 @@ def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
 def _while(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Unroll a loop whose condition never depends on the state."""
     params = equation.params
-    condition, body = params["cond_jaxpr"], params["body_jaxpr"]
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     of_condition, of_body, carry = args[:first], args[first:second], list(args[second:])
     for _ in range(MOST_TURNS):
-        (again,) = _run(graph, condition.jaxpr, condition.consts, [*of_condition, *carry])
+        (again,) = _run(graph, params["cond_jaxpr"], [*of_condition, *carry])
         if again.dtype == object:
             raise Unsupported("calls jax.lax.while_loop with a condition that depends on the state")
         if not again:
             return carry
-        carry = _run(graph, body.jaxpr, body.consts, [*of_body, *carry])
+        carry = _run(graph, params["body_jaxpr"], [*of_body, *carry])
     raise Unsupported(f"has a loop of more than {MOST_TURNS} turns")
 
 
@@ -262,12 +257,10 @@ def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Trace all branches, and select among their results."""
     which, *operands = args
     choice, branches = which.item(), equation.params["branches"]
-    is_known = not isinstance(choice, Node | Integer)
-    if is_known:
-        branches = [branches[int(np.clip(choice, 0, len(branches) - 1))]]
-    results = [_run(graph, branch.jaxpr, branch.consts, operands) for branch in branches]
-    if is_known:
-        return results[0]
+    known = known_number(choice)
+    if known is not None:
+        return _run(graph, branches[int(np.clip(known, 0, len(branches) - 1))], operands)
+    results = [_run(graph, branch, operands) for branch in branches]
     select = np.frompyfunc(partial(_select(graph), choice), len(branches), 1)
     return [np.asarray(select(*cases), dtype=object) for cases in zip(*results, strict=True)]
 
@@ -278,8 +271,7 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     # Operands: constants of matvec, vecmat, solve and transpose_solve, in this order, then the right-hand side.
     before = lengths.matvec + lengths.vecmat
     right = before + lengths.solve + (lengths.transpose_solve if jaxprs.transpose_solve is not None else 0)
-    solve = jaxprs.solve
-    return _run(graph, solve.jaxpr, solve.consts, [*args[before : before + lengths.solve], *args[right:]])
+    return _run(graph, jaxprs.solve, [*args[before : before + lengths.solve], *args[right:]])
 
 
 LOOPS: dict[str, Callable[..., list[Any]]] = {
@@ -354,8 +346,6 @@ NUMPY: dict[str, Callable[..., Any]] = {
         if operation.known_alike
         for name in (*operation.primitives, *operation.of_truth[:1])
     },
-    "gt": lambda params, a, b: a > b,
-    "ge": lambda params, a, b: a >= b,
     "select_n": lambda params, which, *cases: np.choose(which.astype(int), cases),
 }
 """Frequent operations on known numbers, evaluated by NumPy, since calling XLA for each would be slow."""
@@ -416,7 +406,7 @@ def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any
     return lambda low, a, high: smaller(larger(a, low), high)
 
 
-OF_ALL: dict[str, Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]] = {
+OF_ALL: dict[str, Meaning] = {
     "clamp": _clamp,
     "convert_element_type": _convert,
     "integer_pow": _integer_power,
@@ -428,21 +418,17 @@ OF_ALL: dict[str, Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]] = {
 # Doubles
 
 
-def _apply_operation(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: partial(graph.apply, op)
+def _apply_operation(op: str) -> Meaning:
+    return lambda graph, params, dtype: partial(graph.apply, op)
 
 
-def _apply_swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: lambda a, b: graph.apply(op, b, a)
-
-
-def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
+def _round(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
     """Round to the nearest integer; a half to the even one, or away from zero."""
     to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
     return partial(graph.apply, "rint" if to_even else "round")
 
 
-def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
+def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
     def sign(a: Any) -> Any:
         negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
         return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
@@ -450,18 +436,16 @@ def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
     return sign
 
 
-MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
+OF_DOUBLES: dict[str, Meaning] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
-    "gt": _apply_swapped("lt"),
-    "ge": _apply_swapped("le"),
-    "square": lambda graph, params: lambda a: a * a,
-    "rsqrt": lambda graph, params: lambda a: 1.0 / graph.apply("sqrt", a),
-    "logistic": lambda graph, params: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
+    "square": lambda graph, params, dtype: lambda a: a * a,
+    "rsqrt": lambda graph, params, dtype: lambda a: 1.0 / graph.apply("sqrt", a),
+    "logistic": lambda graph, params, dtype: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
     "sign": _sign,
     "round": _round,
-    "lt_to": lambda graph, params: partial(compare_in_order, graph, "lt"),
-    "le_to": lambda graph, params: partial(compare_in_order, graph, "le"),
-    "is_finite": lambda graph, params: lambda a: graph.apply("eq", a - a, 0.0),
+    "lt_to": lambda graph, params, dtype: partial(compare_in_order, graph, "lt"),
+    "le_to": lambda graph, params, dtype: partial(compare_in_order, graph, "le"),
+    "is_finite": lambda graph, params, dtype: lambda a: graph.apply("eq", a - a, 0.0),
 }
 """Operations on each entry of arrays of doubles."""
 
@@ -469,10 +453,10 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
 # Truth values
 
 
-OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
+OF_TRUTH: dict[str, Meaning] = OF_INTEGERS | {
+    name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth
 }
-"""Operations on each entry of arrays of truth values."""
+"""Operations on each entry of arrays of truth values, which are compared as integers are."""
 
 
 # Whole arrays
