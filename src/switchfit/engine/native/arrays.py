@@ -156,8 +156,8 @@ def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
         taken = np.squeeze(take(graph, a, starts, sizes), axis=dropped)
         if params["mode"] == GatherScatterMode.FILL_OR_DROP and known_number(fits) is not True:
             fill = _fill_value(params["fill_value"], out.dtype)
-            filled = [choose(graph, fits, value, fill) for value in taken.reshape(-1).tolist()]
-            taken = as_objects(filled).reshape(taken.shape)
+            filled = np.frompyfunc(partial(choose, graph, fits), 2, 1)(taken, fill)
+            taken = np.asarray(filled, dtype=object)
         result[among] = taken if taken.ndim else taken.item()
     return result
 
@@ -297,10 +297,7 @@ def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
         entry = graph.lookup(padded, last)
         beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN comes after all numbers
         found = graph.apply("select", beyond, found + float(step), found)
-    most = float(K)
-    if 2**turns - 1 > K:
-        found = graph.apply("select", graph.apply("lt", most, found), most, found)
-    return Integer(found, 0, K) if found.number is None else int(found.number)
+    return clamp(graph, Integer(found, 0, 2**turns - 1), 0, K)
 
 
 MOST_ROWS_TO_PIVOT = 5

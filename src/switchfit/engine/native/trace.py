@@ -49,9 +49,6 @@ __all__ = ["Unsupported", "trace_scalars"]
 MOST_NODES = 10_000
 """Largest number of operations of one function. Compiling takes 20 s at this size, and grows faster than it."""
 
-MOST_TURNS = 100_000
-"""Largest number of iterations of a loop that is unrolled."""
-
 
 def trace_scalars(
     function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function"
@@ -141,42 +138,41 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     # An empty array counts as known, so that JAX evaluates reductions over it.
     args = [a if a.size else np.empty(a.shape, v.aval.dtype) for a, v in zip(args, equation.invars, strict=True)]
     known = all(a.dtype != object for a in args)
-    # The order matters: calls are inlined; what is known is computed at once, indexing here, frequent operations by
-    # NumPy and all others by XLA; only what is left becomes nodes.
+    # The order matters: calls are inlined; what is known is computed at once; only what is left becomes nodes.
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
             places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
             return [np.asarray(places, dtype=object)]
         return _run(graph, inner, args)
-    if known and name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
-        with suppress(Unsupported):
-            dtype = equation.outvars[0].aval.dtype
-            return [np.asarray(INDEXED[name](graph, equation, *args)).astype(dtype)]
-    if known and name not in MOVES and name not in NUMPY:
-        return _evaluate_known(equation, args)
     if name in MOVES:
         result = MOVES[name](params, *args)
         return result if equation.primitive.multiple_results else [result]
     if known:
-        dtype = equation.outvars[0].aval.dtype
-        if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
-            return _evaluate_known(equation, args)  # NumPy and JAX differ for numbers out of range
-        return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
+        return _evaluate_known(graph, equation, args)
     # What depends on the state: loops are unrolled, rules take whole arrays, and meanings one entry at a time.
     if name in LOOPS:
         return LOOPS[name](graph, equation, *args)
+    for dtype in (variable.aval.dtype for variable in equation.invars):
+        if dtype.kind not in "fbiu" or (dtype.kind == "f" and dtype != np.float64):
+            raise Unsupported(f"has numbers of type {dtype} that depend on the state")
     if name in RULES:
-        for variable in equation.invars:
-            _check_type(variable.aval.dtype)
         results = RULES[name](graph, equation, *args)
         return results if equation.primitive.multiple_results else [np.asarray(results, dtype=object)]
     meaning = _get_meaning(graph, name, params, equation.invars[-1].aval.dtype)
     return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
 
 
-def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
-    """Evaluate an operation on known numbers by JAX."""
+def _evaluate_known(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+    """Evaluate an operation on known numbers: indexing here, frequent operations by NumPy and all others by XLA."""
+    name, out = equation.primitive.name, [variable.aval for variable in equation.outvars]
+    if name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
+        with suppress(Unsupported):
+            return [np.asarray(INDEXED[name](graph, equation, *args)).astype(out[0].dtype)]
+    # NumPy and JAX differ where doubles become integers, for numbers out of range.
+    is_cut = name == "convert_element_type" and args[0].dtype.kind == "f" and out[0].dtype.kind in "iu"
+    if name in NUMPY and not is_cut:
+        return [np.asarray(NUMPY[name](equation.params, *args)).astype(out[0].dtype).reshape(out[0].shape)]
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*args, **equation.params)
     return [_as_array(a) for a in (results if equation.primitive.multiple_results else [results])]
@@ -184,18 +180,12 @@ def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
 
 def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries of arrays of a type."""
-    _check_type(dtype)
     table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, OF_INTEGERS)
     if name in table:
         return table[name](graph, params, dtype)
-    if dtype.kind in "iu":
+    if dtype.kind in "iu" and name not in OTHER_NAMES:
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
-
-
-def _check_type(dtype: np.dtype[Any]) -> None:
-    if dtype.kind not in "fbiu" or (dtype.kind == "f" and dtype != np.float64):
-        raise Unsupported(f"has numbers of type {dtype} that depend on the state")
 
 
 def _is_search(equation: Any) -> bool:
@@ -238,21 +228,6 @@ def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def _while(graph: Graph, equation: Any, *args: Any) -> list[Any]:
-    """Unroll a loop whose condition never depends on the state."""
-    params = equation.params
-    first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-    of_condition, of_body, carry = args[:first], args[first:second], list(args[second:])
-    for _ in range(MOST_TURNS):
-        (again,) = _run(graph, params["cond_jaxpr"], [*of_condition, *carry])
-        if again.dtype == object:
-            raise Unsupported("calls jax.lax.while_loop with a condition that depends on the state")
-        if not again:
-            return carry
-        carry = _run(graph, params["body_jaxpr"], [*of_body, *carry])
-    raise Unsupported(f"has a loop of more than {MOST_TURNS} turns")
-
-
 def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Trace all branches, and select among their results."""
     which, *operands = args
@@ -276,7 +251,6 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
 
 LOOPS: dict[str, Callable[..., list[Any]]] = {
     "scan": _scan,
-    "while": _while,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
 }
