@@ -659,11 +659,11 @@ def compile_modules(texts: Iterable[str]) -> Program:
             # The key has all that the code depends on: text, version of llvmlite, processor.
             path = None if folder is None else folder / f"native-{keys[-1]}"
             known = None if path is None else read_code(path)
-            codes.append((path, executor.submit(_compile_to_object_code, text) if known is None else known))
-        if any(isinstance(code, Future) for _, code in codes):
+            codes.append(executor.submit(_compile_to_object_code, text, path) if known is None else known)
+        if any(isinstance(code, Future) for code in codes):
             for name in NEEDED_NEXT:  # Python would only wait for LLVM
                 import_module(name)
-        found = [_wait_for_code(code, path) if isinstance(code, Future) else code for path, code in codes]
+        found = [wait_for(code) if isinstance(code, Future) else code for code in codes]
     finally:
         executor.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for LLVM
     # One engine links the objects of all modules: addresses of functions in others are known only then.
@@ -679,8 +679,12 @@ def _create_machine() -> Any:
     return llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
 
 
-def _compile_to_object_code(text: str) -> bytes:
-    return bytes(_create_machine().emit_object(llvm.parse_assembly(text)))
+def _compile_to_object_code(text: str, path: Path | None) -> bytes:
+    """Compile a module, which takes seconds for long functions; keep its code."""
+    code = bytes(_create_machine().emit_object(llvm.parse_assembly(text)))
+    if path is not None:
+        write_code(path, code)
+    return code
 
 
 def wait_for(future: Future[Found]) -> Found:
@@ -688,14 +692,6 @@ def wait_for(future: Future[Found]) -> Found:
     while not wait([future], timeout=0.1).done:  # on Windows, a wait without timeout cannot be interrupted
         pass
     return future.result()
-
-
-def _wait_for_code(future: Future[bytes], path: Path | None) -> bytes:
-    """Wait for a compilation, which takes seconds for long functions; keep its code."""
-    code = wait_for(future)
-    if path is not None:
-        write_code(path, code)
-    return code
 
 
 @cache

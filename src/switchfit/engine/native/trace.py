@@ -41,6 +41,7 @@ from switchfit.engine.native.entries import (
     within,
 )
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
+from switchfit.problem.jaxprs import MOVES as SELECTIONS
 from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
 
 __all__ = ["Unsupported", "trace_scalars"]
@@ -267,11 +268,6 @@ def _broadcast(params: Any, a: Any, *_: Any) -> Any:
     return np.broadcast_to(np.expand_dims(a, others), params["shape"])
 
 
-def _slice(params: Any, a: Any) -> Any:
-    steps = params["strides"] or [1] * a.ndim
-    return a[tuple(slice(*s) for s in zip(params["start_indices"], params["limit_indices"], steps, strict=True))]
-
-
 def _pad(params: Any, a: Any, value: Any) -> Any:
     """Insert entries between and around those of an array; a negative count at an end removes entries."""
     shape, inside, places = [], [], []
@@ -291,11 +287,8 @@ def _split(params: Any, a: Any) -> Any:
 
 
 MOVES: dict[str, Callable[..., Any]] = {
+    **{name: lambda params, a, *_, move=move: move(a, params) for name, move in SELECTIONS.items()},
     "broadcast_in_dim": _broadcast,
-    "reshape": lambda params, a, *_: a.reshape(params["new_sizes"]),
-    "squeeze": lambda params, a: np.squeeze(a, axis=tuple(params["dimensions"])),
-    "transpose": lambda params, a: np.transpose(a, params["permutation"]),
-    "slice": _slice,
     "concatenate": lambda params, *a: np.concatenate(a, axis=params["dimension"]),
     "pad": _pad,
     "rev": lambda params, a: np.flip(a, params["dimensions"]),
