@@ -375,7 +375,7 @@ def cholesky(graph: Graph, equation: Any, a: Any) -> Any:
 
 def _cholesky(graph: Graph, a: Objects) -> Objects:
     n = len(a)
-    L, positive = np.full((n, n), 0.0, dtype=object), True
+    L, positive = np.full((n, n), 0.0, dtype=object), graph.constant(True)
     for k in range(n):
         positive = graph.apply("and", positive, graph.apply("lt", 0.0, a[0, 0]))
         L[k, k] = graph.apply("sqrt", a[0, 0])
