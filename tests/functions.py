@@ -360,7 +360,6 @@ ORDER: dict[str, Function] = {
     "quantile by the state": lambda x: jnp.quantile(some(6)(x), jax.nn.sigmoid(x[0])),
     "nanmedian": lambda x: jnp.nanmedian(jnp.where(x > 0.5, x, jnp.nan)),
     "top_k 4": lambda x: lax.top_k(some(6)(x), 4)[0] * lax.top_k(some(6)(x), 4)[1],
-    "top_k with NaN": lambda x: lax.top_k(jnp.where(x > 0.5, x, jnp.nan), 2)[0],
     "argpartition": lambda x: x[jnp.argpartition(x, 1)],
 }
 
@@ -467,6 +466,8 @@ FALLS_BACK = {
     "matrices: cholesky 7": "calls jnp.linalg.cholesky, which works with a matrix of 7 rows (limit: 6)",
     "matrices: positive definite system 6": "takes more than 10000 operations",
     "order: sort 17": "calls jnp.sort, which sorts 17 numbers that depend on the state (limit: 16)",
+    "order: top_k 4": "calls jax.lax.top_k",
+    "order: argpartition": "calls jnp.argpartition",
     "loops: known while": "cannot be traced with its derivatives: ValueError",
     "loops: while": "cannot be traced with its derivatives: ValueError",
     "loops: fori_loop as long as the state says": "cannot be traced with its derivatives: ValueError",

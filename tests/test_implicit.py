@@ -398,7 +398,7 @@ def compile_solve(filled, kind):
     factors = elimination.eliminate(STIFF.a, graph.constant(1.0), f_x)
     x = np.concatenate(factors.solve(right, transposed=kind == "transposed"))
     module.write_straight_line("run", [("x", k, node) for k, node in enumerate(x)], ("f_x", "right", "x"))
-    program = llvm.compile_module(module.take())
+    program = llvm.compile_modules([module.take()])
     run = program.function("run", *[ctypes.c_void_p] * 3)
 
     def solve(f_x, right):

@@ -253,7 +253,7 @@ def test_machine_code_is_kept_and_read_again(tmp_path, monkeypatch):
 
     def tripled():
         x = np.array([2.0, 0.0])
-        program = llvm.compile_module(text)
+        program = llvm.compile_modules([text])
         program.function("f", llvm.ctypes.c_void_p)(x.ctypes.data)
         return x[1]
 

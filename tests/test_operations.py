@@ -66,7 +66,7 @@ def by_machine_code(operation, points):
     module = llvm.Module(1)
     module.write_straight_line("f", [("y", 0, applied(graph, operation, operands))], ("x", "y"))
     assert graph.nodes[-1].op in (operation.name, "select"), "simplified away"
-    program = llvm.compile_module(module.take())
+    program = llvm.compile_modules([module.take()])
     function, y = program.function("f", ctypes.c_void_p, ctypes.c_void_p), np.zeros(1)
     found = []
     for x in np.ascontiguousarray(points.T):

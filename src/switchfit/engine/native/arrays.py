@@ -23,12 +23,9 @@ from switchfit.engine.native.entries import (
     OF_INTEGERS,
     Integer,
     Unsupported,
-    both,
     choose,
     clamp,
     equal,
-    invert,
-    is_traced,
     known_number,
     less,
     pick,
@@ -43,7 +40,7 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
     a = a[tuple(_get_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
-    if len(moving) > 1 and not any(is_traced(e) and known_number(e) is None for e in a.reshape(-1)):
+    if len(moving) > 1 and all(known_number(e) is not None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
     for axis in moving:
         rows = np.moveaxis(a, axis, 0)
@@ -88,8 +85,8 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
     for first in product(*ranges):
         here = condition
         for start, value in zip(starts, first, strict=True):
-            here = both(graph, here, equal(graph, start, value))
-        if here is False:
+            here = graph.apply("and", here, equal(graph, start, value))
+        if known_number(here) is False:
             continue
         for place in np.ndindex(*window.shape):
             at = tuple(f + k for f, k in zip(first, place, strict=True))
@@ -139,8 +136,8 @@ def _list_windows(
             starts[axis] = start
         fits: Any = True
         for axis, (start, n, size) in enumerate(zip(starts, shape, sizes, strict=True)):
-            fits = both(graph, fits, invert(graph, less(graph, start, 0)))
-            fits = both(graph, fits, invert(graph, less(graph, n - size, start)))
+            for outside_range in (less(graph, start, 0), less(graph, n - size, start)):
+                fits = graph.apply("and", fits, graph.apply("not", outside_range))
             starts[axis] = clamp(graph, start, 0, n - size)
         among: list[Any] = [slice(None)] * many
         for axis, k in zip(outside, place, strict=True):
@@ -157,10 +154,10 @@ def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
     windows = _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape))
     for starts, fits, among in windows:
         taken = np.squeeze(take(graph, a, starts, sizes), axis=dropped)
-        if params["mode"] == GatherScatterMode.FILL_OR_DROP and fits is not True:
+        if params["mode"] == GatherScatterMode.FILL_OR_DROP and known_number(fits) is not True:
             fill = _fill_value(params["fill_value"], out.dtype)
-            filled = [choose(graph, fits, value, fill) for value in taken.reshape(-1).tolist()]
-            taken = as_objects(filled).reshape(taken.shape)
+            filled = np.frompyfunc(partial(choose, graph, fits), 2, 1)(taken, fill)
+            taken = np.asarray(filled, dtype=object)
         result[among] = taken if taken.ndim else taken.item()
     return result
 
@@ -198,42 +195,36 @@ Entries = tuple[Any, ...]
 def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
     """Trace `jax.lax.sort`: stable, NaN last, by the first `num_keys` arrays."""
     params = equation.params
-    axis, keys = params["dimension"], params["num_keys"]
-    kinds = [variable.aval.dtype.kind for variable in equation.invars[:keys]]
-
-    def behind(one: Entries, other: Entries) -> Any:
-        return _is_behind(graph, kinds, one[:keys], other[:keys])
+    axis = params["dimension"]
+    kinds = [variable.aval.dtype.kind for variable in equation.invars[: params["num_keys"]]]
 
     shape = arrays[0].shape
     rows = [np.moveaxis(a, axis, -1).reshape(-1, shape[axis]) for a in arrays]
     found = [np.empty(row.shape, dtype=object) for row in rows]
     for k in range(len(rows[0])):
-        entries = _sort_entries(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), behind)
+        entries = _sort_entries(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), kinds)
         for to, column in zip(found, zip(*entries, strict=True), strict=True):
             to[k] = as_objects(column)
     moved = tuple(n for k, n in enumerate(shape) if k != axis)
     return [np.moveaxis(each.reshape(*moved, shape[axis]), -1, axis) for each in found]
 
 
-def _sort_entries(
-    graph: Graph, entries: list[Entries], behind: Callable[[Entries, Entries], Any], first: int | None = None
-) -> list[Entries]:
-    """Sort entries, or only until the `first` ones are in place, by exchanging neighbors."""
+def _sort_entries(graph: Graph, entries: list[Entries], kinds: list[str]) -> list[Entries]:
+    """Sort entries by exchanging neighbors."""
     n = len(entries)
     if n > MOST_SORTED:
         raise Unsupported(f"sorts {n} numbers that depend on the state (limit: {MOST_SORTED})")
-    entries = list(entries)
-    for front in range(n - 1 if first is None else min(first, n - 1)):
+    for front in range(n - 1):
         for k in reversed(range(front, n - 1)):
             one, other = entries[k], entries[k + 1]
-            swap = behind(one, other)
+            swap = _is_behind(graph, kinds, one, other)
             entries[k] = tuple(choose(graph, swap, b, a) for a, b in zip(one, other, strict=True))
             entries[k + 1] = tuple(choose(graph, swap, a, b) for a, b in zip(one, other, strict=True))
     return entries
 
 
 def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> Any:
-    """Return whether an entry comes after another by the first key in which they differ."""
+    """Return whether an entry comes after another by the first key in which they differ; their kinds are given."""
     kind, a, b = kinds[0], one[0], other[0]
     if kind == "f":  # a > b, or a is NaN and b is not
         behind = graph.apply("and", graph.apply("not", graph.apply("le", a, b)), graph.apply("eq", b, b))
@@ -246,31 +237,8 @@ def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> 
         same: Any = graph.apply("or", graph.apply("eq", a, b), undefined)
     else:
         same = equal(graph, a, b)
-    later = both(graph, same, _is_behind(graph, kinds[1:], one[1:], other[1:]))
-    return choose(graph, behind, True, later) if isinstance(behind, Node) else behind or later
-
-
-def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Trace `jax.lax.top_k`: the largest entries and their indices; NaN counts as largest, ties keep their order.
-
-    Unlike in a sort, 0.0 is larger than -0.0. The reciprocal of each entry moves with it and tells the two apart.
-    """
-    k, kind = equation.params["k"], equation.invars[0].aval.dtype.kind
-
-    def behind(one: Entries, other: Entries) -> Any:
-        found = _is_behind(graph, [kind], other, one)
-        if kind != "f":
-            return found
-        zeros = graph.apply("and", graph.apply("eq", one[0], other[0]), graph.apply("lt", one[2], other[2]))
-        return graph.apply("or", found, zeros)
-
-    shape = (*a.shape[:-1], k)
-    values, places = np.empty((2, int(np.prod(shape[:-1])), k), dtype=object)
-    for row, to, at in zip(a.reshape(-1, a.shape[-1]), values, places, strict=True):
-        reciprocals = [graph.apply("div", 1.0, value) if kind == "f" else 0 for value in row]
-        found = _sort_entries(graph, list(zip(row.tolist(), range(len(row)), reciprocals, strict=True)), behind, k)[:k]
-        to[:], at[:], _ = (as_objects(column) for column in zip(*found, strict=True))
-    return [values.reshape(shape), places.reshape(shape)]
+    later = graph.apply("and", same, _is_behind(graph, kinds[1:], one[1:], other[1:]))
+    return graph.apply("or", behind, later)
 
 
 # Searching sorted arrays
@@ -286,7 +254,7 @@ def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
 
 def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
     """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table (K,)."""
-    entries = [known_number(e) if is_traced(e) else e for e in table.tolist()]
+    entries = [known_number(e) for e in table.tolist()]
     numbers = None if None in entries else np.array(entries, dtype=float)
     of_constants = numbers is not None and not any(a > b for a, b in pairwise(numbers)) and not np.isnan(numbers).any()
 
@@ -329,10 +297,7 @@ def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
         entry = graph.lookup(padded, last)
         beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN comes after all numbers
         found = graph.apply("select", beyond, found + float(step), found)
-    most = float(K)
-    if 2**turns - 1 > K:
-        found = graph.apply("select", graph.apply("lt", most, found), most, found)
-    return Integer(found, 0, K) if found.number is None else int(found.number)
+    return clamp(graph, Integer(found, 0, 2**turns - 1), 0, K)
 
 
 MOST_ROWS_TO_PIVOT = 5
@@ -410,9 +375,9 @@ def cholesky(graph: Graph, equation: Any, a: Any) -> Any:
 
 def _cholesky(graph: Graph, a: Objects) -> Objects:
     n = len(a)
-    L, positive = np.full((n, n), 0.0, dtype=object), True
+    L, positive = np.full((n, n), 0.0, dtype=object), graph.constant(True)
     for k in range(n):
-        positive = both(graph, positive, graph.apply("lt", 0.0, a[0, 0]))
+        positive = graph.apply("and", positive, graph.apply("lt", 0.0, a[0, 0]))
         L[k, k] = graph.apply("sqrt", a[0, 0])
         L[k + 1 :, k] = a[1:, 0] * (1.0 / L[k, k])
         a = a[1:, 1:] - np.outer(L[k + 1 :, k], L[k + 1 :, k])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.implicit_rows import couple
 from switchfit.discretization.rows import FloatArray
+from switchfit.engine.native.entries import known_number
 from switchfit.engine.native.llvm import count_doubles
 from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
 
@@ -30,7 +31,7 @@ def eliminate(a: FloatArray, h: Node, f_x: Sequence[Objects], place: int | None 
 
     With a place behind `KEPT`, another function can `load` the factors from there, once their `stores` are written.
     """
-    filled = np.any([[[_is_entry(value) for value in row] for row in J] for J in f_x], axis=0)
+    filled = np.any([[[known_number(value) != 0.0 for value in row] for row in J] for J in f_x], axis=0)
     order, products = order_states(filled)
     n, s = len(order), len(a)
     if _takes_routine(products, n, s):
@@ -49,10 +50,6 @@ def count_factors(n: int, s: int) -> int:
 
 def _takes_routine(products: int, n: int, s: int) -> bool:
     return products * s**2 > MOST_PRODUCTS * n
-
-
-def _is_entry(value: Any) -> bool:
-    return (value.number if isinstance(value, Node) else value) != 0.0
 
 
 def order_states(filled: NDArray[np.bool_]) -> tuple[list[int], int]:

@@ -10,8 +10,10 @@ program checks the result at run time (`Graph.require`), and falls back to JAX i
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -75,21 +77,15 @@ class Integer:
         return cls(graph.constant(float(value)), int(value), int(value))
 
 
-def is_traced(value: Any) -> bool:
-    """Return whether an entry is a node or an integer that depends on the state."""
-    return isinstance(value, Node | Integer)
-
-
 def _is_known_integer(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
     """Select one of two entries of the same type; the condition may be known or traced."""
-    if isinstance(condition, Node) and condition.number is not None:
-        condition = condition.number
-    if not isinstance(condition, Node):
-        return yes if condition else no
+    known = known_number(condition)
+    if known is not None:
+        return yes if known else no
     if isinstance(yes, Integer) or isinstance(no, Integer) or (_is_known_integer(yes) and _is_known_integer(no)):
         one, other = Integer.of(graph, yes), Integer.of(graph, no)
         node = graph.apply("select", condition, one.node, other.node)
@@ -117,27 +113,12 @@ def equal(graph: Graph, a: Any, b: Any) -> Any:
     return graph.apply("eq", one.node, other.node)
 
 
-def both(graph: Graph, a: Any, b: Any) -> Any:
-    """Return whether both of two conditions hold; either may be known."""
-    if isinstance(a, Node) and isinstance(b, Node):
-        return graph.apply("and", a, b)
-    known, other = (b, a) if isinstance(a, Node) else (a, b)
-    return other if known else False
-
-
 def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
     """Clamp an integer to a range; return an int if the result is known."""
     if not isinstance(index, Integer):
         return min(max(int(index), low), high)
-    least, most = min(max(index.low, low), high), max(min(index.high, high), low)
-    if least == most:
-        return least
-    node = index.node
-    if index.low < low:
-        node = graph.apply("select", graph.apply("lt", node, float(low)), float(low), node)
-    if index.high > high:
-        node = graph.apply("select", graph.apply("lt", float(high), node), float(high), node)
-    return Integer(node, least, most)
+    found = _choose_extreme(graph, min, high, _choose_extreme(graph, max, low, index))
+    return found.low if found.low == found.high else found
 
 
 def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
@@ -149,8 +130,8 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     starts = [k for k in range(len(entries)) if k == 0 or not _is_same(entries[k - 1], entries[k])]
     if len(starts) == 1:
         return entries[0]
-    if len(starts) > MOST_SELECTIONS and not any(is_traced(e) and known_number(e) is None for e in entries):
-        return _look_up(graph, [known_number(e) if is_traced(e) else e for e in entries], index)
+    if len(starts) > MOST_SELECTIONS and all(known_number(e) is not None for e in entries):
+        return _look_up(graph, list(map(known_number, entries)), index)
     if len(starts) > MOST_CHOICES:
         raise Unsupported(
             f"takes one of {len(starts)} numbers by an index that depends on the state (limit: {MOST_CHOICES})"
@@ -168,18 +149,18 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
 
 def known_number(entry: Any) -> Any:
     """Return the value of an entry; None if it depends on the state."""
-    return entry.number if isinstance(entry, Node) else None
+    if isinstance(entry, Node):
+        return entry.number
+    return None if isinstance(entry, Integer) else entry
 
 
 def _is_same(one: Any, other: Any) -> bool:
-    if one is other:
-        return True
-    if isinstance(one, Integer) or isinstance(other, Integer):
-        return isinstance(one, Integer) and isinstance(other, Integer) and one.node is other.node
-    one, other = (e.number if isinstance(e, Node) and e.number is not None else e for e in (one, other))
-    if isinstance(one, Node) or isinstance(other, Node):
-        return False
-    return bool((one == other and np.signbit(one) == np.signbit(other)) or (one != one and other != other))
+    if isinstance(one, Integer) and isinstance(other, Integer):
+        return one.node is other.node
+    a, b = known_number(one), known_number(other)
+    if a is None or b is None:
+        return one is other
+    return bool((a == b and np.signbit(a) == np.signbit(b)) or (a != a and b != b))
 
 
 def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
@@ -205,25 +186,27 @@ def _bounds(dtype: np.dtype[Any]) -> tuple[int, int]:
     return max(info.min, -LARGEST), min(info.max, LARGEST)
 
 
-def within(graph: Graph, node: Node, low: int, high: int, dtype: np.dtype[Any]) -> Any:
-    """Return a node between two bounds as an integer of a type, clamped to its range: it may be an index of memory."""
+def within(graph: Graph, found: Integer, dtype: np.dtype[Any]) -> Any:
+    """Return an integer as one of a type, clamped to its range: it may be an index of memory."""
     least, most = _bounds(dtype)
-    if high < least or low > most:
+    if found.high < least or found.low > most:
         raise Unsupported(f"does arithmetic with integers beyond {most}")
-    found = Integer(node, low, high)
     inside = clamp(graph, found, least, most)
-    if low < least or high > most:
-        graph.require(graph.apply("eq", node, Integer.of(graph, inside).node))
+    if found.low < least or found.high > most:
+        graph.require(graph.apply("eq", found.node, Integer.of(graph, inside).node))
     return inside
 
 
-def _from_bounds(op: str, bounds: Callable[..., tuple[int, int]]) -> Meaning:
+def _exactly(op: str, value: Callable[..., int]) -> Meaning:
+    """Return an operation on doubles; its result is between the extremes at the bounds of the operands and at zero."""
+
     def get_meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
         def apply(*given: Any) -> Any:
             args = [Integer.of(graph, a) for a in given]
-            low, high = bounds(*((a.low, a.high) for a in args))
+            corners = [value(*c) for c in product(*((a.low, a.high, min(max(0, a.low), a.high)) for a in args))]
+            low, high = min(corners), max(corners)
             node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
-            return within(graph, node, low, high, dtype)
+            return within(graph, Integer(node, low, high), dtype)
 
         return apply
 
@@ -236,15 +219,6 @@ def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -
     return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
 
 
-def _product(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
-    corners = [x * y for x, y in product(a, b)]
-    return min(corners), max(corners)
-
-
-def _absolute(a: tuple[int, int]) -> tuple[int, int]:
-    return (0 if a[0] <= 0 <= a[1] else min(map(abs, a))), max(map(abs, a))
-
-
 def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return division rounded towards zero; division by zero yields -1."""
 
@@ -253,7 +227,7 @@ def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., 
         largest = max(abs(a.low), abs(a.high), 1)
         low = 0 if a.low >= 0 and b.low >= 0 else -largest
         node = _drop_sign_of_zero(graph, graph.apply("trunc", a.node / b.node), -largest, largest, "trunc")
-        return choose(graph, equal(graph, b, 0), -1, within(graph, node, low, largest, dtype))
+        return choose(graph, equal(graph, b, 0), -1, within(graph, Integer(node, low, largest), dtype))
 
     return divide
 
@@ -276,63 +250,44 @@ def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], An
     return lambda a: choose(graph, less(graph, a, 0), -1, choose(graph, less(graph, 0, a), 1, 0))
 
 
-def _extreme(choose_bound: Callable[..., int]) -> Meaning:
+def _choose_extreme(graph: Graph, extreme: Callable[..., int], a: Any, b: Any) -> Integer:
     """Return the smaller (larger) of two integers, as Python's `min` (`max`) does for bounds."""
-
-    def get_meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-        def extreme(a: Any, b: Any) -> Any:
-            one, other = Integer.of(graph, a), Integer.of(graph, b)
-            first = less(graph, one, other) if choose_bound is min else less(graph, other, one)
-            bounds = choose_bound(one.low, other.low), choose_bound(one.high, other.high)
-            return Integer(choose(graph, first, one, other).node, *bounds)
-
-        return extreme
-
-    return get_meaning
-
-
-def of_type(graph: Graph, a: Integer, kind: np.dtype[Any]) -> Any:
-    """Convert an integer to a type."""
-    return within(graph, a.node, a.low, a.high, kind)
-
-
-def invert(graph: Graph, condition: Any) -> Any:
-    """Negate a condition, known or traced."""
-    return graph.apply("not", condition) if isinstance(condition, Node) else not condition
+    one, other = Integer.of(graph, a), Integer.of(graph, b)
+    is_first = less(graph, one, other) if extreme is min else less(graph, other, one)
+    node = choose(graph, is_first, one, other).node
+    return Integer(node, extreme(one.low, other.low), extreme(one.high, other.high))
 
 
 def from_double(graph: Graph, kind: np.dtype[Any]) -> Callable[[Any], Any]:
     """Return the conversion of doubles to integers of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
     least, most = _bounds(kind)
 
-    def convert(a: Any) -> Integer:
+    def convert(a: Any) -> Any:
         rounded = graph.apply("trunc", a)
         number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)
         if kind.itemsize == 8:
             graph.require(graph.apply("le", graph.apply("abs", number), float(most)))
-        number = graph.apply("select", graph.apply("lt", number, float(least)), float(least), number)
-        number = graph.apply("select", graph.apply("lt", float(most), number), float(most), number)
-        return Integer(number, least, most)
+        return clamp(graph, Integer(number, least - 1, most + 1), least, most)
 
     return convert
 
 
 OF_INTEGERS: dict[str, Meaning] = {
-    "add": _from_bounds("add", lambda a, b: (a[0] + b[0], a[1] + b[1])),
-    "sub": _from_bounds("sub", lambda a, b: (a[0] - b[1], a[1] - b[0])),
-    "mul": _from_bounds("mul", _product),
-    "neg": _from_bounds("neg", lambda a: (-a[1], -a[0])),
-    "abs": _from_bounds("abs", _absolute),
+    "add": _exactly("add", operator.add),
+    "sub": _exactly("sub", operator.sub),
+    "mul": _exactly("mul", operator.mul),
+    "neg": _exactly("neg", operator.neg),
+    "abs": _exactly("abs", abs),
     "div": _quotient,
     "rem": _remainder,
     "sign": _sign,
-    "max": _extreme(max),
-    "min": _extreme(min),
-    "lt": lambda graph, params, dtype: lambda a, b: less(graph, a, b),
+    "max": lambda graph, params, dtype: partial(_choose_extreme, graph, max),
+    "min": lambda graph, params, dtype: partial(_choose_extreme, graph, min),
+    "lt": lambda graph, params, dtype: partial(less, graph),
     "gt": lambda graph, params, dtype: lambda a, b: less(graph, b, a),
-    "le": lambda graph, params, dtype: lambda a, b: invert(graph, less(graph, b, a)),
-    "ge": lambda graph, params, dtype: lambda a, b: invert(graph, less(graph, a, b)),
-    "eq": lambda graph, params, dtype: lambda a, b: equal(graph, a, b),
-    "ne": lambda graph, params, dtype: lambda a, b: invert(graph, equal(graph, a, b)),
+    "le": lambda graph, params, dtype: lambda a, b: graph.apply("not", less(graph, b, a)),
+    "ge": lambda graph, params, dtype: lambda a, b: graph.apply("not", less(graph, a, b)),
+    "eq": lambda graph, params, dtype: partial(equal, graph),
+    "ne": lambda graph, params, dtype: lambda a, b: graph.apply("not", equal(graph, a, b)),
 }
 """Operations on each entry of arrays of integers; comparisons too."""

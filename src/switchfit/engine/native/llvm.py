@@ -164,15 +164,11 @@ class Lines:
     def _has_ended(self) -> bool:
         return bool(self.lines) and self.lines[-1].startswith(("  br ", "  ret ", "  switch "))
 
-    def assign(self, text: str) -> str:
-        """Emit an instruction; return the name of its value."""
-        self.count += 1
-        self.line(f"%t{self.count} = {text}")
-        return f"%t{self.count}"
-
     def let(self, kind: str, text: str) -> Value:
         """Emit an instruction whose value has this type."""
-        return Value(self, kind, self.assign(text))
+        self.count += 1
+        self.line(f"%t{self.count} = {text}")
+        return Value(self, kind, f"%t{self.count}")
 
     def write(self, operand: Operand, kind: str) -> str:
         """Return an operand of a type as text."""
@@ -213,7 +209,7 @@ class Lines:
     def spread(self, value: Operand, width: int) -> Value:
         """Emit the vector with this value in all entries."""
         kind, zeros = f"<{width} x double>", f"<{width} x i32> zeroinitializer"
-        one = self.assign(f"insertelement {kind} poison, double {value}, i64 0")
+        one = self.let(kind, f"insertelement {kind} poison, double {value}, i64 0")
         return self.let(kind, f"shufflevector {kind} {one}, {kind} poison, {zeros}")
 
     def invoke(self, name: str, *given: Operand, returns: str = "void") -> Value:
@@ -273,32 +269,10 @@ class Lines:
 LANES = 8
 """Entries of a row that are computed together."""
 
-ROUTINES = "factors", "solution", "entry"
-
-
-def find_routine(node: Any) -> str:
-    """Return the name of the routine of a node."""
-    if node.op == "factors":
-        return "lu_factorize"
-    return "lu_solve_vectors" if node.vector else "lu_solve_transposed" if node.args[1] else "lu_solve"
-
-
-def estimate_cost(node: Any) -> int:
-    """Return the cost of a call, in additions, so that rows of 7 to 10 states have about the work of their time."""
-    if node.op == "factors":
-        m = int(node.args[0]) * len(node.args[1])
-        return m**3 // 3 + 10 * m**2 if len(node.args) > 3 else 1
-    return 2 * len(node.args) ** 2 if node.op == "solution" else 1
-
 
 def count_doubles(m: int) -> int:
     """Return the size of the factors of m equations."""
     return m * (m + LANES) + m
-
-
-def write_routine(name: str, width: int) -> str:
-    """Write a routine; vectors have this width."""
-    return _write_factorize() if name == "lu_factorize" else _write_solve(name, width)
 
 
 class _Matrix(Lines):
@@ -428,6 +402,11 @@ class Module:
         Number of entries of a vector.
     prefix : str
         Prefix of the names of all functions.
+
+    Attributes
+    ----------
+    work, pointers : dict
+        Cost of each straight-line function, in additions, and the pointers that it takes.
     """
 
     def __init__(self, width: int, prefix: str = "") -> None:
@@ -436,7 +415,7 @@ class Module:
         self._functions: list[str] = []
         self._declared: dict[str, str] = {}
         self._written: dict[str, str] = {}
-        self._work: dict[str, int] = {}
+        self.work: dict[str, int] = {}
         self.pointers: dict[str, tuple[str, ...]] = {}
 
     def write_straight_line(
@@ -445,32 +424,21 @@ class Module:
         """Write a function that loads, computes, and then stores each ``(pointer, offset, node)``.
 
         All loads come before the first store. Offsets count doubles, or vectors if the node is a vector. The arguments
-        are the `pointers`; by default those that it uses, which the module lists by the name of the function.
+        are the `pointers`; by default those that it uses.
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
         for node in nodes:
             writer.value(node)
-        self._work[name] = sum(self._estimate_cost(node) for node in nodes)
+        self.work[name] = sum(_estimate_cost(node) * (1 + self.width // 4 if node.vector else 1) for node in nodes)
         for pointer, offset, node in stores:
             if node.truth:
                 raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
             writer.used.add(pointer)
-            writer.store_node(node, writer.value(node), writer.place(f"%{pointer}", offset, node))
+            writer.store(writer.value(node), writer.place(f"%{pointer}", offset, node))
         self.pointers[name] = tuple(pointers or sorted(writer.used))
         writer.begin(f"void @{self.prefix}{name}({', '.join(f'ptr %{pointer}' for pointer in self.pointers[name])})")
         self._functions.append(writer.end())
-
-    def work(self, name: str) -> int:
-        """Return the cost of a straight-line function, in additions."""
-        return self._work[name]
-
-    def _estimate_cost(self, node: Node) -> int:
-        if node.op in ROUTINES:
-            return estimate_cost(node) * (1 + self.width // 4 if node.vector else 1)
-        operation = OPERATIONS.get(node.op)
-        effort = LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
-        return effort * (1 + self.width // 4 if node.vector else 1)
 
     def add(self, text: str) -> None:
         """Add a hand-written function; all function names in it, except LLVM's intrinsics, get the prefix."""
@@ -493,6 +461,17 @@ class Module:
         return "\n".join([*declared.values(), *called.values(), written])
 
 
+def _estimate_cost(node: Node) -> int:
+    """Return the cost of a node, in additions, so that rows of 7 to 10 states have about the work of their time."""
+    if node.op == "factors":
+        m = int(node.args[0]) * len(node.args[1])
+        return m**3 // 3 + 10 * m**2 if len(node.args) > 3 else 1
+    if node.op == "solution":
+        return 2 * len(node.args) ** 2
+    operation = OPERATIONS.get(node.op)
+    return LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
+
+
 _CALLED = re.compile(r"call \w+ @([\w.]+)\(")
 _HEADER = re.compile(r"^define (\w+ @([\w.]+)\(.*\))", re.MULTILINE)
 
@@ -510,15 +489,15 @@ class _Writer(Lines):
     def __init__(self, module: Module) -> None:
         super().__init__()
         self.module, self.used = module, set[str]()
-        self._names: dict[int, str] = {}
-        self._splats: dict[int, str] = {}
+        self._values: dict[int, Value] = {}
+        self._splats: dict[int, Value] = {}
 
-    def value(self, node: Node) -> str:
-        """Return the name of the value of a node, or its literal; emit it first if needed."""
-        name = self._names.get(node.index)
-        if name is None:
-            name = self._names[node.index] = self._emit_node(node)
-        return name
+    def value(self, node: Node) -> Value:
+        """Return the value of a node; emit it first if needed."""
+        value = self._values.get(node.index)
+        if value is None:
+            value = self._values[node.index] = self._emit_node(node)
+        return value
 
     def kind(self, node: Node) -> str:
         """Return the type of a node."""
@@ -528,83 +507,78 @@ class _Writer(Lines):
         """Emit an address; the offset counts values of the type of a node."""
         return self.at(pointer, offset * (self.module.width if node.vector else 1)) if offset else pointer
 
-    def load_node(self, node: Node, place: Operand) -> str:
-        """Emit the load of a node."""
-        return self.load(self.kind(node), place).name
-
-    def store_node(self, node: Node, value: str, place: Operand) -> None:
-        """Emit the store of a value of the type of a node."""
-        self.line(f"store {self.kind(node)} {value}, ptr {place}, align 8")
-
-    def _emit_node(self, node: Node) -> str:
-        op, args = node.op, node.args
+    def _emit_node(self, node: Node) -> Value:
+        op, args, kind = node.op, node.args, self.kind(node)
         if op == "const":
-            return str(args[0]).lower() if isinstance(args[0], bool) else literal(args[0])
+            return Value(self, kind, self.write(args[0], kind))
         if op == "load":
             self.used.add(args[0])
-            return self.load_node(node, self.place(f"%{args[0]}", args[1], node))
+            return self.load(kind, self.place(f"%{args[0]}", args[1], node))
         if op == "unit":
             entries = (f"double {literal(float(k == args[0]))}" for k in range(self.module.width))
-            return "<" + ", ".join(entries) + ">"
+            return Value(self, kind, "<" + ", ".join(entries) + ">")
         if op == "zeros":
-            return "zeroinitializer"
+            return Value(self, kind, "zeroinitializer")
         if op == "table":
             return self._table(node.values)
         if op == "lookup":
-            index = self.assign(f"fptosi double {self.value(args[1])} to i64")
-            return self.load_node(node, self.at(self.value(args[0]), index))
+            return self.get(kind, self.value(args[0]), self.value(args[1]).to("i64"))
         if op == "entry":
-            return self.load_node(node, self.place(self.value(args[0]), args[1], node))
-        if op in ROUTINES:
-            return self._call_routine(node)
+            return self.load(kind, self.place(self.value(args[0]), args[1], node))
+        if op == "factors":
+            return self._factorize(node)
+        if op == "solution":
+            return self._solve(node)
         operation = OPERATIONS[op]
         if operation.function is not None:
             self.module.declare(operation.function, _write_declaration(operation))
-        return self.assign(operation.code.format(*(self._as(a, node.vector) for a in args), type=self.kind(node)))
+        return self.let(kind, operation.code.format(*(self._as(a, node.vector) for a in args), type=kind))
 
-    def _call_routine(self, node: Node) -> str:
-        """Call the routine of a node; return the address of its results."""
-        name = find_routine(node)
-        given = [a for a in node.args if isinstance(a, Node) and a.op != "factors"]
-        kept = ""
-        if node.op == "factors" and node.args[2] is not None:
+    def _factorize(self, node: Node) -> Value:
+        """Call the factorization, if the factors are not there already; return their address."""
+        n, a, place, *given = node.args
+        if place is None:
+            results = self.allocate("double", count_doubles(n * len(a)))
+        else:
             self.used.add("kept")
-            kept = self.at("%kept", node.args[2]).name
-        if not given:
-            return kept
-        self.module.declare(name, write_routine(name, self.module.width))
-        if node.op == "solution":
-            results = self._store_all(given, node)
-            self.line(f"call void @{name}(ptr {self.value(node.args[0])}, ptr {results}, i64 {len(given)})")
-            return results
-        (n, a), (h, *entries) = node.args[:2], given
-        table = self._table(np.array(a).reshape(-1))
-        numbers = f"ptr {table}, double {self.value(h)}, i64 {n}, i64 {len(a)}"
-        results = kept or self.allocate("double", count_doubles(n * len(a))).name
-        self.line(f"call void @{name}(ptr {results}, ptr {self._store_all(entries, node)}, {numbers})")
+            results = self.at("%kept", place)
+        if given:
+            h, *entries = given
+            self.module.declare("lu_factorize", _write_factorize())
+            table, f_x = self._table(np.array(a).reshape(-1)), self._store_all(entries, node)
+            self.invoke("lu_factorize", results, f_x, table, self.value(h), n, len(a))
         return results
 
-    def _store_all(self, values: Sequence[Node], node: Node) -> str:
+    def _solve(self, node: Node) -> Value:
+        """Call the solution of a linear system; return the address of its results."""
+        factors, transposed, *right = node.args
+        name = "lu_solve_vectors" if node.vector else "lu_solve_transposed" if transposed else "lu_solve"
+        self.module.declare(name, _write_solve(name, self.module.width))
+        results = self._store_all(right, node)
+        self.invoke(name, self.value(factors), results, len(right))
+        return results
+
+    def _store_all(self, values: Sequence[Node], node: Node) -> Value:
         """Store values in new memory, each of the type of a node; return its address."""
         memory = self.allocate("double", len(values) * (self.module.width if node.vector else 1))
         for k, value in enumerate(values):
-            self.store_node(node, self._as(value, node.vector), self.place(memory, k, node))
-        return memory.name
+            self.store(self._as(value, node.vector), self.place(memory, k, node))
+        return memory
 
-    def _table(self, values: NDArray[np.float64]) -> str:
+    def _table(self, values: NDArray[np.float64]) -> Value:
         """Declare a constant array, which the functions of a module share; return its name."""
         name = f"table.{hashlib.sha256(values.tobytes()).hexdigest()[:16]}"
         entries = ", ".join(f"double {literal(value)}" for value in values.tolist())
         kind = f"[{len(values)} x double]"
         self.module.declare(name, f"@{name} = private unnamed_addr constant {kind} [{entries}], align 8")
-        return f"@{name}"
+        return Value(self, "ptr", f"@{name}")
 
-    def _as(self, node: Node, vector: bool) -> str:
+    def _as(self, node: Node, vector: bool) -> Value:
         """Return a value as an operand: a scalar is broadcast for an operation on vectors."""
         if not vector or node.vector or node.truth:
             return self.value(node)
         if node.index not in self._splats:
-            self._splats[node.index] = self.spread(self.value(node), self.module.width).name
+            self._splats[node.index] = self.spread(self.value(node), self.module.width)
         return self._splats[node.index]
 
 
@@ -660,24 +634,15 @@ class Program:
         self.pointers: dict[str, tuple[str, ...]] = {}
         self._functions: dict[str, Any] = {}
 
-    def address(self, name: str) -> int:
-        """Return the address of a function."""
-        return int(self._engine.get_function_address(name))
-
     def function(self, name: str, *types: Any) -> Any:
         """Return a Python callable for a void function with arguments of these ctypes."""
         if name not in self._functions:
-            self._functions[name] = ctypes.CFUNCTYPE(None, *types)(self.address(name))
+            self._functions[name] = ctypes.CFUNCTYPE(None, *types)(self._engine.get_function_address(name))
         return self._functions[name]
 
 
-def compile_module(text: str) -> Program:
-    """Compile a module for this processor, or load its code from the cache."""
-    return compile_modules([text])
-
-
 def compile_modules(texts: Iterable[str]) -> Program:
-    """Compile modules into one program, or load their code from the cache.
+    """Compile modules for this processor into one program, or load their code from the cache.
 
     Parameters
     ----------
@@ -694,11 +659,11 @@ def compile_modules(texts: Iterable[str]) -> Program:
             # The key has all that the code depends on: text, version of llvmlite, processor.
             path = None if folder is None else folder / f"native-{keys[-1]}"
             known = None if path is None else read_code(path)
-            codes.append((path, executor.submit(_compile_to_object_code, text) if known is None else known))
-        if any(isinstance(code, Future) for _, code in codes):
+            codes.append(executor.submit(_compile_to_object_code, text, path) if known is None else known)
+        if any(isinstance(code, Future) for code in codes):
             for name in NEEDED_NEXT:  # Python would only wait for LLVM
                 import_module(name)
-        found = [_wait_for_code(code, path) if isinstance(code, Future) else code for path, code in codes]
+        found = [wait_for(code) if isinstance(code, Future) else code for code in codes]
     finally:
         executor.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for LLVM
     # One engine links the objects of all modules: addresses of functions in others are known only then.
@@ -714,8 +679,12 @@ def _create_machine() -> Any:
     return llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
 
 
-def _compile_to_object_code(text: str) -> bytes:
-    return bytes(_create_machine().emit_object(llvm.parse_assembly(text)))
+def _compile_to_object_code(text: str, path: Path | None) -> bytes:
+    """Compile a module, which takes seconds for long functions; keep its code."""
+    code = bytes(_create_machine().emit_object(llvm.parse_assembly(text)))
+    if path is not None:
+        write_code(path, code)
+    return code
 
 
 def wait_for(future: Future[Found]) -> Found:
@@ -723,14 +692,6 @@ def wait_for(future: Future[Found]) -> Found:
     while not wait([future], timeout=0.1).done:  # on Windows, a wait without timeout cannot be interrupted
         pass
     return future.result()
-
-
-def _wait_for_code(future: Future[bytes], path: Path | None) -> bytes:
-    """Wait for a compilation, which takes seconds for long functions; keep its code."""
-    code = wait_for(future)
-    if path is not None:
-        write_code(path, code)
-    return code
 
 
 @cache

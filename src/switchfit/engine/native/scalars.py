@@ -119,6 +119,8 @@ OPERATIONS = {
         Operation("neg", np.negative, "fneg {type} {0}", 1, primitives=("neg",)),
         _comparison("lt", np.less, "olt"),
         _comparison("le", np.less_equal, "ole"),
+        _comparison("gt", np.greater, "ogt"),
+        _comparison("ge", np.greater_equal, "oge"),
         _comparison("eq", np.equal, "oeq", commutes=True),
         _comparison("ne", np.not_equal, "une", commutes=True),
         _logic("and", np.bitwise_and, ("and", "min"), known_alike=True),
@@ -463,6 +465,10 @@ def list_needed(outputs: Sequence[Node]) -> list[Node]:
     return [graph.nodes[k] for k in np.flatnonzero(wanted)]
 
 
+def _look_up(table: NDArray[np.float64], index: Any) -> Any:
+    return table[np.asarray(index, int)]
+
+
 class Template:
     """A traced function of scalars that can be copied into graphs; inputs and outputs are lists of arrays.
 
@@ -506,33 +512,26 @@ class Template:
         return [*results, as_objects([made[node.index] for node in also])] if also else results
 
     @cached_property
-    def _steps(self) -> list[tuple[int, Callable[..., Any], list[int]]]:
-        """What to compute for each node: its value as a function of others, or of the inputs if it has none."""
-        steps: list[tuple[int, Callable[..., Any], list[int]]] = []
-        for node in self._list_needed(tuple(range(len(self._flat)))):
-            if node.op == "load":
-                pointer, offset = node.args
-                steps.append((node.index, lambda inputs, k=int(pointer), offset=offset: inputs[k][offset], []))
-            elif node.op == "const":
-                steps.append((node.index, lambda inputs, number=node.args[0]: number, []))
-            elif node.op == "lookup":
-                table = node.args[0].values
-                look_up = lambda place, table=table: table[np.asarray(place, int)]  # noqa: E731
-                steps.append((node.index, look_up, [node.args[1].index]))
-            elif node.op != "table":
-                steps.append((node.index, OPERATIONS[node.op].value, [a.index for a in node.args]))
-        return steps
+    def _steps(self) -> tuple[list[tuple[int, int, int]], dict[int, Any], list[tuple[int, Any, list[int]]]]:
+        """What `evaluate` does, by the indices of nodes: entries of inputs, numbers, operations on them in order."""
+        nodes = self._list_needed(tuple(range(len(self._flat))))
+        loads = [(node.index, int(node.args[0]), node.args[1]) for node in nodes if node.op == "load"]
+        known = {node.index: node.number for node in nodes if node.op == "const"}
+        known |= {node.index: node.values for node in nodes if node.op == "table"}
+        values = {name: operation.value for name, operation in OPERATIONS.items()} | {"lookup": _look_up}
+        return loads, known, [(n.index, values[n.op], [a.index for a in n.args]) for n in nodes if n.op in values]
 
     def evaluate(self, *inputs: Any) -> list[NDArray[np.float64]]:
         """Evaluate the function with NumPy; the entries of its inputs are numbers, or arrays (L,) of equal length.
 
         The outputs have an axis of length L in front if an input has.
         """
-        known: dict[int, Any] = {}
+        loads, numbers, operations = self._steps
+        known = numbers | {index: inputs[k][offset] for index, k, offset in loads}
         with np.errstate(all="ignore"):
             # The nodes in order, each an operation of NumPy on whole columns.
-            for index, value, args in self._steps:
-                known[index] = value(*[known[a] for a in args]) if args else value(inputs)
+            for index, value, args in operations:
+                known[index] = value(*[known[a] for a in args])
         results = []
         for values, shape in zip(self._flat, self.shapes, strict=True):
             entries = [known[v.index] if isinstance(v, Node) else v for v in values]

@@ -117,8 +117,8 @@ def solve_stages(writer: Writer, name: str, given: Pointers) -> None:
 def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
     """Return the work of a row of a mode in an evaluation with second derivatives, in additions."""
     names = [f"forward_inner_{mode}", f"backward_inner_{mode}", *(curvature.name for _ in curvature.stages)]
-    newton = USUAL_ITERATIONS * writer.module.work(f"newton_{mode}") if writer.library.implicit[mode] else 0
-    return newton + sum(map(writer.module.work, names))
+    newton = USUAL_ITERATIONS * writer.module.work[f"newton_{mode}"] if writer.library.implicit[mode] else 0
+    return newton + sum(writer.module.work[name] for name in names)
 
 
 def add_curvature(writer: Writer, curvature: Curvature, given: Pointers, moving: bool) -> None:

@@ -17,8 +17,6 @@ from switchfit.discretization.model import (
     Model,
     Piece,
     apply_weights,
-    get_end_constraints,
-    get_end_cost,
     get_transition_function,
 )
 from switchfit.engine.native.scalars import Template
@@ -202,9 +200,7 @@ class Templates:
         """Trace the terminal costs."""
 
         def end(model: Model, x: Any, p: Any) -> Any:
-            cost = get_end_cost(model)
-            if cost is None:
-                raise ValueError("there is no terminal cost")
+            cost = lambda t, x, p: model.terminal(x, p)  # noqa: E731
             at = jnp.zeros(()), x, p
             return self._cost(cost, *at, lambda: _differentiate_twice(cost, *at))
 
@@ -232,10 +228,8 @@ class Templates:
         """Trace all terminal constraints and their first derivatives, then those of the weighted sum."""
 
         def end(model: Model, x: Any, p: Any, weights: Any) -> Any:
-            function = get_end_constraints(model)
-            if function is None:
-                raise ValueError("there is no terminal constraint")
-            return self._map(function, jnp.zeros(()), x, p, weights)
+            constraints = lambda t, x, p: model.terminal_constraint(x, p)  # noqa: E731
+            return self._map(constraints, jnp.zeros(()), x, p, weights)
 
         shapes = (self.sizes.n,), (self.sizes.M,), (self.sizes.m,)
         return self._trace(end, *shapes, name="a terminal constraint")

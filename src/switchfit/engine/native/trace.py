@@ -8,7 +8,7 @@ An array whose entries are all known is a NumPy array of numbers, any other an o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -27,30 +27,28 @@ from switchfit.engine.native.arrays import (
     scatter,
     search,
     sort,
-    top_k,
     triangular_solve,
 )
 from switchfit.engine.native.entries import (
     OF_INTEGERS,
     Integer,
+    Meaning,
     Unsupported,
     choose,
     from_double,
-    is_traced,
+    known_number,
     less,
-    of_type,
+    within,
 )
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
-from switchfit.problem.jaxprs import find_line, find_public_name
+from switchfit.problem.jaxprs import MOVES as SELECTIONS
+from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
 
 __all__ = ["Unsupported", "trace_scalars"]
 
 
 MOST_NODES = 10_000
 """Largest number of operations of one function. Compiling takes 20 s at this size, and grows faster than it."""
-
-MOST_TURNS = 100_000
-"""Largest number of iterations of a loop that is unrolled."""
 
 
 def trace_scalars(
@@ -71,7 +69,7 @@ def trace_scalars(
         # Without what has no use: there, no operation has to be finite.
         jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
         with np.errstate(all="ignore"):
-            outputs = _run(graph, jaxpr, closed.consts, inputs)
+            outputs = _Tracing(graph).run(jaxpr, closed.consts, inputs)
         if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
             raise Unsupported("returns something else than float64")
     except Unsupported as error:
@@ -87,25 +85,28 @@ def _make_jaxpr(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) 
         raise Unsupported(f"cannot be traced with its derivatives: {type(error).__name__}: {line}") from error
 
 
-def _run(graph: Graph, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-    known: dict[Any, Any] = {}
-    for variables, values in ((jaxpr.constvars, consts), (jaxpr.invars, inputs)):
-        for variable, value in zip(variables, values, strict=True):
-            known[variable] = _as_array(value)
+class _Tracing(Walk):
+    """Follows arrays through a jaxpr; what is done to entries that are not known becomes nodes of a graph."""
 
-    def of(atom: Any) -> Any:
-        return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
 
-    for equation in jaxpr.eqns:
+    def constant(self, value: Any) -> Any:
+        return _as_array(value)
+
+    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
         try:
-            if len(graph.nodes) > MOST_NODES:
+            if len(self._graph.nodes) > MOST_NODES:
                 raise Unsupported(f"takes more than {MOST_NODES} operations")
-            results = _apply(graph, equation, [of(a) for a in equation.invars])
+            return [_as_array(value) for value in _apply(self._graph, equation, given)]
         except Unsupported as error:
             raise _add_location(error, equation) from None
-        for variable, value in zip(equation.outvars, results, strict=True):
-            known[variable] = _as_array(value)
-    return [of(a) for a in jaxpr.outvars]
+
+
+def _run(graph: Graph, inner: Any, inputs: Sequence[Any]) -> list[Any]:
+    """Return the results of a jaxpr that an operation calls, with its constants or without."""
+    jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+    return _Tracing(graph).run(jaxpr, consts, [_as_array(value) for value in inputs])
 
 
 def _as_array(value: Any) -> Any:
@@ -138,44 +139,41 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     # An empty array counts as known, so that JAX evaluates reductions over it.
     args = [a if a.size else np.empty(a.shape, v.aval.dtype) for a, v in zip(args, equation.invars, strict=True)]
     known = all(a.dtype != object for a in args)
-    # The order matters: calls are inlined; what is known is computed at once, indexing here, frequent operations by
-    # NumPy and all others by XLA; only what is left becomes nodes.
+    # The order matters: calls are inlined; what is known is computed at once; only what is left becomes nodes.
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
-            places = search(graph, args[0], args[1], right="lt_to" in _primitives(inner.jaxpr))
+            places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
             return [np.asarray(places, dtype=object)]
-        if hasattr(inner, "consts"):
-            return _run(graph, inner.jaxpr, inner.consts, args)
-        return _run(graph, inner, (), args)
-    if known and name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
-        with suppress(Unsupported):
-            dtype = equation.outvars[0].aval.dtype
-            return [np.asarray(INDEXED[name](graph, equation, *args)).astype(dtype)]
-    if known and name not in MOVES and name not in NUMPY:
-        return _evaluate_known(equation, args)
+        return _run(graph, inner, args)
     if name in MOVES:
         result = MOVES[name](params, *args)
         return result if equation.primitive.multiple_results else [result]
     if known:
-        dtype = equation.outvars[0].aval.dtype
-        if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
-            return _evaluate_known(equation, args)  # NumPy and JAX differ for numbers out of range
-        return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
+        return _evaluate_known(graph, equation, args)
     # What depends on the state: loops are unrolled, rules take whole arrays, and meanings one entry at a time.
     if name in LOOPS:
         return LOOPS[name](graph, equation, *args)
+    for dtype in (variable.aval.dtype for variable in equation.invars):
+        if dtype.kind not in "fbiu" or (dtype.kind == "f" and dtype != np.float64):
+            raise Unsupported(f"has numbers of type {dtype} that depend on the state")
     if name in RULES:
-        for variable in equation.invars:
-            _check_type(variable.aval.dtype)
         results = RULES[name](graph, equation, *args)
         return results if equation.primitive.multiple_results else [np.asarray(results, dtype=object)]
     meaning = _get_meaning(graph, name, params, equation.invars[-1].aval.dtype)
     return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
 
 
-def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
-    """Evaluate an operation on known numbers by JAX."""
+def _evaluate_known(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+    """Evaluate an operation on known numbers: indexing here, frequent operations by NumPy and all others by XLA."""
+    name, out = equation.primitive.name, [variable.aval for variable in equation.outvars]
+    if name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
+        with suppress(Unsupported):
+            return [np.asarray(INDEXED[name](graph, equation, *args)).astype(out[0].dtype)]
+    # NumPy and JAX differ where doubles become integers, for numbers out of range.
+    is_cut = name == "convert_element_type" and args[0].dtype.kind == "f" and out[0].dtype.kind in "iu"
+    if name in NUMPY and not is_cut:
+        return [np.asarray(NUMPY[name](equation.params, *args)).astype(out[0].dtype).reshape(out[0].shape)]
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*args, **equation.params)
     return [_as_array(a) for a in (results if equation.primitive.multiple_results else [results])]
@@ -183,22 +181,12 @@ def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
 
 def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries of arrays of a type."""
-    _check_type(dtype)
-    if name in OF_ALL:
-        return OF_ALL[name](graph, params, dtype)
-    if dtype.kind != "f" and name in OF_INTEGERS and (dtype.kind != "b" or name not in OF_TRUTH):
-        return OF_INTEGERS[name](graph, params, dtype)  # truth values are compared as integers are
-    if dtype.kind in "iu":
-        raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
-    table = MEANINGS if dtype.kind == "f" else OF_TRUTH
+    table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, OF_INTEGERS)
     if name in table:
-        return table[name](graph, params)
+        return table[name](graph, params, dtype)
+    if dtype.kind in "iu" and name not in OTHER_NAMES:
+        raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
-
-
-def _check_type(dtype: np.dtype[Any]) -> None:
-    if dtype.kind not in "fbiu" or (dtype.kind == "f" and dtype != np.float64):
-        raise Unsupported(f"has numbers of type {dtype} that depend on the state")
 
 
 def _is_search(equation: Any) -> bool:
@@ -209,17 +197,13 @@ def _is_search(equation: Any) -> bool:
     if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) < 2:
         return False
     table, query = (variable.aval for variable in equation.invars[:2])
-    sides = {"lt_to", "le_to"} & set(_primitives(equation.params["jaxpr"].jaxpr))
+    sides = {"lt_to", "le_to"} & _find_primitives(equation.params["jaxpr"])
     types = table.dtype == query.dtype == np.float64 and len(equation.outvars) == len(sides) == 1
     return bool(types and table.ndim == 1 and equation.outvars[0].aval.shape == query.shape)
 
 
-def _primitives(jaxpr: Any) -> Iterator[str]:
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for value in equation.params.values():
-            if hasattr(value, "jaxpr"):
-                yield from _primitives(value.jaxpr)
+def _find_primitives(closed: Any) -> set[str]:
+    return {equation.primitive.name for inner in list_jaxprs(closed.jaxpr) for equation in inner.eqns}
 
 
 OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
@@ -236,9 +220,7 @@ def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     consts, carry, columns = args[:fixed], list(args[fixed : fixed + carried]), args[fixed + carried :]
     made: list[list[Any]] = []
     for k in reversed(range(length)) if params["reverse"] else range(length):
-        results = _run(
-            graph, params["jaxpr"].jaxpr, params["jaxpr"].consts, [*consts, *carry, *(c[k] for c in columns)]
-        )
+        results = _run(graph, params["jaxpr"], [*consts, *carry, *(c[k] for c in columns)])
         carry = results[:carried]
         made.append(results[carried:])
     if not made:
@@ -247,32 +229,14 @@ def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def _while(graph: Graph, equation: Any, *args: Any) -> list[Any]:
-    """Unroll a loop whose condition never depends on the state."""
-    params = equation.params
-    condition, body = params["cond_jaxpr"], params["body_jaxpr"]
-    first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-    of_condition, of_body, carry = args[:first], args[first:second], list(args[second:])
-    for _ in range(MOST_TURNS):
-        (again,) = _run(graph, condition.jaxpr, condition.consts, [*of_condition, *carry])
-        if again.dtype == object:
-            raise Unsupported("calls jax.lax.while_loop with a condition that depends on the state")
-        if not again:
-            return carry
-        carry = _run(graph, body.jaxpr, body.consts, [*of_body, *carry])
-    raise Unsupported(f"has a loop of more than {MOST_TURNS} turns")
-
-
 def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Trace all branches, and select among their results."""
     which, *operands = args
     choice, branches = which.item(), equation.params["branches"]
-    is_known = not isinstance(choice, Node | Integer)
-    if is_known:
-        branches = [branches[int(np.clip(choice, 0, len(branches) - 1))]]
-    results = [_run(graph, branch.jaxpr, branch.consts, operands) for branch in branches]
-    if is_known:
-        return results[0]
+    known = known_number(choice)
+    if known is not None:
+        return _run(graph, branches[int(np.clip(known, 0, len(branches) - 1))], operands)
+    results = [_run(graph, branch, operands) for branch in branches]
     select = np.frompyfunc(partial(_select(graph), choice), len(branches), 1)
     return [np.asarray(select(*cases), dtype=object) for cases in zip(*results, strict=True)]
 
@@ -283,13 +247,11 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     # Operands: constants of matvec, vecmat, solve and transpose_solve, in this order, then the right-hand side.
     before = lengths.matvec + lengths.vecmat
     right = before + lengths.solve + (lengths.transpose_solve if jaxprs.transpose_solve is not None else 0)
-    solve = jaxprs.solve
-    return _run(graph, solve.jaxpr, solve.consts, [*args[before : before + lengths.solve], *args[right:]])
+    return _run(graph, jaxprs.solve, [*args[before : before + lengths.solve], *args[right:]])
 
 
 LOOPS: dict[str, Callable[..., list[Any]]] = {
     "scan": _scan,
-    "while": _while,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
 }
@@ -304,11 +266,6 @@ CALLS = "jit", "closed_call", "remat2", "checkpoint", "custom_jvp_call", "custom
 def _broadcast(params: Any, a: Any, *_: Any) -> Any:
     others = [k for k in range(len(params["shape"])) if k not in params["broadcast_dimensions"]]
     return np.broadcast_to(np.expand_dims(a, others), params["shape"])
-
-
-def _slice(params: Any, a: Any) -> Any:
-    steps = params["strides"] or [1] * a.ndim
-    return a[tuple(slice(*s) for s in zip(params["start_indices"], params["limit_indices"], steps, strict=True))]
 
 
 def _pad(params: Any, a: Any, value: Any) -> Any:
@@ -330,11 +287,8 @@ def _split(params: Any, a: Any) -> Any:
 
 
 MOVES: dict[str, Callable[..., Any]] = {
+    **{name: lambda params, a, *_, move=move: move(a, params) for name, move in SELECTIONS.items()},
     "broadcast_in_dim": _broadcast,
-    "reshape": lambda params, a, *_: a.reshape(params["new_sizes"]),
-    "squeeze": lambda params, a: np.squeeze(a, axis=tuple(params["dimensions"])),
-    "transpose": lambda params, a: np.transpose(a, params["permutation"]),
-    "slice": _slice,
     "concatenate": lambda params, *a: np.concatenate(a, axis=params["dimension"]),
     "pad": _pad,
     "rev": lambda params, a: np.flip(a, params["dimensions"]),
@@ -359,8 +313,6 @@ NUMPY: dict[str, Callable[..., Any]] = {
         if operation.known_alike
         for name in (*operation.primitives, *operation.of_truth[:1])
     },
-    "gt": lambda params, a, b: a > b,
-    "ge": lambda params, a, b: a >= b,
     "select_n": lambda params, which, *cases: np.choose(which.astype(int), cases),
 }
 """Frequent operations on known numbers, evaluated by NumPy, since calling XLA for each would be slow."""
@@ -381,7 +333,7 @@ def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any],
         return from_double(graph, kind)
     if kind.kind == "f":
         return lambda a: Integer.of(graph, a).node
-    return lambda a: of_type(graph, Integer.of(graph, a), kind)
+    return lambda a: within(graph, Integer.of(graph, a), kind)
 
 
 def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
@@ -421,7 +373,7 @@ def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any
     return lambda low, a, high: smaller(larger(a, low), high)
 
 
-OF_ALL: dict[str, Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]] = {
+OF_ALL: dict[str, Meaning] = {
     "clamp": _clamp,
     "convert_element_type": _convert,
     "integer_pow": _integer_power,
@@ -433,21 +385,17 @@ OF_ALL: dict[str, Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]] = {
 # Doubles
 
 
-def _apply_operation(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: partial(graph.apply, op)
+def _apply_operation(op: str) -> Meaning:
+    return lambda graph, params, dtype: partial(graph.apply, op)
 
 
-def _apply_swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: lambda a, b: graph.apply(op, b, a)
-
-
-def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
+def _round(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
     """Round to the nearest integer; a half to the even one, or away from zero."""
     to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
     return partial(graph.apply, "rint" if to_even else "round")
 
 
-def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
+def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
     def sign(a: Any) -> Any:
         negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
         return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
@@ -455,18 +403,16 @@ def _sign(graph: Graph, params: Any) -> Callable[[Any], Any]:
     return sign
 
 
-MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
+OF_DOUBLES: dict[str, Meaning] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
-    "gt": _apply_swapped("lt"),
-    "ge": _apply_swapped("le"),
-    "square": lambda graph, params: lambda a: a * a,
-    "rsqrt": lambda graph, params: lambda a: 1.0 / graph.apply("sqrt", a),
-    "logistic": lambda graph, params: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
+    "square": lambda graph, params, dtype: lambda a: a * a,
+    "rsqrt": lambda graph, params, dtype: lambda a: 1.0 / graph.apply("sqrt", a),
+    "logistic": lambda graph, params, dtype: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
     "sign": _sign,
     "round": _round,
-    "lt_to": lambda graph, params: partial(compare_in_order, graph, "lt"),
-    "le_to": lambda graph, params: partial(compare_in_order, graph, "le"),
-    "is_finite": lambda graph, params: lambda a: graph.apply("eq", a - a, 0.0),
+    "lt_to": lambda graph, params, dtype: partial(compare_in_order, graph, "lt"),
+    "le_to": lambda graph, params, dtype: partial(compare_in_order, graph, "le"),
+    "is_finite": lambda graph, params, dtype: lambda a: graph.apply("eq", a - a, 0.0),
 }
 """Operations on each entry of arrays of doubles."""
 
@@ -474,10 +420,10 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
 # Truth values
 
 
-OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
-    **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
+OF_TRUTH: dict[str, Meaning] = OF_INTEGERS | {
+    name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth
 }
-"""Operations on each entry of arrays of truth values."""
+"""Operations on each entry of arrays of truth values, which are compared as integers are."""
 
 
 # Whole arrays
@@ -526,16 +472,14 @@ def _find_first(name: str) -> Callable[..., Any]:
 
     def along(graph: Graph, equation: Any, a: Any) -> Any:
         (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
-        beyond = _get_meaning(graph, name, {}, dtype)
+        reaches = _get_meaning(graph, name, {}, dtype)  # false for NaN, which is beyond any number
 
         def first(row: Any) -> Any:
             best, found = row[0], 0
             for k, value in enumerate(row[1:], start=1):
-                better = beyond(value, best)
+                better = graph.apply("not", reaches(best, value))
                 if dtype.kind == "f":
-                    # NaN is beyond any number, and the first NaN stays.
-                    undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
-                    better = graph.apply("or", better, undefined)
+                    better = graph.apply("and", better, graph.apply("eq", best, best))  # the first NaN stays
                 best, found = choose(graph, better, value, best), choose(graph, better, k, found)
             return found
 
@@ -555,12 +499,9 @@ def _scatter(name: str | None) -> Callable[..., Any]:
             if name is None:
                 return choose(graph, here, update, old)
             # Known place, known numbers: no node at all.
-            if name == "add" and here is True and not is_traced(old) and not is_traced(update):
-                return old + update
-            apply = _get_meaning(graph, name, {}, dtype)
-            if name == "add" and dtype.kind == "f":
-                return apply(old, choose(graph, here, update, 0.0))
-            return choose(graph, here, apply(old, update), old)
+            if known_number(here) is True and not any(isinstance(a, Node | Integer) for a in (old, update)):
+                return OPERATIONS[name].value(old, update)
+            return choose(graph, here, _get_meaning(graph, name, {}, dtype)(old, update), old)
 
         return scatter(graph, equation, a, indices, updates, combine)
 
@@ -582,13 +523,12 @@ INDEXED: dict[str, Callable[..., Any]] = {
 """Operations at indices."""
 
 RULES: dict[str, Callable[..., Any]] = {
-    "argmax": _find_first("gt"),
-    "argmin": _find_first("lt"),
+    "argmax": _find_first("ge"),
+    "argmin": _find_first("le"),
     "lu": lu,
     "cholesky": cholesky,
     "triangular_solve": triangular_solve,
     "sort": sort,
-    "top_k": top_k,
     "dot_general": _dot,
     **{f"reduce_{name}": _reduce(op) for name, op in SUMS.items()},
     **{f"reduce_{name}": _reduce(name) for name in ("and", "or", "xor")},
