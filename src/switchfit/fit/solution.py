@@ -373,7 +373,7 @@ class _Change(NamedTuple):
             there[i] = value
             places.append((i, float(self.variables.outward(there)[i])))
         entries = [(i, stated / float(slopes[i]), measured / float(slopes[i])) for i, stated, measured in found.entries]
-        return replace(found, places=tuple(places), entries=tuple(entries))
+        return found._replace(places=tuple(places), entries=tuple(entries))
 
 
 def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:
