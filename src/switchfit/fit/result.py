@@ -206,7 +206,8 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
         figures["differences"] = tuple(measured for _, _, measured in found.entries)
     if problem.estimates_delays:
         figures["delayed"] = 1.0
-    return Issue(found.kind, tuple(names[i] for i, *_ in (*found.places, *found.entries)), figures)
+    named = [i for i, _ in found.places] + [i for i, _, _ in found.entries]
+    return Issue(found.kind, tuple(names[i] for i in named), figures)
 
 
 CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]

@@ -55,6 +55,7 @@ from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import Trial, move
 from switchfit.optimize.qp import Room
 from switchfit.optimize.state import Accepted, Finding, State
+from switchfit.optimize.threads import one_thread
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
 MAX_HALVINGS = 200
@@ -430,6 +431,7 @@ DISAGREES = 0.1
 NAMED = 4
 
 
+@one_thread()
 def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Finding:
     """Find out why no fraction of a step decreases J although its slope is negative."""
     step, noise = direction.step, NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)

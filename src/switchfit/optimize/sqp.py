@@ -27,6 +27,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -378,7 +379,8 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
         if point is not None:
             fresh = State.at(point)
             return fresh._replace(iteration=state.iteration, restarts=state.restarts + 1, careful=True)
-    return state._replace(status=Status.LINE_SEARCH_FAILED, reason=explain_failure(oracle, state, direction))
+    explain = cache(partial(explain_failure, oracle, state, direction))
+    return state._replace(status=Status.LINE_SEARCH_FAILED, explain=explain)
 
 
 def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
@@ -441,7 +443,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         history=history,
         violated=_list_violated(oracle, point),
         idle=idle_coordinates(problem, state),
-        reason=state.reason,
+        explain=state.explain,
         predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
         equalities=_list_equalities(oracle, point),
     )

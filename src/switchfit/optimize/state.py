@@ -38,6 +38,10 @@ class Finding(NamedTuple):
     entries: tuple[tuple[int, float, float], ...] = ()
 
 
+Explain = Callable[[], Finding]
+"""Finds out why a line search failed, when that is asked for."""
+
+
 class Status(Enum):
     """How a minimization ended, and what that means.
 
@@ -164,8 +168,8 @@ class Result:
     idle : tuple of int
         Coordinates on which J does not depend at theta, as the caller's `idle` finds, and those that active rows tie to
         them; they are not in `free_basis`.
-    reason : Finding or None
-        Why the line search failed; None if it did not.
+    explain : callable, or None
+        Finds out why the line search failed, by some dozens of evaluations; None if it did not fail.
     equalities : tuple of (str, float, float)
         Name, value and multiplier of each equality constraint; the Hessian is that of ``J + multipliers . c``.
     predicted : float
@@ -189,9 +193,14 @@ class Result:
     history: tuple[IterationRecord, ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     idle: tuple[int, ...] = ()
-    reason: Finding | None = None
+    explain: Explain | None = None
     equalities: tuple[tuple[str, float, float], ...] = ()
     predicted: float = np.nan
+
+    @property
+    def reason(self) -> Finding | None:
+        """Why the line search failed; None if it did not."""
+        return None if self.explain is None else self.explain()
 
     @property
     def free_basis(self) -> FloatArray:
@@ -248,8 +257,8 @@ class State(NamedTuple):
     careful : bool
         The next step is taken with the diagonal of the Hessian alone.
     status : Status or None
-    reason : Finding or None
-        Why the line search failed, if it did.
+    explain : callable, or None
+        Finds out why the line search failed, if it did.
     """
 
     point: Point
@@ -268,7 +277,7 @@ class State(NamedTuple):
     stagnant: int = 0
     careful: bool = False
     status: Status | None = None
-    reason: Finding | None = None
+    explain: Explain | None = None
 
     @classmethod
     def at(cls, point: Point) -> State:
