@@ -64,10 +64,13 @@ PATIENCE = 15
 
 
 def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Return a step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece."""
+    """Return a step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece.
+
+    With equality constraints, one that decreases the merit function.
+    """
     problem, theta = oracle.problem, state.point.theta
-    if problem.has_box:
-        return _search_in_box(oracle, state, direction)
+    if problem.has_region:
+        return _search_in_region(oracle, state, direction)
     if direction.descends:
         return _descend(oracle, state, direction)
     alpha = 1.0
@@ -86,26 +89,35 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
     return _backtrack(oracle, state, direction)
 
 
-def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Shrink the trust region until the step of the programme in it decreases J."""
-    problem, point, whole = oracle.problem, state.point, direction.step
-    noise, piece = NOISE * abs(point.cost), None
+def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Shrink the trust region until the step of the programme in it is accepted."""
+    problem, point, whole, piece = oracle.problem, state.point, direction.step, None
+    attempt = _attempt_merit if problem.equalities else _attempt_in_box
     for k in range(MAX_BACKTRACKS):
         crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
-        accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
+        state = state._replace(penalty=raise_penalty(state.penalty, point, direction))
+        accepted = attempt(oracle, state, direction, ARMIJO_ACROSS if crossed else ARMIJO, k == 0)
         if accepted is not None:
-            decrease = point.cost - accepted.point.cost
-            radius = next_radius(problem, direction, decrease, direction.reduction, noise)
             part = measure_in_box(problem, direction.step) / measure_in_box(problem, whole) if k else 1.0
-            return Accepted(accepted.point, part, radius)
-        # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
-        corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
-        if corrected is not None:
-            return corrected
-        if k > 5 and -direction.slope < 0.01 * noise:
+            return accepted._replace(step_length=part)
+        if problem.equalities and measure_in_box(problem, direction.step) < SMALLEST_RADIUS:
+            return None
+        if not problem.equalities and k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
             break
         direction, piece = shrink_region(problem, state, direction, piece)
-    return _blind_step(oracle, state, direction)
+    return None if problem.equalities else _blind_step(oracle, state, direction)
+
+
+def _attempt_in_box(
+    oracle: Oracle, state: State, direction: Direction, fraction: float, first: bool
+) -> Accepted | None:
+    """Return the point of a step inside the trust region that decreases J, and the next radius."""
+    accepted = _attempt(oracle, state, direction, 1.0, fraction)
+    if accepted is None:
+        # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
+        return _step_back(oracle, state, direction) if first and state.iteration >= PATIENCE else None
+    decrease, noise = state.point.cost - accepted.point.cost, NOISE * abs(state.point.cost)
+    return accepted._replace(radius=next_radius(oracle.problem, direction, decrease, direction.reduction, noise))
 
 
 def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -212,40 +224,10 @@ SHARE = 0.1
 RAISED = 1.1
 #: Radius of the trust region below which violated constraints count as stuck.
 SMALLEST_RADIUS = 1e-10
-#: Factor by which the trust region shrinks after a step that failed.
-SHRINK = 0.5
 #: Iterations in which the violation has to change by a tenth: with 6 to 40 of them as many fits end right.
 STAGNANT = 10
 #: Part of the violation that a step has to leave, by the linearized constraints, for constraints to count as stuck.
 FALL = 0.9
-
-
-def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Shrink the trust region until a composite step decreases the merit function."""
-    problem, point, penalty = oracle.problem, state.point, state.penalty
-    whole, piece = measure_in_box(problem, direction.step), None
-    for k in range(MAX_BACKTRACKS):
-        crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
-        penalty = raise_penalty(penalty, point, direction)
-        length = measure_in_box(problem, direction.step) if k else whole
-        # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
-        reduction = direction.reduction + penalty * (point.violation - direction.left)
-        # The trial is evaluated with the multipliers of this step, so that its Hessian is that of the Lagrangian there.
-        if direction.multipliers is not None:
-            oracle.multipliers = direction.multipliers
-        trial = move(problem, point.theta, direction.step, state.scale)
-        if trial.is_at(point.theta):
-            return None
-        fraction = ARMIJO_ACROSS if crossed else ARMIJO
-        accepted = _accept(oracle, state, trial, penalty, reduction, fraction, k == 0)
-        if accepted is not None:
-            there, decrease = accepted
-            radius = next_radius(problem, direction, decrease, reduction, _noise(state, penalty), SHRINK)
-            return Accepted(there, length / whole if k else 1.0, radius, penalty)
-        if length < SMALLEST_RADIUS:
-            break
-        direction, piece = shrink_region(problem, state, direction, piece, SHRINK)
-    return None
 
 
 def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
@@ -289,37 +271,40 @@ def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, rad
     return None if moved.is_at(trial.theta) else moved
 
 
-def _accept(
-    oracle: Oracle, state: State, trial: Trial, penalty: float, reduction: float, fraction: float, corrects: bool
-) -> tuple[Point, float] | None:
-    """Return the point of a trial that decreases the merit function, after a correction if need be, and by how much."""
-    first = oracle.first(trial)
-    if first is None:
+def _attempt_merit(oracle: Oracle, state: State, direction: Direction, fraction: float, first: bool) -> Accepted | None:
+    """Return the point of a step that decreases the merit function, the first one after a correction if need be."""
+    problem, theta = oracle.problem, state.point.theta
+    # The trial is evaluated with the multipliers of this step, so that its Hessian is that of the Lagrangian there.
+    if direction.multipliers is not None:
+        oracle.multipliers = direction.multipliers
+    trial = move(problem, theta, direction.step, state.scale)
+    sample = None if trial.is_at(theta) else oracle.first(trial)
+    if sample is None:
         return None
-    found = _judge_merit(oracle, state, trial, first, penalty, reduction, fraction)
-    if found is not None or not corrects:
+    found = _judge_merit(oracle, state, direction, trial, sample, fraction)
+    if found is not None or not first:
         return found
-    problem = oracle.problem
-    moved = correct(oracle, trial, first, state.scale, np.inf)
+    moved = correct(oracle, trial, sample, state.scale, np.inf)
     # What is longer than the step that it is to correct corrects nothing.
-    length = measure_in_box(problem, trial.theta - state.point.theta)
+    length = measure_in_box(problem, trial.theta - theta)
     if moved is None or not measure_in_box(problem, moved.theta - trial.theta) < length:
         return None
-    first = oracle.first(moved)
-    if first is None:
-        return None
-    return _judge_merit(oracle, state, moved, first, penalty, reduction, fraction)
+    sample = oracle.first(moved)
+    return None if sample is None else _judge_merit(oracle, state, direction, moved, sample, fraction)
 
 
 def _judge_merit(
-    oracle: Oracle, state: State, trial: Trial, first: Sample, penalty: float, reduction: float, fraction: float
-) -> tuple[Point, float] | None:
-    """Return the point of a trial that decreases the merit function by a fraction of what is predicted, and how much.
+    oracle: Oracle, state: State, direction: Direction, trial: Trial, first: Sample, fraction: float
+) -> Accepted | None:
+    """Return the point of a trial that decreases the merit function by a fraction of what is predicted.
 
     Where the predicted decrease is below the rounding error of the merit function, the residuals of the optimality
     conditions have to fall.
     """
-    point, noise = state.point, _noise(state, penalty)
+    point, penalty = state.point, state.penalty
+    noise = NOISE * (abs(point.cost) + penalty * point.violation)
+    # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
+    reduction = direction.reduction + penalty * (point.violation - direction.left)
     decrease = point.cost + penalty * point.violation - first.cost - penalty * first.violation
     below_noise = reduction <= noise
     if not (decrease >= -noise if below_noise else decrease >= fraction * reduction):
@@ -327,17 +312,12 @@ def _judge_merit(
     there = oracle.complete(trial, first, state.scale)
     if there is None or (below_noise and not _residual(state, there) < _residual(state, point)):
         return None
-    return there, decrease
+    return Accepted(there, 1.0, next_radius(oracle.problem, direction, decrease, reduction, noise), penalty)
 
 
 def _residual(state: State, point: Point) -> float:
     """Return how far a point is from the optimality conditions: relative optimality and violation."""
     return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
-
-
-def _noise(state: State, penalty: float) -> float:
-    """Return the rounding error of the merit function."""
-    return NOISE * (abs(state.point.cost) + penalty * state.point.violation)
 
 
 def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> bool:

@@ -125,6 +125,11 @@ class Problem:
         return self.hessian == "auto"
 
     @property
+    def has_region(self) -> bool:
+        """Whether steps are searched for in a trust region, in which equality constraints always are."""
+        return self.has_box or bool(self.equalities)
+
+    @property
     def uses_hessian(self) -> bool:
         """Whether the quadratic programme uses the Hessian."""
         return self.hessian != "none"

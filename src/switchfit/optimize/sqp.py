@@ -43,7 +43,7 @@ from switchfit.optimize.algebra import (
     is_negligible,
 )
 from switchfit.optimize.direction import Direction, find_direction, measure_in_box
-from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search, search_merit
+from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import (
@@ -310,7 +310,7 @@ def _step(oracle: Oracle, state: State) -> State:
     accuracy = 0.0 if problem.accuracy is None else problem.accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
-    accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
+    accepted = search(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
     following = state.advance(accepted, problem.tolerance)
