@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, largest, measure_forces
+from switchfit.optimize.algebra import MANY_BREAKPOINTS, BoolArray, FloatArray, IntArray, largest, measure_forces
 from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
 from switchfit.optimize.matrix import Box, Dense, Programme
@@ -206,8 +206,6 @@ SHRINK, GROW = 0.25, 2.0
 CONSTRAINED_SHRINK = 0.5
 #: Ratios of the actual to the predicted reduction below and above which it does so.
 POOR, GOOD = 0.25, 0.75
-#: Steps are tried inside the present smooth piece where they cross fewer breakpoints than this.
-MANY_BREAKPOINTS = 3
 MAX_BACKTRACKS = 60
 
 

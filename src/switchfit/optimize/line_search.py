@@ -33,16 +33,17 @@ from switchfit.optimize.algebra import (
     ARMIJO,
     ARMIJO_ACROSS,
     ARMIJO_DESCENT,
+    MANY_BREAKPOINTS,
     NOISE,
     FloatArray,
     IntArray,
     cost_allows,
+    mix_sides,
     optimality_allows,
 )
 from switchfit.optimize.composite import find_normal_step
 from switchfit.optimize.direction import (
     FIRST_CONSTRAINED_RADIUS,
-    MANY_BREAKPOINTS,
     MAX_BACKTRACKS,
     Direction,
     find_direction,
@@ -50,7 +51,6 @@ from switchfit.optimize.direction import (
     next_radius,
     shrink_region,
 )
-from switchfit.optimize.matrix import mix_sides
 from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import Trial, move
 from switchfit.optimize.qp import Room

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR, BoolArray, FloatArray, IntArray, norm
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR, SMALLEST_JUMP, BoolArray, FloatArray, IntArray, norm
 from switchfit.optimize.matrix import Curvature, Dense
 from switchfit.optimize.point import Point
 from switchfit.optimize.problem import Problem
@@ -330,7 +330,7 @@ class State(NamedTuple):
         if point.kink is None:
             return np.zeros(point.theta.size, dtype=bool)
         jump = point.plus.gradient - point.minus.gradient
-        return np.asarray(point.kink & (jump > 1e-12 * self.gradient_scale))
+        return np.asarray(point.kink & (jump > SMALLEST_JUMP * self.gradient_scale))
 
 
 class Accepted(NamedTuple):
