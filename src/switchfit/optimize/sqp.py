@@ -56,7 +56,6 @@ from switchfit.optimize.problem import (
     as_vector,
     feasible_start,
     move,
-    read_labels,
     snap_to_rows,
     typical_reach,
 )
@@ -231,7 +230,7 @@ def minimize(
     Raises
     ------
     ValueError
-        If shapes or settings are wrong, or the start is infeasible.
+        If the start is infeasible or not finite, or breakpoints are not in order.
 
     Notes
     -----
@@ -242,16 +241,12 @@ def minimize(
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
     d = constraints.size
-    if start.shape != (d,):
-        raise ValueError(f"theta0 has shape {start.shape}, the constraints expect ({d},)")
-    if d == 0:
-        raise ValueError("there is nothing to minimize over: theta0 is empty")
     problem = Problem(
         evaluate=evaluate,
         constraints=constraints,
         breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
         hessian=hessian,
-        labels=read_labels(hessian, blocks, d),
+        labels=np.asarray(blocks, dtype=float) if hessian == "block-diagonal" else None,
         tolerance=tolerance,
         max_iterations=max_iterations,
         size=np.zeros(d) if size is None else as_vector(size, d),
