@@ -265,7 +265,7 @@ IN_SQP: dict[str, tuple[str, Replacements]] = {
 }
 
 IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
-    "second-order correction": (MERIT, [("if found is not None or not corrects:", "if True:")]),
+    "second-order correction": (MERIT, [("if found is not None or not first:", "if True:")]),
     "the penalty is raised": (
         MERIT,
         [("return penalty if penalty >= needed else RAISED * needed", "return penalty")],

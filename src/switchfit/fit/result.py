@@ -195,29 +195,19 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
     for i, value in found.places if found.kind == "jump" else ():
         switch = describe_switch(problem, i)
         if switch is not None:
-            return replace(switch, figures={"before": found.before, "after": found.after, "at": value})
+            return replace(switch, figures={**found.figures, "at": value})
     if result.status.successful:
         return None
-    figures: dict[str, float | tuple[float, ...]] = {}
-    subjects: tuple[str, ...] = ()
-    if found.kind in ("wrong slope", "jump", "kink"):
-        figures |= {"before": found.before, "after": found.after}
-    if found.kind == "wrong slope":
-        subjects = tuple(names[i] for i, _, _ in found.entries)
-        figures |= {
-            "derivatives": tuple(stated for _, stated, _ in found.entries),
-            "differences": tuple(measured for _, _, measured in found.entries),
-        }
-    elif found.kind in ("jump", "kink", "not finite"):
-        subjects = tuple(names[i] for i, _ in found.places)
+    figures: dict[str, float | tuple[float, ...]] = {**found.figures}
+    if found.places:
         figures["at"] = tuple(value for _, value in found.places)
-    elif found.kind == "rounding":
-        figures["noise"] = found.noise
-    elif found.kind == "valley":
-        figures["condition"] = found.condition
+    if found.entries:
+        figures["derivatives"] = tuple(stated for _, stated, _ in found.entries)
+        figures["differences"] = tuple(measured for _, _, measured in found.entries)
     if problem.estimates_delays:
         figures["delayed"] = 1.0
-    return Issue(found.kind, subjects, figures)
+    named = [i for i, _ in found.places] + [i for i, _, _ in found.entries]
+    return Issue(found.kind, tuple(names[i] for i in named), figures)
 
 
 CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -354,6 +355,7 @@ class _Change(NamedTuple):
             rows[k] = slopes[where[0]]
         gradient, hessian = self.variables.derivatives_outward(theta, result.gradient, result.hessian)
         history = tuple(self.convert_record(record) for record in result.history)
+        find = result.explain
         return replace(
             result,
             theta=theta,
@@ -362,10 +364,10 @@ class _Change(NamedTuple):
             history=history,
             multipliers=result.multipliers / np.concatenate([rows, slopes, slopes]),
             kinks=tuple((i, left / float(slopes[i]), right / float(slopes[i])) for i, left, right in result.kinks),
-            reason=None if result.reason is None else self._convert_reason(result.theta, slopes, result.reason),
+            explain=find and cache(lambda: self._convert_finding(result.theta, slopes, find())),
         )
 
-    def _convert_reason(self, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
+    def _convert_finding(self, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
         """Return why the line search failed, in theta instead of the variables z (d,); `slopes`: dtheta/dz (d,)."""
         places = []
         for i, value in found.places:
@@ -373,7 +375,7 @@ class _Change(NamedTuple):
             there[i] = value
             places.append((i, float(self.variables.outward(there)[i])))
         entries = [(i, stated / float(slopes[i]), measured / float(slopes[i])) for i, stated, measured in found.entries]
-        return replace(found, places=tuple(places), entries=tuple(entries))
+        return found._replace(places=tuple(places), entries=tuple(entries))
 
 
 def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:

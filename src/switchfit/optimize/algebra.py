@@ -41,6 +41,10 @@ EXTRA_ITERATIONS = 5
 LONGEST_STEP = 1e3
 #: Sizes below this count as unknown: their squares vanish.
 SMALLEST = 1e-150
+#: Steps are tried inside the present smooth piece where they cross fewer breakpoints than this.
+MANY_BREAKPOINTS = 3
+#: Smaller jumps of a derivative, beside the largest one seen, are rounding.
+SMALLEST_JUMP = 1e-12
 #: Rounds of equilibration after which the scaling of an indefinite matrix is good enough.
 EQUILIBRATIONS = 20
 #: Largest entry of a row with which equilibration ends.
@@ -167,6 +171,20 @@ def positive_eigenvalues(values: Array, xp: Any = np) -> Array:
 def is_negligible(step: Array, scale: Array, xp: Any = np) -> Any:
     """Return whether a step (d,) is negligible beside unknowns of the size (d,)."""
     return xp.all(xp.abs(step) <= NEGLIGIBLE_STEP * scale)
+
+
+def mix_sides(right: Array, left: Array, sides: Array, xp: Any = np) -> Array:
+    """Return what is found on the right where the side is positive, on the left where it is negative, else the mean."""
+    return xp.where(sides > 0, right, xp.where(sides < 0, left, 0.5 * (right + left)))
+
+
+def choose_sides(left: Array, right: Array, xp: Any = np) -> Array:
+    """Return the side to which each coordinate at a kink descends by itself, given its derivatives (d,): (d,) int.
+
+    It is held, 0, where 0 is in [g₋, g₊]; else it goes where the descent is steeper, −g₊ to the right and g₋ to the
+    left.
+    """
+    return xp.where((left <= 0.0) & (right >= 0.0), 0, xp.where(-right >= left, 1, -1))
 
 
 def measure_forces(

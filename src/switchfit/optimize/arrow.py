@@ -28,7 +28,6 @@ from switchfit.optimize.algebra import (
     BoolArray,
     FloatArray,
     IntArray,
-    is_finite,
     positive_eigenvalues,
     unit_rows,
 )
@@ -136,11 +135,6 @@ class Arrow(SymmetricMatrix):
     def with_parts(self, *parts: FloatArray) -> Arrow:
         """Return a matrix of the same shape with other entries."""
         return Arrow(self.layout, *parts)
-
-    @property
-    def finite(self) -> bool:
-        """Whether all entries are."""
-        return all(map(is_finite, self.parts))
 
     def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
         """Return the entries of a vector (d,), 1 where padded, for rows and columns of each part, to be broadcast."""

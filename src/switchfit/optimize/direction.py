@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, largest, measure_forces
+from switchfit.optimize.algebra import MANY_BREAKPOINTS, BoolArray, FloatArray, IntArray, largest, measure_forces
 from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
 from switchfit.optimize.matrix import Box, Dense, Programme
@@ -202,10 +202,10 @@ def _descends(problem: Problem, hessian: Hessian, free: BoolArray | None) -> boo
 
 #: Factors by which the radius falls after a step that the model misjudged, and grows after one that it judged well.
 SHRINK, GROW = 0.25, 2.0
+#: The first of them where there are equality constraints.
+CONSTRAINED_SHRINK = 0.5
 #: Ratios of the actual to the predicted reduction below and above which it does so.
 POOR, GOOD = 0.25, 0.75
-#: Steps are tried inside the present smooth piece where they cross fewer breakpoints than this.
-MANY_BREAKPOINTS = 3
 MAX_BACKTRACKS = 60
 
 
@@ -214,22 +214,24 @@ def measure_in_box(problem: Problem, step: FloatArray) -> float:
     return largest(np.abs(step) / problem.reach)
 
 
-def next_radius(
-    problem: Problem, direction: Direction, decrease: float, predicted: float, noise: float, shrink: float = SHRINK
-) -> float:
+def _shrink(problem: Problem) -> float:
+    return CONSTRAINED_SHRINK if problem.equalities else SHRINK
+
+
+def next_radius(problem: Problem, direction: Direction, decrease: float, predicted: float, noise: float) -> float:
     """Return the radius that follows an accepted step, from the actual and the predicted decrease and their error."""
     radius = direction.radius
     if predicted <= noise:
         return radius
     ratio = decrease / predicted
     if ratio < POOR:
-        return min(radius, shrink * measure_in_box(problem, direction.step))
+        return min(radius, _shrink(problem) * measure_in_box(problem, direction.step))
     grows = ratio > GOOD and radius < math.inf and measure_in_box(problem, direction.step) > 0.9 * radius
     return GROW * radius if grows else radius
 
 
 def shrink_region(
-    problem: Problem, state: State, direction: Direction, piece: Piece | None, shrink: float = SHRINK
+    problem: Problem, state: State, direction: Direction, piece: Piece | None
 ) -> tuple[Direction, Piece | None]:
     """Return the direction after one that failed: in a smaller trust region, and the smooth piece that it keeps to.
 
@@ -239,5 +241,5 @@ def shrink_region(
     if piece is None and 0 < problem.breakpoints.count_crossed(theta, direction.step) < MANY_BREAKPOINTS:
         piece = problem.breakpoints.piece(theta, problem.constraints)
     else:
-        radius = shrink * measure_in_box(problem, direction.step)
+        radius = _shrink(problem) * measure_in_box(problem, direction.step)
     return find_direction(problem, state._replace(radius=radius), piece), piece

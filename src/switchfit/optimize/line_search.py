@@ -19,11 +19,13 @@ References
 .. [3] R. M. Chamberlain, M. J. D. Powell, C. Lemarechal, H. C. Pedersen, The watchdog technique for forcing convergence
    in algorithms for constrained optimization, Math. Program. Study 16 (1982) 1-17.
 .. [4] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
+.. [5] J. J. More, S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011) 1292-1314.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,15 +33,17 @@ from switchfit.optimize.algebra import (
     ARMIJO,
     ARMIJO_ACROSS,
     ARMIJO_DESCENT,
+    MANY_BREAKPOINTS,
     NOISE,
     FloatArray,
+    IntArray,
     cost_allows,
+    mix_sides,
     optimality_allows,
 )
 from switchfit.optimize.composite import find_normal_step
 from switchfit.optimize.direction import (
     FIRST_CONSTRAINED_RADIUS,
-    MANY_BREAKPOINTS,
     MAX_BACKTRACKS,
     Direction,
     find_direction,
@@ -50,7 +54,8 @@ from switchfit.optimize.direction import (
 from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import Trial, move
 from switchfit.optimize.qp import Room
-from switchfit.optimize.state import Accepted, Finding, State, curvature_at, find_reason, measure_noise, wrong_slope
+from switchfit.optimize.state import Accepted, Finding, State
+from switchfit.optimize.threads import one_thread
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
 MAX_HALVINGS = 200
@@ -59,10 +64,13 @@ PATIENCE = 15
 
 
 def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Return a step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece."""
+    """Return a step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece.
+
+    With equality constraints, one that decreases the merit function.
+    """
     problem, theta = oracle.problem, state.point.theta
-    if problem.has_box:
-        return _search_in_box(oracle, state, direction)
+    if problem.has_region:
+        return _search_in_region(oracle, state, direction)
     if direction.descends:
         return _descend(oracle, state, direction)
     alpha = 1.0
@@ -81,26 +89,35 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
     return _backtrack(oracle, state, direction)
 
 
-def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Shrink the trust region until the step of the programme in it decreases J."""
-    problem, point, whole = oracle.problem, state.point, direction.step
-    noise, piece = NOISE * abs(point.cost), None
+def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Shrink the trust region until the step of the programme in it is accepted."""
+    problem, point, whole, piece = oracle.problem, state.point, direction.step, None
+    attempt = _attempt_merit if problem.equalities else _attempt_in_box
     for k in range(MAX_BACKTRACKS):
         crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
-        accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
+        state = state._replace(penalty=raise_penalty(state.penalty, point, direction))
+        accepted = attempt(oracle, state, direction, ARMIJO_ACROSS if crossed else ARMIJO, k == 0)
         if accepted is not None:
-            decrease = point.cost - accepted.point.cost
-            radius = next_radius(problem, direction, decrease, direction.reduction, noise)
             part = measure_in_box(problem, direction.step) / measure_in_box(problem, whole) if k else 1.0
-            return Accepted(accepted.point, part, radius)
-        # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
-        corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
-        if corrected is not None:
-            return corrected
-        if k > 5 and -direction.slope < 0.01 * noise:
+            return accepted._replace(step_length=part)
+        if problem.equalities and measure_in_box(problem, direction.step) < SMALLEST_RADIUS:
+            return None
+        if not problem.equalities and k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
             break
         direction, piece = shrink_region(problem, state, direction, piece)
-    return _blind_step(oracle, state, direction)
+    return None if problem.equalities else _blind_step(oracle, state, direction)
+
+
+def _attempt_in_box(
+    oracle: Oracle, state: State, direction: Direction, fraction: float, first: bool
+) -> Accepted | None:
+    """Return the point of a step inside the trust region that decreases J, and the next radius."""
+    accepted = _attempt(oracle, state, direction, 1.0, fraction)
+    if accepted is None:
+        # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
+        return _step_back(oracle, state, direction) if first and state.iteration >= PATIENCE else None
+    decrease, noise = state.point.cost - accepted.point.cost, NOISE * abs(state.point.cost)
+    return accepted._replace(radius=next_radius(oracle.problem, direction, decrease, direction.reduction, noise))
 
 
 def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -207,40 +224,10 @@ SHARE = 0.1
 RAISED = 1.1
 #: Radius of the trust region below which violated constraints count as stuck.
 SMALLEST_RADIUS = 1e-10
-#: Factor by which the trust region shrinks after a step that failed.
-SHRINK = 0.5
 #: Iterations in which the violation has to change by a tenth: with 6 to 40 of them as many fits end right.
 STAGNANT = 10
 #: Part of the violation that a step has to leave, by the linearized constraints, for constraints to count as stuck.
 FALL = 0.9
-
-
-def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Shrink the trust region until a composite step decreases the merit function."""
-    problem, point, penalty = oracle.problem, state.point, state.penalty
-    whole, piece = measure_in_box(problem, direction.step), None
-    for k in range(MAX_BACKTRACKS):
-        crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
-        penalty = raise_penalty(penalty, point, direction)
-        length = measure_in_box(problem, direction.step) if k else whole
-        # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
-        reduction = direction.reduction + penalty * (point.violation - direction.left)
-        # The trial is evaluated with the multipliers of this step, so that its Hessian is that of the Lagrangian there.
-        if direction.multipliers is not None:
-            oracle.multipliers = direction.multipliers
-        trial = move(problem, point.theta, direction.step, state.scale)
-        if trial.is_at(point.theta):
-            return None
-        fraction = ARMIJO_ACROSS if crossed else ARMIJO
-        accepted = _accept(oracle, state, trial, penalty, reduction, fraction, k == 0)
-        if accepted is not None:
-            there, decrease = accepted
-            radius = next_radius(problem, direction, decrease, reduction, _noise(state, penalty), SHRINK)
-            return Accepted(there, length / whole if k else 1.0, radius, penalty)
-        if length < SMALLEST_RADIUS:
-            break
-        direction, piece = shrink_region(problem, state, direction, piece, SHRINK)
-    return None
 
 
 def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
@@ -284,37 +271,40 @@ def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, rad
     return None if moved.is_at(trial.theta) else moved
 
 
-def _accept(
-    oracle: Oracle, state: State, trial: Trial, penalty: float, reduction: float, fraction: float, corrects: bool
-) -> tuple[Point, float] | None:
-    """Return the point of a trial that decreases the merit function, after a correction if need be, and by how much."""
-    first = oracle.first(trial)
-    if first is None:
+def _attempt_merit(oracle: Oracle, state: State, direction: Direction, fraction: float, first: bool) -> Accepted | None:
+    """Return the point of a step that decreases the merit function, the first one after a correction if need be."""
+    problem, theta = oracle.problem, state.point.theta
+    # The trial is evaluated with the multipliers of this step, so that its Hessian is that of the Lagrangian there.
+    if direction.multipliers is not None:
+        oracle.multipliers = direction.multipliers
+    trial = move(problem, theta, direction.step, state.scale)
+    sample = None if trial.is_at(theta) else oracle.first(trial)
+    if sample is None:
         return None
-    found = _judge_merit(oracle, state, trial, first, penalty, reduction, fraction)
-    if found is not None or not corrects:
+    found = _judge_merit(oracle, state, direction, trial, sample, fraction)
+    if found is not None or not first:
         return found
-    problem = oracle.problem
-    moved = correct(oracle, trial, first, state.scale, np.inf)
+    moved = correct(oracle, trial, sample, state.scale, np.inf)
     # What is longer than the step that it is to correct corrects nothing.
-    length = measure_in_box(problem, trial.theta - state.point.theta)
+    length = measure_in_box(problem, trial.theta - theta)
     if moved is None or not measure_in_box(problem, moved.theta - trial.theta) < length:
         return None
-    first = oracle.first(moved)
-    if first is None:
-        return None
-    return _judge_merit(oracle, state, moved, first, penalty, reduction, fraction)
+    sample = oracle.first(moved)
+    return None if sample is None else _judge_merit(oracle, state, direction, moved, sample, fraction)
 
 
 def _judge_merit(
-    oracle: Oracle, state: State, trial: Trial, first: Sample, penalty: float, reduction: float, fraction: float
-) -> tuple[Point, float] | None:
-    """Return the point of a trial that decreases the merit function by a fraction of what is predicted, and how much.
+    oracle: Oracle, state: State, direction: Direction, trial: Trial, first: Sample, fraction: float
+) -> Accepted | None:
+    """Return the point of a trial that decreases the merit function by a fraction of what is predicted.
 
     Where the predicted decrease is below the rounding error of the merit function, the residuals of the optimality
     conditions have to fall.
     """
-    point, noise = state.point, _noise(state, penalty)
+    point, penalty = state.point, state.penalty
+    noise = NOISE * (abs(point.cost) + penalty * point.violation)
+    # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
+    reduction = direction.reduction + penalty * (point.violation - direction.left)
     decrease = point.cost + penalty * point.violation - first.cost - penalty * first.violation
     below_noise = reduction <= noise
     if not (decrease >= -noise if below_noise else decrease >= fraction * reduction):
@@ -322,46 +312,12 @@ def _judge_merit(
     there = oracle.complete(trial, first, state.scale)
     if there is None or (below_noise and not _residual(state, there) < _residual(state, point)):
         return None
-    return there, decrease
+    return Accepted(there, 1.0, next_radius(oracle.problem, direction, decrease, reduction, noise), penalty)
 
 
 def _residual(state: State, point: Point) -> float:
     """Return how far a point is from the optimality conditions: relative optimality and violation."""
     return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
-
-
-def _noise(state: State, penalty: float) -> float:
-    """Return the rounding error of the merit function."""
-    return NOISE * (abs(state.point.cost) + penalty * state.point.violation)
-
-
-def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Finding:
-    """Find what J is like along the direction that failed, and which coordinates make it so."""
-    problem, theta = oracle.problem, state.point.theta
-    noise = NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
-
-    def line(fraction: float) -> tuple[float, float] | None:
-        if fraction == 0.0 and not problem.equalities:
-            return state.point.cost, direction.slope
-        sample = oracle.sample(theta + fraction * direction.step, 1)
-        return None if sample is None else _along(sample, state, direction.step)
-
-    found = find_reason(line, noise, min(problem.breakpoints.next_on(theta, direction.step), 1.0))
-    at = theta + found.at * direction.step
-    if found.kind == "wrong slope":
-        return replace(found, entries=_wrong_entries(oracle, state, noise))
-    if found.kind == "jump":
-        return replace(found, places=_who_jumps(oracle, theta, direction.step, found))
-    if found.kind == "not finite":
-        return replace(found, places=tuple((i, float(at[i])) for i in np.flatnonzero(direction.step).tolist()))
-    if found.kind == "kink":
-        bent = _who_bends(oracle, theta, direction.step, found)
-        return replace(found, places=tuple((i, float(at[i])) for i in bent))
-    if found.kind == "rounding":
-        return replace(found, noise=noise)
-    curvature = curvature_at(problem, state, state.point.active).spectrum.eigenvalues
-    positive = curvature.size > 0 and curvature[0] > 0.0
-    return replace(found, condition=float(curvature[-1] / curvature[0]) if positive else np.inf)
 
 
 def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> bool:
@@ -373,65 +329,182 @@ def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> boo
     smallest, largest = 10 * NOISE * abs(state.point.cost), 10 * NOISE * state.cost_scale
     if not smallest < direction.reduction <= largest:
         return direction.reduction <= smallest
-
-    def line(fraction: float) -> float | None:
-        sample = oracle.first(move(oracle.problem, state.point.theta, fraction * direction.step, state.scale))
-        return None if sample is None else sample.lagrangian(state.point.forces)[0]
-
-    return direction.reduction <= 10 * measure_noise(line)
+    return direction.reduction <= 10 * _measure_noise(oracle, state, direction.step)
 
 
-def _along(sample: Sample, state: State, step: FloatArray) -> tuple[float, float]:
-    """Return J and its slope along a step (d,); those of the Lagrangian where there are equality constraints."""
-    cost, gradient = sample.lagrangian(state.point.forces)
-    return cost, float(gradient @ step)
+def _measure_noise(oracle: Oracle, state: State, step: FloatArray) -> float:
+    """Return the standard deviation of the error of J along a step (d,); infinite if unknown.
+
+    Differences of the fourth order of a smooth J at equal distances vanish, those of its error do not ([5]_). A jump or
+    a kink makes them large too; it is on one side of the point, so that the smaller of both sides counts.
+    """
+    found = []
+    for side in (1.0, -1.0):
+        trials = [move(oracle.problem, state.point.theta, side * k / 8 * step, state.scale) for k in range(9)]
+        samples = [sample for trial in trials if (sample := oracle.first(trial)) is not None]
+        if len(samples) == 9:
+            values = [sample.lagrangian(state.point.forces)[0] for sample in samples]
+            found.append(math.sqrt(float(np.mean(np.diff(values, 4) ** 2)) / 70))  # 70 = 8! / (4!)²
+    return min(found, default=math.inf)
 
 
-def _wrong_entries(oracle: Oracle, state: State, noise: float) -> tuple[tuple[int, float, float], ...]:
-    """Find up to four coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
-    theta, problem = state.point.theta, oracle.problem
-    wrong = []
-    for i in np.flatnonzero(problem.constraints.movable):
-        for sign in (1.0, -1.0):
-            unit = np.zeros(theta.size)
-            unit[i] = sign * 0.01 * max(abs(theta[i]), problem.size[i], 1e-3)
+class _Place(NamedTuple):
+    """J, its slope and its gradient (d,) at a fraction of a step; cost and slope are infinite where not finite."""
 
-            def line(fraction: float, unit: FloatArray = unit) -> tuple[float, float] | None:
-                sample = oracle.sample(theta + fraction * unit, 1)
-                return None if sample is None else _along(sample, state, unit)
+    fraction: float
+    theta: FloatArray
+    cost: float
+    slope: float
+    gradient: FloatArray
 
-            smooth = min(problem.breakpoints.next_on(theta, unit), 1.0)
-            measured = wrong_slope(line, noise, smooth)
-            if measured is not None:
-                stated = state.point.plus.gradient[i]
-                wrong.append((int(i), float(stated), float(measured / unit[i])))
-                break
-    return tuple(wrong[:4])
+    def excess(self, before: _Place) -> float:
+        """Return by how much J rises from a place before this one more than its slopes at both say."""
+        return self.cost - before.cost - 0.5 * (self.fraction - before.fraction) * (before.slope + self.slope)
 
 
-def _who_bends(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> list[int]:
-    """Find the coordinates along which the derivative of J jumps at a kink on the line."""
-    width = max(2.0**-40 * found.at, 1e-15)
-    sides = [oracle.sample(theta + (found.at + w) * step, 1) for w in (-width, width)]
-    moving = np.flatnonzero(step).tolist()
-    if sides[0] is None or sides[1] is None:
-        return moving[:4]
-    jumps = np.abs((sides[1].gradient - sides[0].gradient) * step)
-    return [i for i in moving if jumps[i] > 0.1 * jumps.max()][:4]
+class _Line(NamedTuple):
+    """J along a step (d,), and its rounding error; with equality constraints, the Lagrangian."""
+
+    oracle: Oracle
+    state: State
+    step: FloatArray
+    noise: float
+
+    @property
+    def begin(self) -> _Place:
+        """Its begin, on the sides of kinks to which the step leads; it is not evaluated again."""
+        point = self.state.point
+        cost, right = point.plus.lagrangian(point.forces)
+        gradient = mix_sides(right, point.minus.lagrangian(point.forces)[1], self.step)
+        return _Place(0.0, point.theta, cost, float(gradient @ self.step), gradient)
+
+    def see(self, fraction: float) -> _Place:
+        """Evaluate J at a fraction of the step."""
+        point = self.state.point
+        theta = point.theta + fraction * self.step
+        sample = self.oracle.sample(theta, 1)
+        if sample is None:
+            return _Place(fraction, theta, np.inf, np.inf, self.step)
+        cost, gradient = sample.lagrangian(point.forces)
+        return _Place(fraction, theta, cost, float(gradient @ self.step), gradient)
+
+    def rises(self, place: _Place) -> bool:
+        """Return whether J is larger than at the begin, or rises."""
+        return place.cost > self.begin.cost + self.noise or place.slope >= 0.0
+
+    def jumps(self, low: _Place, high: _Place) -> bool:
+        """Return whether J rises between two places by more than its slopes explain."""
+        return high.cost < np.inf and abs(high.excess(low)) > 10 * self.noise
+
+    def bends(self, low: _Place, high: _Place) -> bool:
+        """Return whether the slope of J rises between two places by more than a part of what it was at the begin."""
+        return high.slope - low.slope > DISAGREES * max(abs(self.begin.slope), abs(low.slope))
 
 
-def _who_jumps(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> tuple[tuple[int, float], ...]:
-    """Find the coordinate whose change by a hair across a jump of J makes it jump, and its value there.
+#: Part of its distance, and of the step, within which a jump or a kink is located.
+LOCATED, SHORTEST = 2.0**-40, 2.0**-60
+#: Fractions of the step over which differences of J are taken.
+LENGTHS = 10.0 ** -np.arange(1, 6)
+#: A slope is wrong where differences of J contradict it by more than this part of it, beyond their own error.
+DISAGREES = 0.1
+#: Number of unknowns that are named at most.
+NAMED = 4
+
+
+@one_thread()
+def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Finding:
+    """Find out why no fraction of a step decreases J although its slope is negative."""
+    step, noise = direction.step, NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
+    line = _Line(oracle, state, step, noise)
+    begin = line.begin
+    if not begin.slope < 0.0:
+        return Finding("rounding", {"noise": noise})
+    low, high = _locate_rise(line)
+    if line.jumps(low, high):
+        return Finding("jump", {"before": low.cost, "after": high.cost}, _who_jumps(line, low, high))
+    # After the jump: differences across one contradict a slope that is right between jumps.
+    measured = _contradict_slope(line)
+    if measured is not None:
+        return Finding("wrong slope", {"before": begin.slope, "after": measured}, (), _list_wrong(line))
+    if high.cost == np.inf:
+        return Finding("not finite", {}, _list_places(np.flatnonzero(step), high))
+    if line.bends(low, high):
+        change = np.abs((high.gradient - low.gradient) * step)
+        bent = np.flatnonzero(change > 0.1 * change.max())[:NAMED]
+        return Finding("kink", {"before": low.slope, "after": high.slope}, _list_places(bent, high))
+    lost = begin.cost - low.cost <= noise and -0.5 * low.fraction * begin.slope <= noise
+    return Finding("rounding", {"noise": noise}) if lost else Finding("valley", {})
+
+
+def _list_places(coordinates: IntArray, place: _Place) -> tuple[tuple[int, float], ...]:
+    return tuple((i, float(place.theta[i])) for i in coordinates.tolist())
+
+
+def _locate_rise(line: _Line) -> tuple[_Place, _Place]:
+    """Return a place at which J falls, and the next one at which it has risen; the begin twice if it nowhere rises.
+
+    They are as near to each other as makes no difference where J jumps or bends between them, or is not finite from
+    there on; where it is smooth, their slopes are nearly equal.
+    """
+    low = high = line.begin
+    # From the shortest length, a power of 1/64, from which on J is larger.
+    for k in range(10):
+        there = line.see(64.0**-k)
+        if there.cost <= low.cost + line.noise:
+            break
+        high = there
+    while high.fraction - low.fraction > max(LOCATED * high.fraction, SHORTEST):
+        if high.cost < np.inf and not line.jumps(low, high) and not line.bends(low, high):
+            break
+        middle = line.see(0.5 * (low.fraction + high.fraction))
+        low, high = (low, middle) if line.rises(middle) else (middle, high)
+    return low, high
+
+
+def _who_jumps(line: _Line, low: _Place, high: _Place) -> tuple[tuple[int, float], ...]:
+    """Find the coordinate whose change across a jump of J makes it jump alone, and its value there.
 
     Up to four coordinates that the step moves, where none of them does so alone.
     """
-    width = max(2.0**-40 * found.at, 1e-15)
-    before, after = theta + (found.at - width) * step, theta + (found.at + width) * step
-    base, half = oracle.sample(before, 1), 0.5 * abs(found.after - found.before)
-    for i in np.flatnonzero(before != after):
-        moved = before.copy()
-        moved[i] = after[i]
-        there = oracle.sample(moved, 1)
-        if base is not None and there is not None and abs(there.cost - base.cost) > half:
-            return ((int(i), float(after[i])),)
-    return tuple((int(i), float(after[i])) for i in np.flatnonzero(step)[:4])
+    moving = np.flatnonzero(line.step)
+    for i in moving[low.theta[moving] != high.theta[moving]].tolist():
+        moved = np.where(np.arange(line.step.size) == i, high.theta, low.theta)
+        sample = line.oracle.sample(moved, 1)
+        cost = low.cost if sample is None else sample.lagrangian(line.state.point.forces)[0]
+        if abs(cost - low.cost) > 0.5 * abs(high.cost - low.cost):
+            return ((i, float(high.theta[i])),)
+    return _list_places(moving[:NAMED], high)
+
+
+def _contradict_slope(line: _Line) -> float | None:
+    """Return what differences of J say in place of its slope at the begin, if they contradict it; None if not.
+
+    They have to contradict the slopes farther on as well: at a kink within the shortest difference they do not.
+    """
+    begin, values, errors, farther = line.begin, [], [], []
+    # J is smooth, if it is what it is said to be, up to the next breakpoint.
+    smooth = min(line.oracle.problem.breakpoints.next_on(begin.theta, line.step), 1.0)
+    for length in LENGTHS * smooth:
+        half, full = line.see(0.5 * length), line.see(length)
+        if max(half.cost, full.cost) < np.inf:
+            values.append((4 * half.cost - 3 * begin.cost - full.cost) / length)
+            errors.append(8 * line.noise / length)
+            farther.append(abs(full.excess(half)) / (0.5 * length))
+    if len(values) < 2:
+        return None
+    spread = np.abs(np.diff(values)) + np.array(errors[1:])
+    best = int(np.argmin(spread)) + 1
+    error = 2 * spread[best - 1] + DISAGREES * max(abs(begin.slope), abs(values[best]))
+    return values[best] if min(abs(values[best] - begin.slope), farther[best]) > error else None
+
+
+def _list_wrong(line: _Line) -> tuple[tuple[int, float, float], ...]:
+    """Find coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
+    wrong, theta = [], line.begin.theta
+    for i in np.flatnonzero(line.step).tolist():
+        alone = np.zeros(theta.size)
+        alone[i] = math.copysign(0.01 * max(abs(theta[i]), line.oracle.problem.size[i], 1e-3), line.step[i])
+        measured = _contradict_slope(line._replace(step=alone))
+        if measured is not None:
+            wrong.append((i, float(line.begin.gradient[i]), float(measured / alone[i])))
+    return tuple(wrong[:NAMED])

@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.optimize import lapack
 from switchfit.optimize.algebra import (
@@ -29,6 +29,7 @@ from switchfit.optimize.algebra import (
     equilibrate,
     is_finite,
     jacobi_scaling,
+    mix_sides,
     norm,
     positive_eigenvalues,
     smallest,
@@ -168,6 +169,11 @@ class SymmetricMatrix:
         """The arrays."""
         raise NotImplementedError
 
+    @property
+    def finite(self) -> bool:
+        """Whether all entries are."""
+        return all(map(is_finite, self.parts))
+
     def with_parts(self, *parts: FloatArray) -> Self:
         """Return a matrix of the same shape with other entries."""
         raise NotImplementedError
@@ -208,11 +214,6 @@ class SymmetricMatrix:
         """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
         pairs = zip(self.parts, minus.parts, self.pairs(sides), strict=True)
         return self.with_parts(*(mix_sides(right, left, a + b) for right, left, (a, b) in pairs))
-
-
-def mix_sides(right: FloatArray, left: FloatArray, sides: NDArray[Any]) -> FloatArray:
-    """Return what is found on the right where the side is positive, on the left where it is negative, else the mean."""
-    return np.where(sides > 0, right, np.where(sides < 0, left, 0.5 * (right + left)))
 
 
 def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -> FloatArray:
@@ -284,11 +285,6 @@ class Dense(SymmetricMatrix):
     def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray]]:
         """Return the entries of a vector (d,) for rows and columns, to be broadcast."""
         return ((vector[:, None], vector),)
-
-    @property
-    def finite(self) -> bool:
-        """Whether all entries are."""
-        return is_finite(self.array)
 
     def dense(self) -> FloatArray:
         """Return the matrix in full: (d, d)."""
@@ -503,10 +499,7 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:
-    """Return the matrix with eigenvalues that are not positive replaced by absolute values; itself if all are."""
-    symmetric = 0.5 * (matrix + matrix.T)
-    values, vectors = np.linalg.eigh(symmetric)
-    if values.size == 0 or values[0] > EIGENVALUE_FLOOR:
-        return symmetric
+    """Return the matrix, which is symmetric, with eigenvalues that are not positive replaced by absolute values."""
+    values, vectors = np.linalg.eigh(matrix)
     convex = (vectors * positive_eigenvalues(values)) @ vectors.T
     return np.asarray(0.5 * (convex + convex.T))

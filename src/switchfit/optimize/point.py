@@ -25,10 +25,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, is_finite, largest, norm, unit_rows
+from switchfit.optimize.algebra import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    choose_sides,
+    is_finite,
+    largest,
+    mix_sides,
+    norm,
+    unit_rows,
+)
 from switchfit.optimize.arrow import Arrow, Hessian
 from switchfit.optimize.composite import Equalities, Rows
-from switchfit.optimize.matrix import Curvature, Dense, mix_sides
+from switchfit.optimize.matrix import Curvature, Dense
 from switchfit.optimize.problem import Problem, Trial
 from switchfit.optimize.qp import NONE, find_least_distance
 
@@ -111,7 +121,7 @@ def steepest_descent(
     if smooth:
         return *kkt_residual(right, right, normals), side
     kink = np.zeros(left.size, dtype=bool) if kink is None else kink
-    alone = np.where((left <= 0.0) & (right >= 0.0), 0, np.where(-right >= left, 1, -1))
+    alone = choose_sides(left, right)
     convex = kink & (left < right)
     best, force, rounding = -np.inf, np.inf, 1e-12 * float(np.abs(left).sum() + np.abs(right).sum())
     for sides in _choices(np.where(kink, alone, side), kink & (left > right), normals):

@@ -6,7 +6,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,9 +25,6 @@ HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss
 - "gauss-newton": "exact", for a caller whose evaluations return the Gauss-Newton matrix;
 - "none": steepest descent in the metric of theta, as in the paper.
 """
-
-HESSIANS = get_args(HessianKind)
-
 
 REACH = 0.1
 """Part of an unknown's size by which it may move in the first step inside a trust region."""
@@ -52,7 +49,7 @@ evaluation. Unless `everything`, only those that are found without an evaluation
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A problem with its settings, which are checked.
+    """A problem with its settings, which the caller has checked.
 
     Attributes
     ----------
@@ -87,18 +84,6 @@ class Problem:
     equalities: tuple[str, ...]
     accuracy: Callable[[], float] | None
 
-    def __post_init__(self) -> None:
-        if self.hessian not in HESSIANS:
-            raise ValueError(f"hessian is {self.hessian!r}; choose one of {', '.join(HESSIANS)}")
-        if self.equalities and self.hessian not in ("auto", "exact"):
-            raise ValueError(
-                f"equality constraints need the exact Hessian: hessian 'auto' or 'exact'; got {self.hessian!r}"
-            )
-        if not self.tolerance >= 0.0 or self.max_iterations < 0:
-            raise ValueError(
-                f"tolerance {self.tolerance} and max_iterations {self.max_iterations} must not be negative"
-            )
-
     @cached_property
     def row_size(self) -> FloatArray:
         """Size of the terms of each row of the constraints, to which rounding errors are relative: (m,)."""
@@ -125,6 +110,11 @@ class Problem:
         return self.hessian == "auto"
 
     @property
+    def has_region(self) -> bool:
+        """Whether steps are searched for in a trust region, in which equality constraints always are."""
+        return self.has_box or bool(self.equalities)
+
+    @property
     def uses_hessian(self) -> bool:
         """Whether the quadratic programme uses the Hessian."""
         return self.hessian != "none"
@@ -148,10 +138,6 @@ class Breakpoints:
     def of(cls, given: Sequence[ArrayLike] | None, d: int) -> Breakpoints:
         """Check one array for each of d coordinates; coordinates may share one, which is read once."""
         given = [()] * d if given is None else given
-        if len(given) != d:
-            raise ValueError(
-                f"got breakpoints for {len(given)} coordinates, expected {d}; give an empty array for none"
-            )
         read: dict[int, list[float]] = {}
         found = []
         for i, points in enumerate(given):
@@ -240,16 +226,6 @@ def typical_reach(theta: FloatArray) -> FloatArray:
     """Return the default of the largest changes in a first step, a part of the unknowns' sizes: (d,)."""
     size = np.abs(theta)
     return REACH * np.where(size > 0.0, size, 1.0)
-
-
-def read_labels(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
-    """Return the labels of the blocks, (d,); None unless the Hessian is to be cut into blocks."""
-    if hessian != "block-diagonal":
-        return None
-    labels = np.asarray(blocks)
-    if blocks is None or labels.shape != (d,):
-        raise ValueError(f"hessian='block-diagonal' needs blocks, an integer label for each of the {d} coordinates")
-    return labels.astype(float)
 
 
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:

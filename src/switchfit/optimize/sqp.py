@@ -27,6 +27,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,7 +43,7 @@ from switchfit.optimize.algebra import (
     is_negligible,
 )
 from switchfit.optimize.direction import Direction, find_direction, measure_in_box
-from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search, search_merit
+from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import (
@@ -55,7 +56,6 @@ from switchfit.optimize.problem import (
     as_vector,
     feasible_start,
     move,
-    read_labels,
     snap_to_rows,
     typical_reach,
 )
@@ -230,7 +230,7 @@ def minimize(
     Raises
     ------
     ValueError
-        If shapes or settings are wrong, or the start is infeasible.
+        If the start is infeasible or not finite, or breakpoints are not in order.
 
     Notes
     -----
@@ -241,16 +241,12 @@ def minimize(
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
     d = constraints.size
-    if start.shape != (d,):
-        raise ValueError(f"theta0 has shape {start.shape}, the constraints expect ({d},)")
-    if d == 0:
-        raise ValueError("there is nothing to minimize over: theta0 is empty")
     problem = Problem(
         evaluate=evaluate,
         constraints=constraints,
         breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
         hessian=hessian,
-        labels=read_labels(hessian, blocks, d),
+        labels=np.asarray(blocks, dtype=float) if hessian == "block-diagonal" else None,
         tolerance=tolerance,
         max_iterations=max_iterations,
         size=np.zeros(d) if size is None else as_vector(size, d),
@@ -309,7 +305,7 @@ def _step(oracle: Oracle, state: State) -> State:
     accuracy = 0.0 if problem.accuracy is None else problem.accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
-    accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
+    accepted = search(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
     following = state.advance(accepted, problem.tolerance)
@@ -378,7 +374,8 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
         if point is not None:
             fresh = State.at(point)
             return fresh._replace(iteration=state.iteration, restarts=state.restarts + 1, careful=True)
-    return state._replace(status=Status.LINE_SEARCH_FAILED, reason=explain_failure(oracle, state, direction))
+    explain = cache(partial(explain_failure, oracle, state, direction))
+    return state._replace(status=Status.LINE_SEARCH_FAILED, explain=explain)
 
 
 def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
@@ -441,7 +438,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         history=history,
         violated=_list_violated(oracle, point),
         idle=idle_coordinates(problem, state),
-        reason=state.reason,
+        explain=state.explain,
         predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
         equalities=_list_equalities(oracle, point),
     )

@@ -40,19 +40,15 @@ from switchfit.optimize.algebra import (
     EQUILIBRATED,
     EQUILIBRATIONS,
     EXTRA_ITERATIONS,
+    MANY_BREAKPOINTS,
     NOISE,
+    SMALLEST_JUMP,
 )
 
 Array = jax.Array
 
 MAX_TRIALS = 30
 """Fractions of a step that are tried."""
-
-MANY_BREAKPOINTS = 3
-"""As of `switchfit.optimize.direction`."""
-
-SMALLEST_JUMP = 1e-12
-"""Smaller jumps of a derivative, beside the largest one seen, are rounding."""
 
 CRAWLING = (12, 1)
 """A fit that has refused more fractions of steps than this, plus this many an iteration, makes no headway and is left
@@ -477,9 +473,7 @@ def begin(start: Array) -> State:
 
 def _sides(left: Array, right: Array, kink: Array) -> Array:
     """Choose sides as `switchfit.optimize.point.steepest_descent` does where no constraint is active: (d,)."""
-    # 0 in [g-, g+]: held. Else to the side with the steeper descent, of -g+ to the right and g- to the left.
-    alone = jnp.where((left <= 0.0) & (right >= 0.0), 0, jnp.where(-right >= left, 1, -1))
-    return jnp.where(kink, alone, 1)
+    return jnp.where(kink, algebra.choose_sides(left, right, jnp), 1)
 
 
 def _steepest(left: Array, right: Array, kink: Array) -> Array:
@@ -634,8 +628,7 @@ def _solve_on_sides(
     # right are those of no piece that was evaluated, and the mean stands for them.
     held = sides == 0
     pair = sides[:, None] + sides[None]
-    left, right = point.left.hessian, point.right.hessian
-    mixed = jnp.where(pair > 0, right, jnp.where(pair < 0, left, 0.5 * (right + left)))
+    mixed = algebra.mix_sides(point.right.hessian, point.left.hessian, pair, jnp)
     hessian = _without(held, mixed)
     gradient = jnp.where(held, 0.0, jnp.where(sides > 0, point.right.gradient, point.left.gradient))
     # B = D S D, with S of unit diagonal, so that eigenvalues of S are compared with numbers that have no unit.

@@ -490,8 +490,7 @@ _ISSUES: dict[str, Sentence] = {
     "model is not defined there, or a state grows without bound. Start elsewhere, or bound the unknowns.",
     "rounding": "The derivatives are right, but what the cost can still fall along that direction is less than its "
     "rounding error, {noise:.1e}. Scale the unknowns to be of size one, or ask for a larger tolerance.{delay}",
-    "valley": "The derivatives are right, but the cost has a narrow valley there (condition number of the scaled "
-    "Hessian {condition:.1e}). Start elsewhere, fix one of the unknowns that trade off, or take "
-    "hessian='gauss-newton'.{delay}",
+    "valley": "The derivatives are right, but the cost has a narrow valley there. Start elsewhere, fix one of "
+    "the unknowns that trade off, or take hessian='gauss-newton'.{delay}",
     "error": "{names}",
 }
