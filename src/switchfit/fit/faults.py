@@ -11,7 +11,7 @@ then the line search fails at a jump, and `switchfit.fit.result` says so.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +26,8 @@ from switchfit.problem.inspection import find_comparisons, find_undefined
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError, Issue
 
-
-class _Visit(NamedTuple):
-    """A function, its role, and arguments with which it is called: times, states and inputs of N points each."""
-
-    role: str
-    function: Function
-    arguments: Sequence[FloatArray]
+_Visit = tuple[str, Function, Sequence[FloatArray]]
+"""A function's role, the function, and arguments with which it is called: times, states and inputs of N points each."""
 
 
 def explain_nonfinite(evaluator: Evaluator, theta: FloatArray) -> Issue | None:
@@ -53,12 +48,12 @@ def explain_nonfinite(evaluator: Evaluator, theta: FloatArray) -> Issue | None:
     for e, (run, simulation) in enumerate(zip(runs, simulations, strict=True)):
         model = Model(evaluator.structures[e], evaluator.arguments[e])
         parameters = model.parameters(problem.vectors(theta, e)[1])  # type: ignore[arg-type]  # of NumPy
-        for visit in _list_visits(model, parameters, simulation):
-            found = find_undefined(visit.function, visit.arguments, parameters)
+        for role, function, arguments in _list_visits(model, parameters, simulation):
+            found = find_undefined(function, arguments, parameters)
             if found is not None:
-                point = _describe_point([argument[found.point] for argument in visit.arguments])
+                point = _describe_point([argument[found.point] for argument in arguments])
                 figures = point | {"order": float(found.order), "valued": float(found.valued)}
-                return Issue("undefined", (visit.role, found.operation, found.line, run), figures)
+                return Issue("undefined", (role, found.operation, found.line, run), figures)
     return None
 
 
@@ -76,11 +71,11 @@ def _list_visits(model: Model, parameters: Mapping[str, Any], simulation: Simula
     own.
     """
     structure, roles = model.structure, model.structure.roles
-    names = {id(function): role for role, function in reversed(roles.items())}
+    names = {function: role for role, function in reversed(roles.items())}
 
     def visit(function: Function | None, *arguments: Any) -> Iterator[_Visit]:
         if function is not None:
-            yield _Visit(names[id(function)], function, arguments)
+            yield names[function], function, arguments
 
     yield from visit(structure.initial_state)
     rows = simulation.segments

@@ -6,7 +6,7 @@ How a fit ended, as data from which the report writes its message.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -173,29 +173,16 @@ def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ..
     return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
 
-def describe_switch(problem: Problem, i: int) -> Issue | None:
-    """Return that a function compares with an unknown, and where; None if no function does.
-
-    Parameters
-    ----------
-    problem : Problem
-    i : int
-        Index of the unknown in theta.
-    """
-    comparison = find_comparisons(problem).get(i)
-    return None if comparison is None else Issue("switch", (problem.unknowns.names[i], comparison))
-
-
 def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:
     """Return why the line search failed, with the names of the unknowns; of a fit that has converged a "switch" alone.
 
     A jump of J is a switch if a function compares with the unknown: where, is the second subject of the issue.
     """
-    names = problem.unknowns.names
-    for i, value in found.places if found.kind == "jump" else ():
-        switch = describe_switch(problem, i)
-        if switch is not None:
-            return replace(switch, figures={"before": found.before, "after": found.after, "at": value})
+    names, comparisons = problem.unknowns.names, find_comparisons(problem) if found.kind == "jump" else {}
+    for i, value in found.places:
+        if i in comparisons:
+            figures = {"before": found.before, "after": found.after, "at": value}
+            return Issue("switch", (names[i], comparisons[i]), figures)
     if result.status.successful:
         return None
     figures: dict[str, float | tuple[float, ...]] = {}
