@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.inspection import find_comparisons, find_unread
 from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import ActiveConstraint, Constraint
-from switchfit.problem.validation import as_choice, as_level
+from switchfit.problem.validation import as_level
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Printed
@@ -544,51 +544,7 @@ class Fit(Termination):
         return self.covariance_from("exact")
 
     def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance of theta from the exact Hessian, the Gauss-Newton matrix or both sides of it: (d, d).
-
-        Parameters
-        ----------
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            "exact", the observed information, is used by `covariance` and everything else here. The Gauss-Newton
-            matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
-            residuals, and treats the model as linear. "sandwich" is ``n / (n - d) H^-1 B H^-1`` with the exact Hessian
-            H and ``B = sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: with a robust loss it holds
-            for independent noise of any distribution, whether sigma is right or not.
-
-        Raises
-        ------
-        ValueError
-            For another kind, or if the Gauss-Newton matrix is unknown: the cost does not consist of Measurements
-            alone, or the estimate was loaded without its problem from a file that lacks the matrix. For "sandwich"
-            without the problem, with priors, constraints, or a sigma or delay that is a parameter, and with no more
-            values than free unknowns.
-
-        References
-        ----------
-        P. J. Huber, Robust Statistics, Wiley 1981, section 6.3 (covariance of M-estimates); H. White, Maximum
-        likelihood estimation of misspecified models, Econometrica 50 (1982) 1-25, theorem 3.2; J. G. MacKinnon,
-        H. White, J. Econometrics 29 (1985) 305-325 (the factor n / (n - d)).
-
-        See Also
-        --------
-        Estimate.covariance
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> fit.covariance_from("gauss-newton").shape
-        (2, 2)
-        """
-        hessian = as_choice(hessian, "hessian", get_args(CovarianceKind))
-        if hessian == "sandwich":
-            if self.sandwich_needs:
-                raise ValueError(self.sandwich_needs)
-            B, inverse = self._sum_score_products(), inverse_on(self.free_basis, self.hessian)
-            # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1
-            return np.asarray(self.samples / self.freedom * (inverse @ B @ inverse))
+        """Return the covariance from the exact Hessian or the Gauss-Newton matrix: (d, d); an `Estimate` has others."""
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
         if matrix is None:
             raise ValueError(
@@ -597,18 +553,6 @@ class Fit(Termination):
             )
         scale = self.residual_variance if self.sigma_known is False else 1.0
         return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
-
-    @property
-    def sandwich_needs(self) -> str:
-        """What ``covariance_from("sandwich")`` needs and this fit lacks, as a sentence; empty if there is one."""
-        return (
-            "The sandwich covariance needs the gradient of each sample: fit the problem again, or load the estimate "
-            "with its problem."
-        )
-
-    def _sum_score_products(self) -> FloatArray:
-        """Return the sum over samples of the outer products of their gradients: (d, d). An `Estimate` has it."""
-        raise NotImplementedError
 
     @property
     def standard_errors(self) -> FloatArray:
