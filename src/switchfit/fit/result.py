@@ -181,8 +181,8 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
     names, comparisons = problem.unknowns.names, find_comparisons(problem) if found.kind == "jump" else {}
     for i, value in found.places:
         if i in comparisons:
-            figures = {"before": found.before, "after": found.after, "at": value}
-            return Issue("switch", (names[i], comparisons[i]), figures)
+            sides = {"before": found.before, "after": found.after}
+            return Issue("switch", (names[i], comparisons[i]), {**sides, "at": value})
     if result.status.successful:
         return None
     figures: dict[str, float | tuple[float, ...]] = {}

@@ -9,7 +9,8 @@ posterior density, up to a constant, and its minimum the maximum a posteriori (M
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -344,13 +345,15 @@ class Parameter:
         >>> float(second.value), float(second.lower)
         (2.0, 0.0)
         """
-        terms = PriorTerms.of(self.prior, self.shape)
-        priors: list[Prior | None] = []
-        for center, precision, log in zip(*terms, strict=True):
-            kind = LogNormal if log else Normal
-            priors.append(kind(np.exp(center) if log else center, precision**-0.5) if precision > 0 else None)
-        each = zip(self.value.ravel(), self.lower.ravel(), self.upper.ravel(), priors, strict=True)
-        return tuple(Parameter(x, low, high, self.unit, self.fixed, prior, self.scale) for x, low, high, prior in each)
+
+        def pick(record: Any, names: Iterable[str], k: tuple[int, ...]) -> dict[str, Any]:
+            return {name: np.broadcast_to(getattr(record, name), self.shape)[k] for name in names}
+
+        found = []
+        for k in np.ndindex(self.shape):
+            prior = None if self.prior is None else replace(self.prior, **pick(self.prior, vars(self.prior), k))
+            found.append(replace(self, prior=prior, **pick(self, ("value", *BOUNDS), k)))
+        return tuple(found)
 
     @property
     def shape(self) -> tuple[int, ...]:
