@@ -544,7 +544,30 @@ class Fit(Termination):
         return self.covariance_from("exact")
 
     def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance from the exact Hessian or the Gauss-Newton matrix: (d, d); an `Estimate` has others."""
+        """Return the covariance of theta from one of its matrices: (d, d); for others see `Estimate.covariance_from`.
+
+        Parameters
+        ----------
+        hessian : {"exact", "gauss-newton"}
+
+        Raises
+        ------
+        ValueError
+            If the Gauss-Newton matrix is unknown.
+
+        See Also
+        --------
+        Estimate.covariance_from
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> bool((fit.covariance_from("exact") == fit.covariance).all())
+        True
+        """
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
         if matrix is None:
             raise ValueError(
