@@ -243,11 +243,6 @@ class Experiment:
             why = f" {_say_left_out(missing)}, and taken from the data: give it." if missing else ""
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.{why}")
         set_fields(self, taken_from_data=missing)
-        by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
-        if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
-            raise ValueError(
-                f"The lower bound of tf must lie after t0 = {t0}; got {tf.lower}. Leave it out, or raise it."
-            )
         modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
