@@ -354,7 +354,8 @@ class Experiment:
     @cached_property
     def is_jump(self) -> NDArray[np.bool_]:
         """Which of the N transitions that programs take, `times` and the jumps in between, are jumps: (N,)."""
-        return np.insert(np.zeros(len(self._own_times), dtype=bool), self.passed_by_jumps, True)
+        both = np.append(self.jump_times, self.initial_times)
+        return np.argsort(both, kind="stable") < len(self.jump_times)  # at one time, a jump comes first
 
     @cached_property
     def initial_times_with_jumps(self) -> FloatArray:

@@ -9,14 +9,13 @@ posterior density, up to a constant, and its minimum the maximum a posteriori (M
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.dates import Dates, as_dates, is_dated, list_dates
+from switchfit.problem.dates import Dates, as_dates, is_dated
 from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, require_deviation, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
@@ -345,15 +344,13 @@ class Parameter:
         >>> float(second.value), float(second.lower)
         (2.0, 0.0)
         """
-
-        def pick(record: Any, names: Iterable[str], k: tuple[int, ...]) -> dict[str, Any]:
-            return {name: np.broadcast_to(getattr(record, name), self.shape)[k] for name in names}
-
-        found = []
-        for k in np.ndindex(self.shape):
-            prior = None if self.prior is None else replace(self.prior, **pick(self.prior, vars(self.prior), k))
-            found.append(replace(self, prior=prior, **pick(self, ("value", *BOUNDS), k)))
-        return tuple(found)
+        terms = PriorTerms.of(self.prior, self.shape)
+        priors: list[Prior | None] = []
+        for center, precision, log in zip(*terms, strict=True):
+            kind = LogNormal if log else Normal
+            priors.append(kind(np.exp(center) if log else center, precision**-0.5) if precision > 0 else None)
+        each = zip(self.value.ravel(), self.lower.ravel(), self.upper.ravel(), priors, strict=True)
+        return tuple(Parameter(x, low, high, self.unit, self.fixed, prior, self.scale) for x, low, high, prior in each)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -385,5 +382,6 @@ def as_parameter(
 
 def refuse_dates(parameter: Parameter, what: str) -> None:
     """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
-    for dates in list_dates(parameter):
-        raise ValueError(f"{what} must be a number; got the date {dates!r}. Only transition times and tf may be dates.")
+    date = parameter.value  # its bounds are dates if it is one
+    if isinstance(date, Dates):
+        raise ValueError(f"{what} must be a number; got the date {date!r}. Only transition times and tf may be dates.")

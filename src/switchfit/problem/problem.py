@@ -299,10 +299,13 @@ class Problem:
             require_unknowns(self)
         check_noise(experiments, parameters, has_priors=self.unknowns.priors.any)
         check_delays(experiments, parameters)
-        settings = self._functions, solver, most
-        set_fields(self, structures=tuple(trace_structure(self.system, e, *settings) for e in experiments))
+        set_fields(self, structures=self._trace_structures())
         for structure in self.structures:
             self.system.check_labels_of(structure.n)
+
+    def _trace_structures(self) -> tuple[Structure, ...]:
+        settings = self._functions, self.solver, self.max_transitions
+        return tuple(trace_structure(self.system, e, *settings) for e in self.experiments)
 
     @cached_property
     def _functions(self) -> Functions:
@@ -353,7 +356,10 @@ class Problem:
         changed: Problem = object.__new__(Problem)
         set_fields(changed, **{name: getattr(self, name) for name in (*GIVEN, "_functions")})
         set_fields(changed, experiments=experiments)
-        changed.__post_init__()
+        check_sequences(self.system, experiments, self.max_transitions)
+        unknowns = list_unknowns(self.system, experiments, dict(self.parameters), self.min_duration)
+        set_fields(changed, unknowns=unknowns)
+        set_fields(changed, structures=changed._trace_structures())
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
