@@ -502,6 +502,8 @@ def insert_jumps(experiment: Experiment, of_times: Iterable[Any], of_jumps: Iter
     experiment : Experiment
     of_times, of_jumps : iterable
     """
+    if not len(experiment.jump_times):
+        return list(of_times)
     times, jumps = iter(of_times), iter(of_jumps)
     return [next(jumps if is_jump else times) for is_jump in experiment.is_jump.tolist()]
 

@@ -479,7 +479,7 @@ class Problem:
         """
         runs = enumerate(zip(self.experiments, self.unknowns.times, self.structures, strict=True))
         return tuple(
-            np.array([*insert_jumps(run, own, repeat(-1)), *place_parameters(self, e, structure)], dtype=np.intp)
+            np.concatenate([insert_jumps(run, own, repeat(-1)), place_parameters(self, e, structure)]).astype(np.intp)
             for e, (run, own, structure) in runs
         )
 
