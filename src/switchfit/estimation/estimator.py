@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.estimation.saved import Provenance, describe_python_problem, digest_data, load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import CovarianceKind, Fit
+from switchfit.fit.result import CovarianceKind, Fit, inverse_on
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -219,11 +219,62 @@ class Estimate(Fit, Tabular, Displayed):
             return build_gauss_newton(self.problem, self.theta, samples)
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
+    def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
+        """Return the covariance of theta from the exact Hessian, the Gauss-Newton matrix or both sides of it: (d, d).
+
+        Parameters
+        ----------
+        hessian : {"exact", "gauss-newton", "sandwich"}
+            "exact", the observed information, is used by `covariance` and everything else here. The Gauss-Newton
+            matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
+            residuals, and treats the model as linear. "sandwich" is ``n / (n - d) H^-1 B H^-1`` with the exact Hessian
+            H and ``B = sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: with a robust loss it holds
+            for independent noise of any distribution, whether sigma is right or not.
+
+        Raises
+        ------
+        ValueError
+            For another kind, or if the Gauss-Newton matrix is unknown: the cost does not consist of Measurements
+            alone, or the estimate was loaded without its problem from a file that lacks the matrix. For "sandwich"
+            without the problem, with priors, constraints, or a sigma or delay that is a parameter, and with no more
+            values than free unknowns.
+
+        References
+        ----------
+        P. J. Huber, Robust Statistics, Wiley 1981, section 6.3 (covariance of M-estimates); H. White, Maximum
+        likelihood estimation of misspecified models, Econometrica 50 (1982) 1-25, theorem 3.2; J. G. MacKinnon,
+        H. White, J. Econometrics 29 (1985) 305-325 (the factor n / (n - d)).
+
+        See Also
+        --------
+        Estimate.covariance
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.covariance_from("gauss-newton").shape
+        (2, 2)
+        """
+        if as_choice(hessian, "hessian", get_args(CovarianceKind)) != "sandwich":
+            return super().covariance_from(hessian)
+        if self.problem is None or self.sandwich_needs:
+            raise ValueError(self.sandwich_needs)
+        B = sum_score_products(self.problem, collect_sample_derivatives(self.problem, self.sensitivities))
+        inverse = inverse_on(self.free_basis, self.hessian)
+        # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1
+        return np.asarray(self.samples / self.freedom * (inverse @ B @ inverse))
+
     @property
     def sandwich_needs(self) -> str:
         """What ``covariance_from("sandwich")`` needs and this estimate lacks, as a sentence; empty if there is one."""
         if self.problem is None:
-            return super().sandwich_needs
+            return (
+                "The sandwich covariance needs the gradient of each sample: fit the problem again, or load the "
+                "estimate with its problem."
+            )
         if self.sigma_known is None or self.constraints or not self.problem.has_plain_samples:
             return (
                 "The sandwich covariance needs a cost of Measurements alone, without guards, terminal constraints, "
@@ -235,11 +286,6 @@ class Estimate(Fit, Tabular, Displayed):
                 f"{self.free_basis.shape[1]}. Use hessian='exact'."
             )
         return ""
-
-    def _sum_score_products(self) -> FloatArray:
-        if self.problem is None:
-            return super()._sum_score_products()
-        return sum_score_products(self.problem, collect_sample_derivatives(self.problem, self.sensitivities))
 
     def has_room_for_sensitivities(self) -> bool:
         """Return whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.

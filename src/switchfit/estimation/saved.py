@@ -288,15 +288,13 @@ def load_saved(path: Path) -> SavedFit:
 
 def _list_dates(fit: Fit) -> dict[str, Any]:
     """Return the transition times that are dates by their names, for readers of the file; {} where none is."""
-    if all(trajectory.origin is None for trajectory in fit.trajectories):
-        return {}
     dates = {}
     for transition in fit.transitions:
         origin = fit.trajectories[transition.experiment].origin
         date = None if origin is None else origin.find_date(transition.time, transition.unit)
         if date is not None:
             dates[transition.name] = date.isoformat()
-    return {"transition_dates": dates}
+    return {"transition_dates": dates} if dates else {}
 
 
 def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:

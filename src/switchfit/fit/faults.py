@@ -10,14 +10,15 @@ then the line search fails at a jump, and `switchfit.fit.result` says so.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.rows import stages
 from switchfit.engine.protocol import Matrix, Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
@@ -26,13 +27,8 @@ from switchfit.problem.inspection import find_comparisons, find_undefined
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError, Issue
 
-
-class _Visit(NamedTuple):
-    """A function, its role, and arguments with which it is called: times, states and inputs of N points each."""
-
-    role: str
-    function: Function
-    arguments: Sequence[FloatArray]
+_Visit = tuple[str, Function, Sequence[FloatArray]]
+"""A function's role, the function, and arguments with which it is called: times, states and inputs of N points each."""
 
 
 def explain_nonfinite(evaluator: Evaluator, theta: FloatArray) -> Issue | None:
@@ -52,13 +48,14 @@ def explain_nonfinite(evaluator: Evaluator, theta: FloatArray) -> Issue | None:
         simulations = evaluator.simulate(theta)
     for e, (run, simulation) in enumerate(zip(runs, simulations, strict=True)):
         model = Model(evaluator.structures[e], evaluator.arguments[e])
-        parameters = model.parameters(problem.vectors(theta, e)[1])  # type: ignore[arg-type]  # of NumPy
-        for visit in _list_visits(model, parameters, simulation):
-            found = find_undefined(visit.function, visit.arguments, parameters)
+        p: Any = problem.vectors(theta, e)[1]
+        parameters = model.parameters(p)
+        for role, function, arguments in _list_visits(model, p, simulation):
+            found = find_undefined(function, arguments, parameters)
             if found is not None:
-                point = _describe_point([argument[found.point] for argument in visit.arguments])
+                point = _describe_point([argument[found.point] for argument in arguments])
                 figures = point | {"order": float(found.order), "valued": float(found.valued)}
-                return Issue("undefined", (visit.role, found.operation, found.line, run), figures)
+                return Issue("undefined", (role, found.operation, found.line, run), figures)
     return None
 
 
@@ -69,18 +66,18 @@ def _describe_point(given: list[Any]) -> dict[str, float | tuple[float, ...]]:
     return figures | ({"x": tuple(given[timed].tolist())} if len(given) > timed else {})
 
 
-def _list_visits(model: Model, parameters: Mapping[str, Any], simulation: Simulation) -> Iterator[_Visit]:
+def _list_visits(model: Model, p: Any, simulation: Simulation) -> Iterator[_Visit]:
     """Yield the functions that J calls, with their arguments; samples whose delay is estimated are left out.
 
     All modes get as many points, so that a check is compiled once: rows of other modes are replaced by one of their
     own.
     """
     structure, roles = model.structure, model.structure.roles
-    names = {id(function): role for role, function in reversed(roles.items())}
+    names = {function: role for role, function in reversed(roles.items())}
 
     def visit(function: Function | None, *arguments: Any) -> Iterator[_Visit]:
         if function is not None:
-            yield _Visit(names[id(function)], function, arguments)
+            yield names[function], function, arguments
 
     yield from visit(structure.initial_state)
     rows = simulation.segments
@@ -88,7 +85,7 @@ def _list_visits(model: Model, parameters: Mapping[str, Any], simulation: Simula
     modes = np.array(structure.mode_of_segment)[segment]
     for mode in dict.fromkeys(modes.tolist()):
         own = np.where(modes == mode, np.arange(len(modes)), np.argmax(modes == mode))
-        stages = _list_stages(model, parameters, simulation, mode, own, own - segment[own])
+        stages = _list_stages(model, p, simulation, mode, own, own - segment[own])
         yield from visit(structure.modes[mode], *stages)
     for k, row in enumerate(own.stop - 1 for own in rows[:-1]):
         for functions in (structure.guards, structure.transition_costs, structure.reset_maps):
@@ -105,25 +102,19 @@ def _list_visits(model: Model, parameters: Mapping[str, Any], simulation: Simula
         yield from visit(function, states[-1:])
 
 
-def _list_stages(
-    model: Model, parameters: Mapping[str, Any], simulation: Simulation, mode: int, rows: Any, cells: Any
-) -> list[FloatArray]:
+def _list_stages(model: Model, p: Any, simulation: Simulation, mode: int, rows: Any, cells: Any) -> list[FloatArray]:
     """Return times, states and inputs at which some rows, in some cells, evaluate their mode, in the order of time.
 
-    Those of implicit steps are taken to be the ends of the row.
+    Those of implicit steps are taken to be the start and the end of the row.
     """
-    tableau, function = model.tableaus[mode], model.structure.modes[mode]
+    tableau = model.tableaus[mode]
 
     def evaluate(start: Any, end: Any, before: Any, after: Any, origin: Any, coefficients: Any) -> list[Any]:
-        points: list[tuple[Any, ...]] = []
-        slopes: list[Any] = []
-        for c, a in zip(tableau.c.tolist(), tableau.a.tolist(), strict=True):
-            t = start + c * (end - start)
-            x = before + (end - start) * sum(a_k * slope for a_k, slope in zip(a, slopes, strict=False))
-            if tableau.coupled:
-                t, x = (start, before) if not points else (end, after)
-            points.append((t, x, *model.inputs(t, Piece(origin, coefficients))))
-            slopes.append(function(t, x, parameters, *points[-1][2:]))
+        piece, times, states = Piece(origin, coefficients), [start, end], [before, after]
+        if not tableau.coupled:
+            field = model.field(mode, piece)
+            times, states, _ = stages(tableau, lambda t, x: field(t, x, p), start, end, before)
+        points = [(t, x, *model.inputs(t, piece)) for t, x in zip(times, states, strict=True)]
         return [jnp.stack(each) for each in zip(*points, strict=True)]
 
     given = (simulation.start, simulation.end, simulation.before, simulation.after)

@@ -6,10 +6,10 @@ How a fit ended, as data from which the report writes its message.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.inspection import find_comparisons, find_unread
 from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import ActiveConstraint, Constraint
-from switchfit.problem.validation import as_choice, as_level
+from switchfit.problem.validation import as_level
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Printed
@@ -173,29 +173,15 @@ def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ..
     return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
 
-def describe_switch(problem: Problem, i: int) -> Issue | None:
-    """Return that a function compares with an unknown, and where; None if no function does.
-
-    Parameters
-    ----------
-    problem : Problem
-    i : int
-        Index of the unknown in theta.
-    """
-    comparison = find_comparisons(problem).get(i)
-    return None if comparison is None else Issue("switch", (problem.unknowns.names[i], comparison))
-
-
 def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:
     """Return why the line search failed, with the names of the unknowns; of a fit that has converged a "switch" alone.
 
     A jump of J is a switch if a function compares with the unknown: where, is the second subject of the issue.
     """
-    names = problem.unknowns.names
-    for i, value in found.places if found.kind == "jump" else ():
-        switch = describe_switch(problem, i)
-        if switch is not None:
-            return replace(switch, figures={**found.figures, "at": value})
+    names, comparisons = problem.unknowns.names, find_comparisons(problem) if found.kind == "jump" else {}
+    for i, value in found.places:
+        if i in comparisons:
+            return Issue("switch", (names[i], comparisons[i]), {**found.figures, "at": value})
     if result.status.successful:
         return None
     figures: dict[str, float | tuple[float, ...]] = {**found.figures}
@@ -547,34 +533,20 @@ class Fit(Termination):
         return self.covariance_from("exact")
 
     def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance of theta from the exact Hessian, the Gauss-Newton matrix or both sides of it: (d, d).
+        """Return the covariance of theta from one of its matrices: (d, d); for others see `Estimate.covariance_from`.
 
         Parameters
         ----------
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            "exact", the observed information, is used by `covariance` and everything else here. The Gauss-Newton
-            matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
-            residuals, and treats the model as linear. "sandwich" is ``n / (n - d) H^-1 B H^-1`` with the exact Hessian
-            H and ``B = sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: with a robust loss it holds
-            for independent noise of any distribution, whether sigma is right or not.
+        hessian : {"exact", "gauss-newton"}
 
         Raises
         ------
         ValueError
-            For another kind, or if the Gauss-Newton matrix is unknown: the cost does not consist of Measurements
-            alone, or the estimate was loaded without its problem from a file that lacks the matrix. For "sandwich"
-            without the problem, with priors, constraints, or a sigma or delay that is a parameter, and with no more
-            values than free unknowns.
-
-        References
-        ----------
-        P. J. Huber, Robust Statistics, Wiley 1981, section 6.3 (covariance of M-estimates); H. White, Maximum
-        likelihood estimation of misspecified models, Econometrica 50 (1982) 1-25, theorem 3.2; J. G. MacKinnon,
-        H. White, J. Econometrics 29 (1985) 305-325 (the factor n / (n - d)).
+            If the Gauss-Newton matrix is unknown.
 
         See Also
         --------
-        Estimate.covariance
+        Estimate.covariance_from
 
         Examples
         --------
@@ -582,16 +554,9 @@ class Fit(Termination):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> fit.covariance_from("gauss-newton").shape
-        (2, 2)
+        >>> bool((fit.covariance_from("exact") == fit.covariance).all())
+        True
         """
-        hessian = as_choice(hessian, "hessian", get_args(CovarianceKind))
-        if hessian == "sandwich":
-            if self.sandwich_needs:
-                raise ValueError(self.sandwich_needs)
-            B, inverse = self._sum_score_products(), inverse_on(self.free_basis, self.hessian)
-            # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1
-            return np.asarray(self.samples / self.freedom * (inverse @ B @ inverse))
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
         if matrix is None:
             raise ValueError(
@@ -600,18 +565,6 @@ class Fit(Termination):
             )
         scale = self.residual_variance if self.sigma_known is False else 1.0
         return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
-
-    @property
-    def sandwich_needs(self) -> str:
-        """What ``covariance_from("sandwich")`` needs and this fit lacks, as a sentence; empty if there is one."""
-        return (
-            "The sandwich covariance needs the gradient of each sample: fit the problem again, or load the estimate "
-            "with its problem."
-        )
-
-    def _sum_score_products(self) -> FloatArray:
-        """Return the sum over samples of the outer products of their gradients: (d, d). An `Estimate` has it."""
-        raise NotImplementedError
 
     @property
     def standard_errors(self) -> FloatArray:

@@ -84,25 +84,29 @@ def _list_idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[n
 
 
 def _list_coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
-    """Yield the first and last of two or more transitions that coincide strictly inside the horizon."""
+    """Yield the first and last of two or more transitions that coincide strictly inside the horizon.
+
+    A free tf counts as a transition at the end.
+    """
     experiment, times = problem.experiments[e], _get_times(problem, theta, e)
-    if not np.any(times[1:] - times[:-1] <= _estimate_rounding(experiment)):  # the usual case: tested at every step
+    rounding = _estimate_rounding(experiment)
+    lasting = np.flatnonzero(times[1:] - times[:-1] > rounding).tolist()
+    if len(lasting) >= len(times) - 1:  # the usual case: tested at every step
         return
-    short, room = _find_collapsed(problem, theta, e)
-    first = 0
-    for i in range(1, len(times) + 1):
-        if i < len(times) and short[i]:
-            continue
-        if i - first > 1 and not np.any(room[[first, i - 1]]):
-            yield first, i - 1
-        first = i
+    end = experiment.ends_of_modes(times)[-1]
+    for first, last in zip([0, *(i + 1 for i in lasting)], [*lasting, len(times) - 1], strict=True):
+        if first < last and times[first] - experiment.t0 > rounding and end - times[last] > rounding:
+            yield first, last
 
 
 def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
     """Return theta with transition times moved so that every collapsed mode lasts a little, if there is room."""
     opened = theta.copy()
     for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        times, short = _get_times(problem, theta, e), _find_collapsed(problem, theta, e)[0]
+        times = _get_times(problem, theta, e)
+        lengths = np.diff(experiment.ends_of_modes(times))
+        # A free tf is the transition to a mode that lasts.
+        short = np.append(lengths, [np.inf] * experiment.has_free_tf) <= _estimate_rounding(experiment)
         if not short.any():
             continue
         gap = OPENED * experiment.initial_length * short
@@ -113,19 +117,6 @@ def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
             knots[i] = min(knots[i], knots[i + 1] - gap[i])
         opened[where[where >= 0]] = knots[1:-1][where >= 0]
     return opened
-
-
-def _find_collapsed(problem: Problem, theta: FloatArray, e: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which modes of experiment e have no duration (N + 1,), and which transitions are at an end of it (N,).
-
-    A free tf counts as a transition at the end, to a mode that lasts.
-    """
-    experiment = problem.experiments[e]
-    times, rounding = _get_times(problem, theta, e), _estimate_rounding(experiment)
-    knots = experiment.ends_of_modes(times)
-    at_end = (times - experiment.t0 <= rounding) | (knots[-1] - times <= rounding)
-    short = np.diff(knots) <= rounding
-    return np.append(short, [False] * (len(times) + 1 - len(short))), at_end
 
 
 def _get_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, runs_of
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, replace_samples
 from switchfit.problem.dates import Origin, read_date_text
 from switchfit.problem.experiment import count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
@@ -325,24 +325,14 @@ def replace_values(problem: Problem, values: Mapping[tuple[int, int], FloatArray
     """
     data = [list(run.data) for run in problem.experiments]
     for (e, k), own in values.items():
-        data[e][k] = _replace_values(data[e][k], own)
+        item = data[e][k]
+        if isinstance(item, Measurements):
+            data[e][k] = replace(item, values=np.where(np.isnan(item.values), np.nan, own))
+        else:
+            times, measured = item.samples
+            data[e][k] = replace_samples(item, times, np.where(np.isnan(measured), np.nan, own))
     runs = [replace(run, data=items) for run, items in zip(problem.experiments, data, strict=True)]
     return replace(problem, experiments=runs)
-
-
-def _replace_values(item: Any, values: FloatArray) -> Any:
-    """Return the same kind of data with other values."""
-    if isinstance(item, Measurements):
-        return replace(item, values=np.where(np.isnan(item.values), np.nan, values))
-    times, measured = item.samples
-    return ReferenceSignal.from_samples(
-        times,
-        np.where(np.isnan(measured), np.nan, values),
-        observe=item.observe,
-        lowpass_hz=item.lowpass_hz,
-        weights=item.weights,
-        names=item.names,
-    )
 
 
 def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from jax import lax
 from jax._src import source_info_util
 
 from switchfit.problem.functions import Function, describe_outputs, use_float64
-from switchfit.problem.jaxprs import find_line, find_public_name
+from switchfit.problem.jaxprs import Walk, evaluate, find_line, list_jaxprs
 
 Array = Any
 Sides = tuple[int, ...]
@@ -49,8 +49,10 @@ MOST_SLIDING = 2
 """Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
 
 
-class _Walk:
+class _Walk(Walk):
     """Evaluates a jaxpr with given sides of its corners, and lists their functions g.
+
+    It follows pairs: a value, and whether that depends on the state.
 
     Attributes
     ----------
@@ -63,64 +65,48 @@ class _Walk:
         self.values: list[Array] = []
         self.lines: list[str] = []
 
-    def run(
-        self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], moving: Sequence[bool], call: Any = None
-    ) -> Any:
-        """Return the results of a jaxpr, and whether each of them depends on the state, as `moving` says of `given`.
+    def constant(self, value: Any) -> tuple[Any, bool]:
+        """Return a constant as an array of NumPy, unless it is a random key."""
+        is_key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
+        return value if is_key else np.asarray(value), False
 
-        Its operations come from the line of a `call` of a function of JAX; without one, each has its own line.
-        """
-        known: dict[Any, tuple[Any, bool]] = {
-            v: (_read(c), False) for v, c in zip(jaxpr.constvars, consts, strict=True)
-        }
-        known |= {v: (a, m) for v, a, m in zip(jaxpr.invars, given, moving, strict=True)}
-
-        def read(atom: Any) -> tuple[Any, bool]:
-            return (np.asarray(atom.val), False) if hasattr(atom, "val") else known[atom]
-
-        for equation in jaxpr.eqns:
-            values, moves = zip(*map(read, equation.invars), strict=True) if equation.invars else ((), ())
-            here = call or equation
-            found, depend = self._apply(equation, list(values), list(moves), here)
-            found = [np.asarray(value) if isinstance(value, np.generic) else value for value in found]
-            known |= {v: pair for v, *pair in zip(equation.outvars, found, depend, strict=True)}
-        results = [read(atom) for atom in jaxpr.outvars]
-        return [value for value, _ in results], [moves for _, moves in results]
-
-    def _apply(self, equation: Any, values: list[Any], moves: list[bool], origin: Any) -> tuple[list[Any], list[bool]]:
+    def apply(self, equation: Any, given: list[tuple[Any, bool]], origin: Any) -> list[tuple[Any, bool]]:
         name, params = equation.primitive.name, equation.params
-        depends = [any(moves)] * len(equation.outvars)
+        values, depends = [value for value, _ in given], [moves for _, moves in given]
         # A NumPy array is known once the sides are: whatever these are, there is no corner.
-        is_decided = any(m and isinstance(value, np.ndarray) for m, value in zip(moves, values, strict=True))
-        moves = [m and not isinstance(value, np.ndarray) for m, value in zip(moves, values, strict=True)]
-        if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
-            return [self._pass_corner(name, values, moves, equation.outvars[0].aval.shape, origin)], depends
-        is_search = params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1
-        # A table that is looked up by the state is smooth between its knots: each knot is a corner.
-        if is_search and len(values[0]) <= MOST_KNOTS:
-            return [self._search(values[0], values[1], origin).astype(equation.outvars[0].aval.dtype)], depends
-        if all(isinstance(value, np.ndarray) for value in values) and values:  # also the sides of corners
-            with jax.ensure_compile_time_eval():
-                made = _bind(equation, values, origin)
-            made = made if equation.primitive.multiple_results else [made]
-            return [np.asarray(value) for value in made], depends
-        # The condition follows from the sides: one of the cases, entry by entry.
-        if name == "select_n" and isinstance(values[0], np.ndarray):
-            return [_choose(values[0], *values[1:])], depends
-        if name == "cond" and isinstance(values[0], np.ndarray):
+        moves = [m and not isinstance(value, np.ndarray) for value, m in given]
+        moving = list(zip(values, moves, strict=True))
+        made = self._evaluate(equation, values, moves, origin)
+        if made is None and name == "cond" and isinstance(values[0], np.ndarray):
             branch = params["branches"][int(np.clip(values[0], 0, len(params["branches"]) - 1))]
-            return self.run(branch.jaxpr, branch.consts, values[1:], moves[1:])
-        inner = params.get("jaxpr", params.get("call_jaxpr")) if name not in ("scan", "while") else None
+            return self.run(branch.jaxpr, branch.consts, moving[1:])
+        is_call = made is None and name not in ("scan", "while")
+        inner = params.get("jaxpr", params.get("call_jaxpr")) if is_call else None
         # Functions inside are walked through where they have corners or are decided by one; else they are bound as they
         # are.
-        if inner is not None and (is_decided or (any(moves) and _has_corners(inner))):
-            jaxpr = getattr(inner, "jaxpr", inner)
-            call = origin if find_public_name(jaxpr) or origin is not equation else None
-            return self.run(jaxpr, getattr(inner, "consts", ()), values, moves, call)
-        made = _bind(equation, values, origin)
-        return (list(made) if equation.primitive.multiple_results else [made]), depends
+        if inner is not None and (moves != depends or (any(moves) and _has_corners(inner))):
+            return self.enter(equation, inner, moving, origin)
+        made = _bind(equation, values, origin) if made is None else made
+        return [(np.asarray(value) if isinstance(value, np.generic) else value, any(depends)) for value in made]
 
-    def _pass_corner(self, name: str, values: list[Any], moves: list[bool], shape: tuple[int, ...], origin: Any) -> Any:
+    def _evaluate(self, equation: Any, values: list[Any], moves: list[bool], origin: Any) -> list[Any] | None:
+        """Return the results of an operation that the sides decide; None for any other."""
+        name = equation.primitive.name
+        if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
+            return [self._pass_corner(name, values, equation.outvars[0].aval.shape, origin)]
+        is_search = equation.params.get("name") == "searchsorted" and moves[-1] and not moves[0]
+        # A table that is looked up by the state is smooth between its knots: each knot is a corner.
+        if is_search and np.ndim(values[0]) == 1 and len(values[0]) <= MOST_KNOTS:
+            return [self._search(values[0], values[1], origin).astype(equation.outvars[0].aval.dtype)]
+        if values and all(isinstance(value, np.ndarray) for value in values):  # also the sides of corners
+            with jax.ensure_compile_time_eval():
+                return [np.asarray(value) for value in _bind(equation, values, origin)]
+        # The condition follows from the sides: one of the cases, entry by entry.
+        if name == "select_n" and isinstance(values[0], np.ndarray):
+            return [_choose(values[0], *values[1:])]
+        return None
+
+    def _pass_corner(self, name: str, values: list[Any], shape: tuple[int, ...], origin: Any) -> Any:
         """Return the result of an operation on the sides given."""
         a, *others = [_broadcast(value, shape) for value in values]
         if name == "clamp":  # of the lowest value, the state, and the highest
@@ -165,25 +151,16 @@ def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
     return (np if isinstance(value, np.ndarray) else jnp).broadcast_to(value, shape)
 
 
-def _read(const: Any) -> Any:
-    """Return a constant as an array of NumPy, if it is one of numbers."""
-    is_number = isinstance(const, jax.Array) and not jax.dtypes.issubdtype(const.dtype, jax.dtypes.extended)
-    return np.asarray(const) if is_number else const
-
-
-def _bind(equation: Any, values: Sequence[Any], origin: Any) -> Any:
+def _bind(equation: Any, values: Sequence[Any], origin: Any) -> list[Any]:
     """Evaluate an operation as JAX does, with the line of the user's code from which it comes."""
     with source_info_util.user_context(origin.source_info.traceback):
-        return equation.primitive.bind(*values, **equation.primitive.get_bind_params(equation.params))
+        return evaluate(equation, values)
 
 
 def _has_corners(jaxpr: Any) -> bool:
     """Return whether a corner may be in a jaxpr, or in one inside it."""
-    for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
-        inner = [value for value in equation.params.values() if hasattr(value, "eqns")]
-        if equation.primitive.name in CORNERS or any(map(_has_corners, inner)):
-            return True
-    return False
+    every = list_jaxprs(getattr(jaxpr, "jaxpr", jaxpr))
+    return any(equation.primitive.name in CORNERS for each in every for equation in each.eqns)
 
 
 class End(NamedTuple):
@@ -294,10 +271,10 @@ class Corners:
 
     def _run(self, sides: Sequence[int] | None, given: Sequence[Any]) -> tuple[_Walk, Any]:
         walk, function = _Walk(sides), self.function
-        moving = [k == 1 for k in range(len(given))]  # the state comes after t
         with use_float64():
-            results, _ = walk.run(function.jaxpr, function.consts, given, moving)
-        return walk, jnp.asarray(results[0])
+            pairs = [(value, k == 1) for k, value in enumerate(given)]  # the state comes after t
+            results = walk.run(function.jaxpr, function.consts, pairs)
+        return walk, jnp.asarray(results[0][0])
 
     def _evaluate(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return f (n,), and g of each corner."""

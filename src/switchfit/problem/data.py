@@ -654,12 +654,23 @@ def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any
         return item
     what = what or f"times of {type(item).__name__}"
     if isinstance(item, ReferenceSignal) and item.samples is not None:
-        times = origin.to_numbers(item.samples[0], time_unit, what)
-        own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
-        return ReferenceSignal.from_samples(times, item.samples[1], **own)
+        return replace_samples(item, origin.to_numbers(item.samples[0], time_unit, what), item.samples[1])
     own = {each.name: getattr(item, each.name) for each in fields(item)}
     dated = {name: count_from(value, origin, time_unit, what) for name, value in own.items() if has_dates(value)}
     return replace(item, **dated)
+
+
+def replace_samples(item: ReferenceSignal, times: FloatArray, values: FloatArray) -> ReferenceSignal:
+    """Return a reference signal that is made again from other samples.
+
+    Parameters
+    ----------
+    item : ReferenceSignal
+    times : (K,)
+    values : (K, q)
+    """
+    own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
+    return ReferenceSignal.from_samples(times, values, **own)
 
 
 def _check_samples(

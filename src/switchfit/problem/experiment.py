@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -242,11 +243,6 @@ class Experiment:
             why = f" {_say_left_out(missing)}, and taken from the data: give it." if missing else ""
             raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.{why}")
         set_fields(self, taken_from_data=missing)
-        by_scale = isinstance(tf, Parameter) and tf.scale == "log" and tf.lower == 0
-        if isinstance(tf, Parameter) and np.isfinite(tf.lower) and tf.lower <= t0 and not by_scale:
-            raise ValueError(
-                f"The lower bound of tf must lie after t0 = {t0}; got {tf.lower}. Leave it out, or raise it."
-            )
         modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
@@ -356,9 +352,15 @@ class Experiment:
         return np.searchsorted(self.initial_times, self.jump_times, "left")
 
     @cached_property
+    def is_jump(self) -> NDArray[np.bool_]:
+        """Which of the N transitions that programs take, `times` and the jumps in between, are jumps: (N,)."""
+        both = np.append(self.jump_times, self.initial_times)
+        return np.argsort(both, kind="stable") < len(self.jump_times)  # at one time, a jump comes first
+
+    @cached_property
     def initial_times_with_jumps(self) -> FloatArray:
         """Guess of all of `times`, with the times of the jumps in between: what programs take, (N,)."""
-        return np.asarray(insert_jumps(self, self.initial_times, self.jump_times))
+        return np.sort(np.append(self.initial_times, self.jump_times))
 
     @property
     def initial_times(self) -> FloatArray:
@@ -492,21 +494,18 @@ def _propose_times(t0: float, tf: float, count: int, jumps: Sequence[float]) -> 
     return proposed
 
 
-def insert_jumps(experiment: Experiment, of_times: Any, of_jumps: Any) -> Any:
-    """Return an array or a list with an entry for each of an experiment's `times`, with those of the jumps in between.
+def insert_jumps(experiment: Experiment, of_times: Iterable[Any], of_jumps: Iterable[Any]) -> list[Any]:
+    """Return an entry for each of an experiment's `times`, with those of the jumps in between.
 
     Parameters
     ----------
     experiment : Experiment
-    of_times : (N,) array, or a sequence
-    of_jumps : a number, or one entry for each jump
+    of_times, of_jumps : iterable
     """
     if not len(experiment.jump_times):
-        return of_times
-    is_array = isinstance(of_times, np.ndarray)
-    entries = of_times if is_array else np.array([*of_times, None], dtype=object)[:-1]
-    both = np.insert(entries, experiment.passed_by_jumps, of_jumps)
-    return both if is_array else both.tolist()
+        return list(of_times)
+    times, jumps = iter(of_times), iter(of_jumps)
+    return [next(jumps if is_jump else times) for is_jump in experiment.is_jump.tolist()]
 
 
 def drop_jumps(experiment: Experiment, of_all: Iterable[Any]) -> list[Any]:
@@ -517,8 +516,7 @@ def drop_jumps(experiment: Experiment, of_all: Iterable[Any]) -> list[Any]:
     experiment : Experiment
     of_all : iterable
     """
-    jumps = set((experiment.passed_by_jumps + np.arange(len(experiment.jump_times))).tolist())
-    return [entry for i, entry in enumerate(of_all) if i not in jumps]
+    return list(compress(of_all, (~experiment.is_jump).tolist()))
 
 
 def show_time(experiment: Experiment, time: float) -> str:

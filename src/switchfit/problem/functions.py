@@ -24,7 +24,6 @@ import hashlib
 import itertools
 import threading
 import types
-import weakref
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
@@ -256,7 +255,6 @@ def _as_float64(value: Any) -> Any:
     return jnp.asarray(value, jnp.float64)
 
 
-_known: weakref.WeakValueDictionary[Any, Function] = weakref.WeakValueDictionary()
 _traces: dict[Any, Function] = {}
 _lock = threading.Lock()
 
@@ -324,9 +322,8 @@ def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozense
             if not hidden:
                 raise
             traced = _trace(call, parameters)
-    with _lock:
-        traced = _known.setdefault(traced._key, traced)
-        if key is not None:
+    if key is not None:
+        with _lock:
             _traces[key] = traced
             if len(_traces) > MOST_TRACES:
                 del _traces[next(iter(_traces))]

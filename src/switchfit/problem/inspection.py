@@ -27,7 +27,7 @@ import numpy as np
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
-from switchfit.problem.jaxprs import Walk, find_line, find_public_name
+from switchfit.problem.jaxprs import Walk, evaluate, find_line, find_public_name
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure, trace_structure
 
@@ -354,7 +354,7 @@ class _Checking(Walk):
         operands, which = [value for value, _ in given], [moves for _, moves in given]
         if name in ("jit", "pjit"):
             return self.enter(equation, equation.params["jaxpr"], given, origin)
-        results = _evaluate(equation, operands)
+        results = evaluate(equation, operands)
         if name == "cond":
             outside = self._runs
             for k, branch in enumerate(equation.params["branches"]):
@@ -368,18 +368,12 @@ class _Checking(Walk):
         return [(result, any(which)) for result in results]
 
 
-def _evaluate(equation: Any, operands: Sequence[Any]) -> list[Any]:
-    """Return the results of an operation, by its own rule for derivatives if it has one."""
-    made = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
-    return list(made) if equation.primitive.multiple_results else [made]
-
-
 def _check_orders(equation: Any, operands: list[Any], which: list[bool], results: list[Any]) -> Any:
     """Return whether the value and the first two derivatives of an operation in some operands are finite: (3,)."""
     floats = [k for k, moves in enumerate(which) if moves and _is_float(operands[k])]
 
     def call(*moved: Any) -> list[Any]:
-        made = _evaluate(equation, [moved[floats.index(k)] if k in floats else a for k, a in enumerate(operands)])
+        made = evaluate(equation, [moved[floats.index(k)] if k in floats else a for k, a in enumerate(operands)])
         return list(filter(_is_float, made))
 
     value = _are_finite(results)

@@ -61,6 +61,18 @@ def list_jaxprs(jaxpr: Any) -> Iterator[Any]:
             yield from list_jaxprs(getattr(inner, "jaxpr", inner))
 
 
+def evaluate(equation: Any, operands: Sequence[Any]) -> list[Any]:
+    """Return the results of an operation, by its own rule for derivatives if it has one.
+
+    Parameters
+    ----------
+    equation : operation of a jaxpr
+    operands : sequence
+    """
+    made = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
+    return list(made) if equation.primitive.multiple_results else [made]
+
+
 class Walk:
     """Follows values of any kind through a jaxpr, operation by operation: `apply` says what one makes of them."""
 
@@ -233,8 +245,7 @@ class _Constants(Walk):
         if not self._has_short or equation.effects:
             return [None] * len(equation.outvars)
         with jax.ensure_compile_time_eval():
-            made = equation.primitive.bind(*given, **equation.params)
-        return made if equation.primitive.multiple_results else [made]
+            return evaluate(equation, given)
 
     def _check_precision(self, equation: Any, given: list[Any], results: Sequence[Any], where: str) -> None:
         """Raise ValueError if a known number of an operation lost digits, or an unknown one is cast."""

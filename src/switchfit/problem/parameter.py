@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.dates import Dates, as_dates, is_dated, list_dates
+from switchfit.problem.dates import Dates, as_dates, is_dated
 from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, require_deviation, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
@@ -382,5 +382,6 @@ def as_parameter(
 
 def refuse_dates(parameter: Parameter, what: str) -> None:
     """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
-    for dates in list_dates(parameter):
-        raise ValueError(f"{what} must be a number; got the date {dates!r}. Only transition times and tf may be dates.")
+    date = parameter.value  # its bounds are dates if it is one
+    if isinstance(date, Dates):
+        raise ValueError(f"{what} must be a number; got the date {date!r}. Only transition times and tf may be dates.")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
+from itertools import repeat
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -476,9 +477,11 @@ class Problem:
 
         Jumps are among the N, as transitions at fixed times.
         """
-        times = [insert_jumps(run, own, -1) for run, own in zip(self.experiments, self.unknowns.times, strict=True)]
-        runs = enumerate(zip(times, self.structures, strict=True))
-        return tuple(np.concatenate([own, place_parameters(self, e, structure)]) for e, (own, structure) in runs)
+        runs = enumerate(zip(self.experiments, self.unknowns.times, self.structures, strict=True))
+        return tuple(
+            np.concatenate([insert_jumps(run, own, repeat(-1)), place_parameters(self, e, structure)]).astype(np.intp)
+            for e, (run, own, structure) in runs
+        )
 
     @cached_property
     def own_places(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
@@ -621,9 +624,8 @@ class Problem:
         if not np.isfinite(checked).all():
             raise ValueError(f"{what} must be finite; got {shorten(checked)}.")
         checked = checked.copy()
-        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            times = experiment.initial_times
-            times[where >= 0] = checked[where[where >= 0]]
+        for e, (experiment, where) in enumerate(zip(self.experiments, self.unknowns.times, strict=True)):
+            times = self._select_times(checked, e)
             knots = np.concatenate([[experiment.t0], times, [experiment.end]])
             shortest = (knots[1:] - knots[:-1]).min()
             if shortest < -ROUNDING * _clock(experiment):
@@ -667,12 +669,14 @@ class Problem:
         >>> problem.ends_of_modes(problem.initial_theta)
         [array([0., 2., 6.])]
         """
-        found = []
-        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            times = np.broadcast_to(experiment.initial_times, (*theta.shape[:-1], len(where))).copy()
-            times[..., where >= 0] = theta[..., where[where >= 0]]
-            found.append(experiment.ends_of_modes(times))
-        return found
+        return [run.ends_of_modes(self._select_times(theta, e)) for e, run in enumerate(self.experiments)]
+
+    def _select_times(self, theta: FloatArray, e: int) -> FloatArray:
+        """Return all times of experiment e, fixed ones and a free tf included, for theta (..., d): (..., N)."""
+        where = self.unknowns.times[e]
+        times = np.broadcast_to(self.experiments[e].initial_times, (*theta.shape[:-1], len(where))).copy()
+        times[..., where >= 0] = theta[..., where[where >= 0]]
+        return times
 
     def without_runs(self, *names: str) -> Problem:
         """Return the problem without some of its experiments, and without the parameters that these alone use.

@@ -314,11 +314,13 @@ def trace_structure(
     input_names = () if experiment.inputs is None else experiment.inputs.names
     in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
 
+    end = [None] if experiment.has_free_tf else []  # the transition to rest, which has no functions
+    own: list[Any] = [*pairwise(experiment.mode_sequence), *end]
+
     def at_transitions(
         given: AtTransitions, shape: Shape, what: str, form: str, at_jumps: Sequence[Function | None] = ()
     ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
         """Return the function of each transition and jump, None for one without, and those of all possible ones."""
-        own = list(pairwise(experiment.mode_sequence))
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
         found = insert_jumps(experiment, [traced.get(pair) for pair in own], at_jumps or [None] * len(jump_maps))
@@ -326,16 +328,13 @@ def trace_structure(
 
     modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
     own_modes = [names.index(mode) for mode in experiment.mode_sequence]
-    # After a jump the mode is that before it.
-    sequence = (
-        own_modes[0],
-        *insert_jumps(experiment, own_modes[1:], [own_modes[i] for i in experiment.passed_by_jumps]),
-    )
-    jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for jump in experiment.jump_maps]
-    end: tuple[None, ...] = ()
-    if experiment.has_free_tf:  # a free tf is the transition to one more mode, which has no other functions
+    if experiment.has_free_tf:  # a free tf is the transition to one more mode
         modes += (trace(stay_at_rest, in_mode, (n,), "the rest after tf", form, input_names),)
-        names, sequence, end = (*names, REST), (*sequence, len(names)), (None,)
+        own_modes.append(len(names))
+        names = (*names, REST)
+    after_jumps = (own_modes[i] for i in experiment.passed_by_jumps)  # the mode before it
+    sequence = (own_modes[0], *insert_jumps(experiment, own_modes[1:], after_jumps))
+    jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for jump in experiment.jump_maps]
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)", jump_maps)
@@ -346,7 +345,7 @@ def trace_structure(
         mode_names=names,
         modes=modes,
         mode_of_segment=sequence,
-        reset_maps=(*reset_maps, *end),
+        reset_maps=reset_maps,
         initial_state=x0,
         n=n,
         unknown_states=unknown,
@@ -355,17 +354,17 @@ def trace_structure(
         references=tuple((_trace_observe(trace, item, q, n), q) for item, q in references),
         measurements=tuple(Sensor.of(item, _trace_observe(trace, item, q, n)) for item, q in measurements),
         terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in items(TerminalCost)),
-        guards=(*guards, *end),
+        guards=guards,
         terminal_constraints=tuple(_trace_terminal_constraint(trace, item, n) for item in items(TerminalConstraint)),
         input_shape=inputs,
         implicit=(solver == "stiff",) * len(modes),
-        transitions=(len(reset_maps) if transitions is None else transitions) + len(end),
+        transitions=len(reset_maps) if transitions is None else transitions + len(end),
         reset_library=reset_library,
         guard_library=guard_library,
-        transition_costs=(*transition_costs, *end),
+        transition_costs=transition_costs,
         transition_cost_library=transition_cost_library,
         known=len(jump_maps),
-        jumps=tuple((experiment.passed_by_jumps + np.arange(len(jump_maps))).tolist()),
+        jumps=tuple(np.flatnonzero(experiment.is_jump).tolist()),
         has_free_tf=experiment.has_free_tf,
     )
     return replace(structure, parameters=_select_parameters(trace, structure))
