@@ -21,7 +21,7 @@ from switchfit.fit.result import Fit, Kink, Step, Termination, compute_scaled_sp
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.unknowns import ActiveConstraint
-from switchfit.report import sentences, verdict
+from switchfit.report import sentences
 from switchfit.report.formats import format_rounded
 from switchfit.report.plot import (
     choose_mode_colours,
@@ -580,18 +580,19 @@ def test_what_is_held_fixed_is_printed_as_a_number():
 # --- sentences --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("module", [sentences, verdict])
-def test_fields_of_sentences_are_words_or_figures(module):
+@pytest.mark.parametrize(
+    ("table", "words"), [(sentences._ISSUES, sentences._WORDS), (sentences._REASONS, sentences._REASON_WORDS)]
+)
+def test_fields_of_sentences_are_words_or_figures(table, words):
     """A field of another name would be written as nan."""
     library = Path(sf.__file__).parent
     sources = (path for path in library.rglob("*.py") if "report" not in path.parts)
     nodes = itertools.chain.from_iterable(ast.walk(ast.parse(path.read_text())) for path in sources)
     known = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    table = module._ISSUES if module is sentences else module._REASONS
     templates = [text for text in table.values() if isinstance(text, str)]
     fields = {field for text in templates for _, field, *_ in Formatter().parse(text) if field}
     assert len(fields) > 10
-    assert {field for field in fields if not field.isdigit()} <= module._WORDS.keys() | known
+    assert {field for field in fields if not field.isdigit()} <= words.keys() | known
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,15 @@ from switchfit.problem.validation import join_names
 from switchfit.report import style
 from switchfit.report.formats import (
     Clock,
+    Table,
     Timed,
     format_estimate,
     format_rounded,
     format_table,
     format_time,
     label_quantity,
-    name_columns,
+    label_time,
+    suffix_time,
     wrap_text,
 )
 from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state, plot_transitions
@@ -238,15 +240,19 @@ def write_search(search: ModeSearch) -> str:
 
 def _tabulate_segments(
     modes: Sequence[str], times: FloatArray, errors: FloatArray, ends: Sequence[str], run: Timed
-) -> Iterator[Sequence[str]]:
-    """Yield a header, and a row for each segment: mode, from, the standard error of that, and to."""
-    dated = None if run.origin is None else run
-    unit, spread_unit = (f" ({run.time_unit})", "") if dated is None else ("", f" {run.time_unit}")
-    known = [format_estimate(time, error, dated) for time, error in zip(times.tolist(), errors.tolist(), strict=True)]
+) -> Table:
+    """Return a row for each segment: mode, from, the standard error of that, and to."""
+    known = [format_estimate(time, error, run) for time, error in zip(times.tolist(), errors.tolist(), strict=True)]
     shown = [ends[0], *(time for time, _ in known), ends[1]]
+    spread_unit = "" if run.origin is None else f" {run.time_unit}"
     spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in known)]
-    yield "mode", f"from{unit}", "", f"to{unit}"
-    yield from zip(modes, shown[:-1], spreads, shown[1:], strict=True)
+    titles = ["mode", _title_time(run, "from"), "", _title_time(run, "to")]
+    return Table(list(zip(modes, shown[:-1], spreads, shown[1:], strict=True)), "<>>>", titles)
+
+
+def _title_time(run: Timed, name: str) -> str:
+    """Return the title of a column of times, with their unit unless they are dates."""
+    return name if run.origin is not None else label_time(run, name)
 
 
 def list_segments(search: ModeSearch) -> list[str]:
@@ -257,7 +263,7 @@ def list_segments(search: ModeSearch) -> list[str]:
         ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
         if len(best.sequences) > 1:
             lines.append(f"{search.run_names[e]}:")
-        lines += format_table(list(_tabulate_segments(sequence, times, errors[e], ends, run)), "<>>>")
+        lines += format_table(*_tabulate_segments(sequence, times, errors[e], ends, run))
     return lines
 
 
@@ -288,15 +294,15 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
     discounted = is_discounted(search)
     extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
-    header = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
-    rows = [header]
+    titles = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
+    rows: list[list[str]] = []
     for fit in search.fitted:
         cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
             cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
         cells += [f"{getattr(fit, name):.1f}" for name in likely]
         rows += _extend_row(cells, _list_lines(search, fit))
-    return format_table(rows, "<" + ">" * (len(header) - 2) + "<")
+    return format_table(rows, "<" + ">" * (len(titles) - 2) + "<", titles)
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
@@ -304,11 +310,12 @@ def list_alternatives(search: ModeSearch) -> list[str]:
     name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
     lowest = getattr(search.chosen[0], name)
     label = name_criterion(name) if name == "mbic" else name_decider(search)
-    rows = [["weight", f"{label} above the best", _title_sequences(search, "alternatives")]]
+    titles = ["weight", f"{label} above the best", _title_sequences(search, "alternatives")]
+    rows: list[list[str]] = []
     for fit in search.chosen[:LISTED]:
         rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
     more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
-    return ["", *format_table(rows, ">><"), *more]
+    return ["", *format_table(rows, ">><", titles), *more]
 
 
 def _title_sequences(search: ModeSearch, what: str) -> str:
@@ -467,14 +474,14 @@ def write_insertion(found: Insertion) -> str:
     lines = [] if pulses else ["No short pulse of any mode lowers J."]
     if pulses:
         best = pulses[0]
-        at = format_time(best.time, run) + ("" if run.origin is not None else f" {run.time_unit}")
+        at = format_time(best.time, run) + suffix_time(run)
         speed = f"{-best.rate:.4g} per {run.time_unit} of its length"
         lines += wrap_text(f"A short pulse of {best.mode} at {at} lowers J fastest: by {speed}.")
-        rows = [("mode", "time" if run.origin is not None else f"time ({run.time_unit})", "dJ / d length", "in")]
+        rows = []
         for pulse in pulses:
             interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
             rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
-        lines += ["", *format_table(rows, "<>><")]
+        lines += ["", *format_table(rows, "<>><", ["mode", _title_time(run, "time"), "dJ / d length", "in"])]
     undefined = [
         f"{mode} in {found.modes[m]}"
         for m in np.unique(found.active).tolist()
@@ -529,10 +536,10 @@ def write_log(log: OnlineLog) -> str:
     ----------
     log : OnlineLog
     """
-    run, unit = (None, unit_suffix(log.time_unit)) if log.origin is None else (log, "")
+    unit = suffix_time(log)
     now, end = log.now, format_time(log.now.time, log)
     error = now.time_errors[-1] if len(now.time_errors) else np.nan
-    since = format_estimate(now.since, float(error), run)[0]
+    since = format_estimate(now.since, float(error), log)[0]
     changes = format_count(len(now.transition_times), "change")
     first = f"{now.mode} since {since}{unit}, after {changes} of mode up to {end}{unit}."
     lines = wrap_text(f"{first} {now.status.value[0].upper()}{now.status.value[1:]}.")
@@ -550,8 +557,8 @@ def _list_modes(log: OnlineLog) -> list[str]:
     """Return a line for each of the last modes: from, the standard error of that, and to."""
     now = log.now
     ends = format_time(float(log.since[0]), log), "now"
-    header, *rows = _tabulate_segments(now.mode_sequence, now.transition_times, now.time_errors, ends, log)
-    return format_table([header, *rows[-LISTED_LAST:]], "<>>>")
+    table = _tabulate_segments(now.mode_sequence, now.transition_times, now.time_errors, ends, log)
+    return format_table(*table._replace(rows=table.rows[-LISTED_LAST:]))
 
 
 def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]]:
@@ -576,16 +583,15 @@ def _list_parameters(log: OnlineLog) -> list[str]:
 
 def _list_alarms(log: OnlineLog) -> list[str]:
     """Return a line for each of the last alarms: when it came, what it said then, and whether it was retracted."""
-    run, unit = (None, f" ({log.time_unit})") if log.origin is None else (log, "")
     rows = []
     for alarm in log.alarms[-LISTED_LAST:]:
-        began, spread = format_estimate(alarm.transition_time, alarm.standard_error, run)
+        began, spread = format_estimate(alarm.transition_time, alarm.standard_error, log)
         began = began if spread else format_time(alarm.transition_time, log)
         refuted = "retracted" if alarm in log.retracted else ""
         rows.append([format_time(alarm.time, log), alarm.mode, began, spread, f"{alarm.statistic:.1f}", refuted])
-    titles = name_columns([f"alarm at{unit}", "mode", f"since{unit}", " ", "statistic", "and then"], rows)
+    titles = [_title_time(log, "alarm at"), "mode", _title_time(log, "since"), "", "statistic", "and then"]
     more = [f"  {len(log.alarms) - LISTED_LAST} earlier ones in .alarms"] if len(log.alarms) > LISTED_LAST else []
-    return ["", *format_table([titles, *rows], "><>>><"), *more] if rows else ["", "  no alarm"]
+    return ["", *format_table(rows, "><>>><", titles), *more] if rows else ["", "  no alarm"]
 
 
 @draw_figure.register(OnlineLog)

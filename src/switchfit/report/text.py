@@ -10,11 +10,12 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit, Step, disagreement
-from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.fit.trajectory import Comparison
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.report.formats import (
     Table,
+    Timed,
     add_dates,
     describe_origin,
     format_rounded,
@@ -25,13 +26,11 @@ from switchfit.report.formats import (
     get_unit,
     list_dated,
     list_jumps,
-    name_columns,
     wrap_text,
 )
 from switchfit.report.frames import list_holds
-from switchfit.report.sentences import ALLOWED
+from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
-from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.certificate import WEAK, Certificate, Identifiability, analyse_solution
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel
@@ -281,12 +280,11 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
 def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
     """Return the table of the channels as lines; of more than `most`, those that are explained worst."""
     table, shares = tabulate_channels(fit)
-    header, *rows = table.rows
-    if not rows:
+    if not table.rows:
         return []
-    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(rows), most)].tolist())
-    lines = format_table([header, *(rows[k] for k in kept)], table.alignment)
-    more = len(rows) - len(kept)
+    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(table.rows), most)].tolist())
+    lines = format_table(*table._replace(rows=[table.rows[k] for k in kept]))
+    more = len(table.rows) - len(kept)
     return ["", *lines] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
 
 
@@ -315,7 +313,7 @@ def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
                 rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
                 shares.append(np.inf if np.isnan(share) else share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
-    return Table([name_columns(titles, rows), *rows], "<>><>>"), shares
+    return Table(rows, "<>><>>", titles), shares
 
 
 def _format_size(values: FloatArray, digits: int) -> str:
@@ -376,7 +374,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         errors_shown = (error, relative, plain if corrected else "") if known else ("", "", "")
         rows.append([name, value, *errors_shown, low, high, format_unit(fit.theta_units[i]), guess, note])
     titles = ["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]
-    table = Table([name_columns(titles, rows), *rows], "<><><>><><")
+    table = Table(rows, "<><><>><><", titles)
     if not known or corrected:
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent." if known else ""
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
@@ -386,7 +384,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     return table, f"Standard errors from {matrix}.{ROBUST + other if robust else ''}"
 
 
-def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> str:
+def format_end(end: float, ends: FloatArray, run: Timed | None) -> str:
     """Return an end of an interval to the third digit of its width, as a date if it is one; "" if it is unknown.
 
     Parameters
@@ -394,13 +392,13 @@ def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> s
     end : float
     ends : (2,)
         Both of them.
-    run : Trajectory, optional
-        Of the experiment with dates that this is a time of.
+    run : Timed or None
+        What this is a time of; None for what is no time.
     """
     width = ends[1] - ends[0]
     if not (np.isfinite(end) and np.isfinite(width) and width > 0):
         return ""
-    if run is not None:
+    if run is not None and run.origin is not None:
         return format_time(end, run, width / 4)
     return format_rounded(end, width / 10)[0]
 
@@ -442,7 +440,7 @@ def _is_sided(ends: FloatArray, symmetric: FloatArray, value: float) -> bool:
     return not (np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above))
 
 
-def _format_interval(ends: FloatArray, run: Trajectory | None) -> str:
+def _format_interval(ends: FloatArray, run: Timed | None) -> str:
     if run is None:
         return f"[{ends[0]:.4g}, {ends[1]:.4g}]"
     return f"[{format_end(ends[0], ends, run)}, {format_end(ends[1], ends, run)}]"
@@ -456,7 +454,7 @@ def _mark_unknown(fit: Fit, name: str) -> str:
 
 def _format_fixed(fit: Fit, most: int) -> list[str]:
     """Return the table of what was not estimated, as lines."""
-    rows, alignment = tabulate_fixed(fit)
+    rows, alignment, _ = tabulate_fixed(fit)
     return format_table(rows[:most], alignment) + ([f"  and {len(rows) - most} more"] if len(rows) > most else [])
 
 

@@ -7,16 +7,15 @@ from functools import partial
 
 import numpy as np
 
-from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.formats import (
     Table,
+    Timed,
     describe_origin,
     format_rounded,
     format_table,
     format_time,
-    format_unknown,
     label_time,
     list_dated,
     wrap_text,
@@ -96,7 +95,7 @@ def write_derivative_check(check: DerivativeCheck) -> str:
     ----------
     check : DerivativeCheck
     """
-    rows = [["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]]
+    rows, titles = [], ["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]
     for k, (h, remainders) in enumerate(zip(check.steps, check.remainders, strict=True)):
         orders = [""] * 3 if k == 0 else ["-" if np.isnan(order) else f"{order:.2f}" for order in check.orders[k - 1]]
         cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
@@ -104,7 +103,7 @@ def write_derivative_check(check: DerivativeCheck) -> str:
     lines = [
         "Taylor remainders of J along a random direction",
         "",
-        *format_table(rows, ">" * 7),
+        *format_table(rows, ">" * 7, titles),
         "",
         "Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:",
         f"  gradient {_format_gap(check.gradient_gap)}, with half the steps {_format_gap(check.gradient_gap_halved)}",
@@ -237,13 +236,13 @@ def tabulate_diagnostics(diagnostics: ResidualDiagnostics) -> Table:
     ----------
     diagnostics : ResidualDiagnostics
     """
-    rows = [["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]]
+    rows, titles = [], ["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]
     for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
         size = [f"{len(channel.values)}", f"{channel.rms:.3g}", f"{channel.mean:+.2f}"]
         correlation = [f"{channel.correlation:+.2f}", f"{channel.effective:.0f}"]
         tests = [_format_probability(channel.whiteness), _format_probability(channel.normality)]
         rows.append([label, *size, *correlation, *tests, f"{channel.outliers}"])
-    return Table(rows, "<" + ">" * 8)
+    return Table(rows, "<" + ">" * 8, titles)
 
 
 def _format_probability(value: float) -> str:
@@ -286,8 +285,8 @@ def write_profile(profile: Profile) -> str:
     return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
 
 
-def _find_run(profile: Profile) -> Trajectory | None:
-    """Return the trajectory of a profile of a time that is a date; None for any other."""
+def _find_run(profile: Profile) -> Timed | None:
+    """Return the run of a profile of a time that is a date; None for any other."""
     return list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
 
 
@@ -315,7 +314,7 @@ def list_profile_notes(profile: Profile) -> Iterator[str]:
     profile : Profile
     """
     run, (low, high) = _find_run(profile), profile.interval()
-    show, unit = partial(format_unknown, run=run), "" if run is not None else unit_suffix(profile.unit)
+    show, unit = partial(format_time, run=run), "" if run is not None else unit_suffix(profile.unit)
     limits, outermost = profile.trace.limits.values(), profile.values[[0, -1]]
     for side, end, limit, last in zip(("downward", "upward"), profile.ends, limits, outermost, strict=True):
         if end in _ENDS:

@@ -18,7 +18,8 @@ from switchfit.report.formats import (
     format_time,
     get_unit,
     label_quantity,
-    list_dated_unknowns,
+    list_dated,
+    suffix_time,
     wrap_text,
 )
 from switchfit.report.plot import plot_modes
@@ -116,7 +117,7 @@ def write_validation(found: Validation) -> str:
     errors, names = found.corrected_standard_errors, found.theta_names
     rows = {}
     columns = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
-    for (name, value, error, unit), run in zip(columns, list_dated_unknowns(found.problem), strict=True):
+    for (name, value, error, unit), run in zip(columns, list_dated(found.problem), strict=True):
         shown, spread = format_estimate(float(value), float(error), run)
         rows[name] = [name, shown, spread if spread != "held" else "", unit]
     refit = () if found.refit is None else found.refit.theta_names
@@ -134,10 +135,10 @@ def write_validation(found: Validation) -> str:
         chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
         lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
     if found.inputs:
-        tests = [["residuals of", "and input", "P(none)"]]
+        tests = []
         for test in found.inputs:
             tests.append([test.channel, test.input, "-" if np.isnan(test.probability) else f"{test.probability:.2g}"])
-        lines += ["", "Correlation with inputs", *format_table(tests, "<<>")]
+        lines += ["", "Correlation with inputs", *format_table(tests, "<<>", ["residuals of", "and input", "P(none)"])]
     return "\n".join(lines)
 
 
@@ -148,7 +149,7 @@ def tabulate_predicted(found: Validation) -> Table:
     ----------
     found : Validation
     """
-    rows = [["", "values", "fit (%)", "R²", "rms error", "lag 1", "P(white)"]]
+    rows, titles = [], ["", "values", "fit (%)", "R²", "rms error", "lag 1", "P(white)"]
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     single = len(found.comparisons) == 1
     for run, comparisons in zip(found.run_names, found.comparisons, strict=True):
@@ -162,7 +163,7 @@ def tabulate_predicted(found: Validation) -> Table:
                 shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
                 lag = "" if test is None else f"{test.correlation:+.2f}"
                 rows.append([label, f"{count}", *shares, f"{rmse[k]:.3g}", lag, white])
-    return Table(rows, "<" + ">" * 6)
+    return Table(rows, "<" + ">" * 6, titles)
 
 
 @draw_figure.register(Validation)
@@ -288,12 +289,12 @@ def tabulate_models(found: ModelComparison) -> Table:
     ----------
     found : ModelComparison
     """
-    rows = [["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]]
+    rows, titles = [], ["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]
     for k in _list_best_first(found):
         aicc = [f"{found.aicc[k]:.2f}", f"{found.delta_aicc[k]:.2f}", f"{found.weights[k]:.2g}"]
         bic = [f"{found.bic[k]:.2f}", f"{found.delta_bic[k]:.2f}"]
         rows.append([found.names[k], f"{found.unknown_counts[k]}", f"{found.log_likelihood[k]:.2f}", *aicc, *bic])
-    return Table(rows, "<" + ">" * 7)
+    return Table(rows, "<" + ">" * 7, titles)
 
 
 @draw_figure.register(ModelComparison)
@@ -365,21 +366,20 @@ def write_design(design: Design) -> str:
     """
     path, units = design.trajectory, design.problem.unknowns.units
     columns = (design.theta_names, units, design.theta, design.standard_errors_before, design.standard_errors)
-    rows = [("unknown", "value", "standard error as given", "as designed", "")]
+    rows, titles = [], ["unknown", "value", "standard error as given", "as designed", ""]
     for name, unit, value, *errors in zip(*columns, strict=True):
         before, after = ("none" if np.isnan(error) else f"{error:.3g}" for error in errors)
         rows.append((name, f"{value:.6g}", before, after, unit_suffix(unit).strip()))
     before, after = (f"{value:.4g}" for value in (design.criterion_before, design.criterion_after))
     rows.append((f"{MEANING[design.criterion]} of covariance", "", before, after, ""))
     head = f"{design.criterion}-optimal design of {design.run} for {join_first(design.names)}."
-    lines = [*wrap_text(head), "", *format_table(rows, "<>>><")]
+    lines = [*wrap_text(head), "", *format_table(rows, "<>>><", titles)]
     for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL)):
         lines += ["", *wrap_text(template.format(", ".join(names)))] if names else []
     for name, values in design.inputs.items():
         lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
     for sensor, times in design.sample_times.items():
-        unit = "" if path.origin is not None else unit_suffix(path.time_unit)
-        listed = ", ".join(format_time(time, path) for time in times.tolist()) + unit
+        listed = ", ".join(format_time(time, path) for time in times.tolist()) + suffix_time(path)
         lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
     return "\n".join(lines)
 

@@ -272,14 +272,13 @@ def list_transitions(fit: Fit, e: int) -> Columns:
     e : int, from 0
     """
     errors, run, intervals = correct_errors(fit), fit.trajectories[e], find_transition_intervals(fit, e)
-    dated = None if run.origin is None else run
     own = [t for t in fit.transitions if t.experiment == e]
     values, shown = [], []
     for t, ends in zip(own, intervals, strict=True):
-        value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], dated)
-        unit = format_unit(t.unit) if dated is None or error else ""
+        value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], run)
+        unit = format_unit(t.unit) if run.origin is None or error else ""
         values.append(" ".join(filter(None, (value, error, unit))))
-        low, high = (format_end(end, ends, dated) for end in ends)
+        low, high = (format_end(end, ends, run) for end in ends)
         shown.append(f"{low} to {high}" if low and high else "not known")
     numbers = {"x": np.array([t.time for t in own], dtype=float), "low": intervals[:, 0], "high": intervals[:, 1]}
     words: dict[str, Any] = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
