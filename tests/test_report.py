@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import itertools
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from string import Formatter
@@ -33,7 +33,6 @@ from switchfit.report.plot import (
     plot_transitions,
 )
 from switchfit.report.style import MODE_COLOURS
-from switchfit.report.text import report as write_report
 from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.verdict import find_issues
 
@@ -125,6 +124,12 @@ def several(count: int, names=None) -> Fit:
         cost=29.0 * count,
         history=tuple(IterationRecord(k, 900.0 / (k + 1), 10.0**-k, 1.0, theta, k + 1) for k in range(3)),
     )
+
+
+def write_report(fit: Fit, certificate=None, **settings) -> str:
+    """Return the report of an estimate that has these fields and no model."""
+    known = {field.name: getattr(fit, field.name) for field in fields(Fit)}
+    return sf.Estimate(**known, saved_certificate=certificate).report(**settings)
 
 
 def report(fit: Fit) -> str:
@@ -535,7 +540,7 @@ def test_bands_in_a_figure_are_the_intervals():
 def test_convergence_is_logarithmic():
     figure, ax = axes()
     history = [IterationRecord(k, 1.0, value, 1.0, np.zeros(1), k) for k, value in enumerate([50.0, 1e-2, 0.0])]
-    assert plot_convergence(history, ax, tolerance=1e-7) is ax
+    assert plot_convergence(made(history=history, tolerance=1e-7), ax=ax) is ax
     assert ax.get_yscale() == "log"
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("iteration", "optimality (KKT residual)")
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), [50.0, 1e-2, np.nan])
@@ -590,9 +595,9 @@ def test_fields_of_sentences_are_words_or_figures(table, words):
     nodes = itertools.chain.from_iterable(ast.walk(ast.parse(path.read_text())) for path in sources)
     known = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     templates = [text for text in table.values() if isinstance(text, str)]
-    fields = {field for text in templates for _, field, *_ in Formatter().parse(text) if field}
-    assert len(fields) > 10
-    assert {field for field in fields if not field.isdigit()} <= words.keys() | known
+    found = {field for text in templates for _, field, *_ in Formatter().parse(text) if field}
+    assert len(found) > 10
+    assert {field for field in found if not field.isdigit()} <= words.keys() | known
 
 
 if __name__ == "__main__":

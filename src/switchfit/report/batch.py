@@ -345,10 +345,8 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
 
 def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
     """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
-    from switchfit.report.axes import label_unknown_axis
-
     clock = list_dated(fits)[k]
-    label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
+    style.label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
     if clock is None:
         ax.locator_params(axis="x", nbins=4)
 
@@ -417,8 +415,6 @@ def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figur
 
 
 def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
-    from matplotlib.ticker import MaxNLocator
-
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
     costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
     floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding
@@ -436,7 +432,7 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
     ax.set_ylim(
         floor / 3, max(3 * np.nanmax(height, initial=floor), 1e3 * floor)
     )  # all in one minimum: a few decades, not one tick
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.locator_params(axis="x", integer=True)
     ax.set_xlim(0.5, len(order) + 0.5)
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")

@@ -28,7 +28,15 @@ from switchfit.report.formats import (
     suffix_time,
     wrap_text,
 )
-from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state, plot_transitions
+from switchfit.report.plot import (
+    choose_mode_colours,
+    plot_band,
+    plot_comparison,
+    plot_modes,
+    plot_state,
+    plot_transitions,
+    replace_infinities,
+)
 from switchfit.report.sentences import ALLOWED
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
@@ -383,8 +391,6 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     search : ModeSearch
     ax : matplotlib.axes.Axes
     """
-    from matplotlib.ticker import MaxNLocator
-
     numbers = [fit.switches for fit in search.fitted]
     names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
     names += ["criterion"] if is_discounted(search) or not names else []
@@ -400,7 +406,7 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax.set_ylim(bottom=-1.0)
     ax.set_xlabel("number of switches")
     ax.set_ylabel("above the lowest")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.locator_params(axis="x", integer=True)
     if ax.lines:
         ax.legend(fontsize=SMALL)
     return ax
@@ -432,9 +438,7 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
     stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), ax)
     if search.best is not None:
-        from switchfit.report.axes import label_axis  # here, since it imports matplotlib
-
-        label_axis(ax, search.best.trajectories[e])
+        style.label_axis(ax, search.best.trajectories[e])
     return ax
 
 
@@ -602,8 +606,6 @@ def plot_log(log: OnlineLog) -> Figure:
     ----------
     log : OnlineLog
     """
-    from switchfit.report.axes import label_axis, put_ticks  # here, since it imports matplotlib
-
     values = _list_values(log)[:LISTED_LAST]
     figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))
     figure.get_layout_engine().set(h_pad=ROOM)  # type: ignore[union-attr,call-arg]
@@ -614,8 +616,8 @@ def plot_log(log: OnlineLog) -> Figure:
         _plot_value(log.times, value, error, ax)
         ax.set_ylabel(label_quantity(name, unit))
     for ax in axes[:-1]:
-        put_ticks(ax, log)
-    label_axis(axes[-1], log)
+        style.put_ticks(ax, log)
+    style.label_axis(axes[-1], log)
     return style.turn_off_formulas(figure)
 
 
@@ -629,7 +631,7 @@ def plot_probability(log: OnlineLog, ax: Axes) -> Axes:
     """
     stack_probabilities(log.times, log.modes, log.probability, ax)
     now = log.now
-    reach = QUANTILE * np.where(np.isfinite(now.time_errors), now.time_errors, np.nan)
+    reach = QUANTILE * now.time_errors
     ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
     return plot_transitions(now.transition_times, ends, ax)
 
@@ -646,8 +648,7 @@ def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
     for alarm in log.alarms:
         face = "none" if alarm in log.retracted else FIT
         ax.plot(alarm.time, alarm.statistic, "o", markersize=4, color=FIT, markerfacecolor=face)
-    ax.axhline(log.threshold, color=REFERENCE, linestyle="--", linewidth=THIN)
-    style.name_line(ax, "threshold", log.threshold, "left", color=REFERENCE)
+    style.draw_level(ax, "threshold", log.threshold, "left")
     if np.max(log.statistic) > FAR * log.threshold:
         ax.set_yscale("symlog", linthresh=log.threshold, linscale=2.0)
     ax.set_ylim(0.0, max(1.5 * log.threshold, ax.get_ylim()[1]))
@@ -657,13 +658,12 @@ def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
 
 def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> Axes:
     """Draw a parameter with its 95 % band, which is cut off where it is much wider than at the end."""
-    known = np.isfinite(error)
-    low, high = value - QUANTILE * error, value + QUANTILE * error
+    band = np.stack([value - QUANTILE * error, value + QUANTILE * error], axis=1)
     ax.plot(times, value, "-", color=FIT, linewidth=LINE, zorder=3)
-    reach = 3.0 * QUANTILE * error[-1] if known[-1] else 0.0
+    reach = 3.0 * QUANTILE * np.nan_to_num(error[-1], posinf=0.0)
     ax.set_ylim(*ax.get_ylim() + reach * np.array([-1.0, 1.0]))
     ax.set_autoscaley_on(False)
-    ax.fill_between(times, low, high, where=known, color=FIT, alpha=0.2, linewidth=0, zorder=2, label="95 %")
+    plot_band(times, replace_infinities(band), ax, alpha=0.2, label="95 %")
     ax.axhline(value[-1], color=TRANSITION, linestyle=":", linewidth=THIN, zorder=1)
     ax.tick_params(labelsize=SMALL)
     return ax

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -19,7 +18,6 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
-from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
@@ -150,7 +148,7 @@ def plot_runs(
     runs = list(intervals)
     columns = min(max(len(runs), 1), COLUMNS)
     blocks = [runs[first : first + columns] for first in range(0, len(runs), columns)]
-    panels = [max(len(_list_panels(result, e)) for e in block) for block in blocks]
+    panels = [max(_count_panels(result, e) for e in block) for block in blocks]
     heights = [0.6 + 2.5 * number for number in panels]
     figure = style.make_figure(WIDTHS[columns] * columns, 0.7 + sum(heights))
     grid = figure.add_gridspec(len(blocks), columns, height_ratios=heights)
@@ -192,13 +190,9 @@ def plot_comparison(
     matplotlib.axes.Axes
     """
     measured = replace_infinities(comparison.measured[:, channel])
-    if comparison.kind == "measurements":
-        ax.plot(comparison.times, measured, label="measured", zorder=3, **draw_dots(len(measured)))
-        _mark_outliers(comparison, measured, channel, ax)
-    else:
-        look: dict[str, Any] = {"color": REFERENCE, "linewidth": LINE, "zorder": 3}
-        ax.plot(comparison.times, measured, "--", label="reference signal", **look)
-    times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
+    draw_measured(comparison, comparison.times, measured, ax)
+    _mark_outliers(comparison, measured, channel, ax)
+    times, curve = break_at_transitions(comparison.curve_times, replace_infinities(comparison.curve[:, channel]))
     with style.draw_within(ax, curve):
         ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
     ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
@@ -224,10 +218,9 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
     if comparison.kind == "measurements":
         ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
-        _mark_outliers(comparison, residual, channel, ax)
     else:
-        times, line = _break_at_gaps(comparison.times, residual, trajectory)
-        ax.plot(times, line, "-", color=style.REFERENCE, linewidth=THIN, zorder=3)
+        ax.plot(*break_at_transitions(comparison.times, residual), "-", color=style.REFERENCE, linewidth=THIN, zorder=3)
+    _mark_outliers(comparison, residual, channel, ax)
     if comparison.sigma is not None:
         sigma = replace_infinities(comparison.sigma[:, channel])
         for side, label in ((sigma, "± sigma"), (-sigma, "")):
@@ -252,7 +245,7 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     -------
     matplotlib.axes.Axes
     """
-    times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
+    times, curve = break_at_transitions(trajectory.times, replace_infinities(trajectory.states[:, state]))
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
     ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
     return _label_time_axis(ax, trajectory)
@@ -311,45 +304,28 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
     return ax
 
 
-def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance: float) -> Axes:
-    """Draw the optimality against iteration on a logarithmic scale.
-
-    Parameters
-    ----------
-    history : sequence of IterationRecord
-        As in `Fit.history`. An optimality of 0 is left out.
-    ax : matplotlib.axes.Axes
-    tolerance : float
-        Drawn as a line.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-    """
-    from matplotlib.ticker import MaxNLocator
-
-    optimality = np.array([record.optimality for record in history], dtype=np.float64)
-    shown = np.where(optimality > 0, optimality, np.nan)
-    ax.set_yscale("log")
-    ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
-    ax.axhline(tolerance, color=style.REFERENCE, linestyle="--", linewidth=THIN)
-    style.name_line(ax, "tolerance", tolerance, "left", color=style.REFERENCE)  # where the curve is far above it
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("iteration")
-    ax.set_ylabel("optimality (KKT residual)")
-    return ax
-
-
-def plot_course(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw the optimality of a fit against iteration, with its tolerance.
+def plot_convergence(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the optimality of a fit against iteration on a logarithmic scale, with its tolerance.
 
     Parameters
     ----------
     estimate : Fit
+        An optimality of 0 in its history is left out.
     ax : matplotlib.axes.Axes, optional
     """
-    draw = partial(plot_convergence, estimate.history, tolerance=estimate.tolerance)
-    return style.draw_on(ax, draw, (6.4, 3.4))
+    return style.draw_on(ax, lambda ax: _draw_convergence(estimate, ax), (6.4, 3.4))
+
+
+def _draw_convergence(fit: Fit, ax: Axes) -> Axes:
+    optimality = np.array([record.optimality for record in fit.history], dtype=np.float64)
+    shown = np.where(optimality > 0, optimality, np.nan)
+    ax.set_yscale("log")
+    ax.plot([record.iteration for record in fit.history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
+    style.draw_level(ax, "tolerance", fit.tolerance, "left")  # where the curve is far above it
+    ax.locator_params(axis="x", integer=True)
+    ax.set_xlabel("iteration")
+    ax.set_ylabel("optimality (KKT residual)")
+    return ax
 
 
 def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
@@ -417,10 +393,20 @@ def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = Fal
 # --- the figure of a fit ----------------------------------------------------------------------------------------------
 
 
-def _list_panels(result: Fit | Validation, e: int) -> list[tuple[Comparison | None, int]]:
-    """Return what the panels of an experiment show: (comparison, channel), or (None, state) where there is no data."""
-    channels: list[tuple[Comparison | None, int]] = [(c, k) for c in result.comparisons[e] for k in range(len(c.names))]
-    return channels or [(None, k) for k in range(len(result.trajectories[e].state_names))]
+def list_outputs(result: Fit | Validation, e: int) -> list[tuple[Comparison, int]]:
+    """Return the outputs of an experiment, each as one of its data and the channel of that.
+
+    Parameters
+    ----------
+    result : Fit or Validation
+    e : int, from 0
+    """
+    return [(comparison, k) for comparison in result.comparisons[e] for k in range(len(comparison.names))]
+
+
+def _count_panels(result: Fit | Validation, e: int) -> int:
+    """Return how many channels of an experiment are drawn, or states where there is no data."""
+    return len(list_outputs(result, e)) or len(result.trajectories[e].state_names)
 
 
 def _draw_experiment(
@@ -433,18 +419,17 @@ def _draw_experiment(
     label: str,
 ) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
-    trajectory, panels, with_data = result.trajectories[e], _list_panels(result, e), bool(result.comparisons[e])
+    trajectory, with_data = result.trajectories[e], bool(result.comparisons[e])
+    drawn = _count_panels(result, e) * (1 + with_data)
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
     axes: list[Axes] = [block.add_subplot(grid[0])]
-    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1 : len(panels) * (1 + with_data)]]
-    places = iter(axes)
-    for comparison, k in panels:
-        if comparison is None:
-            plot_state(trajectory, k, next(places))
-        else:
-            plot_comparison(comparison, trajectory, k, next(places), label=label)
-            plot_residuals(comparison, trajectory, k, next(places))
+    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1:drawn]]
+    for (comparison, k), ax, below in zip(list_outputs(result, e), axes[::2], axes[1::2], strict=False):
+        plot_comparison(comparison, trajectory, k, ax, label=label)
+        plot_residuals(comparison, trajectory, k, below)
+    for state, ax in enumerate(() if with_data else axes):
+        plot_state(trajectory, state, ax)
     times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
     for number, ax in enumerate(axes):
         plot_modes(trajectory, ax, colours=colours, labels=number == 0)
@@ -542,11 +527,9 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
     matplotlib.axes.Axes
     """
     if np.isfinite(band).any():
-        inner = np.flatnonzero(np.diff(times) == 0) + 1
-        broken = np.insert(times, inner, times[inner])
-        low, high = (np.insert(edge, inner, np.nan) for edge in band.T)
+        times, low, high = break_at_transitions(times, *band.T)
         with style.draw_within(ax, band):
-            ax.fill_between(broken, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
+            ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
     return ax
 
 
@@ -573,6 +556,23 @@ def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> di
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
+def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes) -> Axes:
+    """Draw samples as dots, or a reference signal as a dashed line.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Whose measured values they are.
+    x, y : (K,)
+    ax : matplotlib.axes.Axes
+    """
+    if comparison.kind == "measurements":
+        ax.plot(x, y, label="measured", zorder=3, **draw_dots(len(x)))
+    else:
+        ax.plot(x, y, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
+    return ax
+
+
 def draw_dots(count: int) -> dict[str, Any]:
     """Draw dots that become smaller the more there are; thousands are one picture in a vector file."""
     look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markeredgewidth": 0, "color": DATA}
@@ -582,8 +582,8 @@ def draw_dots(count: int) -> dict[str, Any]:
 
 def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax: Axes) -> None:
     """Draw circles round the samples that a robust loss weighs down."""
-    if comparison.downweighted is not None and comparison.downweighted[:, channel].any():
-        there = comparison.downweighted[:, channel]
+    there = None if comparison.downweighted is None else comparison.downweighted[:, channel]
+    if there is not None and there.any():
         look: dict[str, Any] = {"color": FIT, "markersize": 8, "markerfacecolor": "none", "markeredgewidth": 1.0}
         ax.plot(comparison.times[there], values[there], "o", zorder=5, label="weighed down", **look)
 
@@ -598,24 +598,26 @@ def replace_infinities(values: FloatArray) -> FloatArray:
     return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
 
 
-def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Return a curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
-    values = replace_infinities(values)
-    if len(times) != len(trajectory.times):
-        return times, values
-    inner = trajectory.segments[1:-1]
-    return np.insert(times, inner, times[inner]), np.insert(values, inner, np.nan)
+def break_at_transitions(times: FloatArray, *values: FloatArray) -> list[FloatArray]:
+    """Return times and values with a gap at each transition, whose time stands there twice: curves may jump there.
+
+    Parameters
+    ----------
+    times : (L,)
+        In order.
+    values : (L,) each
+    """
+    inner = np.flatnonzero(np.diff(times) == 0) + 1
+    return [np.insert(times, inner, times[inner]), *(np.insert(each, inner, np.nan) for each in values)]
 
 
 def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     """Label the axis of times, and limit it to the experiment's horizon."""
-    from switchfit.report.axes import label_axis
-
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
-    return label_axis(ax, trajectory)
+    return style.label_axis(ax, trajectory)
 
 
-PLOTS |= {"fit": plot_fit, "convergence": plot_course, "timeline": plot_timeline}
+PLOTS |= {"fit": plot_fit, "convergence": plot_convergence, "timeline": plot_timeline}
 
 
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
@@ -702,10 +704,8 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) 
 def _draw_plane(estimate: Estimate, e: int, plane: Plane, ax: Axes) -> Axes:
     trajectory, comparison = estimate.trajectories[e], estimate.comparisons[e][plane.data]
     both = [plane.x, plane.y]
-    if comparison.kind == "measurements":
-        ax.plot(*comparison.measured[:, both].T, label="measured", zorder=2, **draw_dots(len(comparison.times)))
-    else:
-        ax.plot(*comparison.measured[:, both].T, "--", color=REFERENCE, linewidth=LINE, label="reference signal")
+    x, y = comparison.measured[:, both].T
+    draw_measured(comparison, x, y, ax)
     colours = choose_mode_colours([trajectory], lines=True)
     segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
     for (mode, begin, end), first, last in segments:

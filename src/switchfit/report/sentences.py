@@ -34,16 +34,6 @@ Words = Mapping[str, Callable[[Issue], Any]]
 """What a field stands for that is neither a subject nor a figure."""
 
 
-class _Fields(dict[str, Any]):
-    """Look up the fields of a template: first among the words, then among the figures of the issue."""
-
-    def __init__(self, issue: Issue, words: Words) -> None:
-        self.issue, self.words = issue, words
-
-    def __getitem__(self, name: str) -> Any:
-        return self.words[name](self.issue) if name in self.words else get_figure(self.issue, name)
-
-
 def write_sentence(sentence: Sentence, issue: Issue, words: Words) -> str:
     """Return the sentence on an issue.
 
@@ -55,7 +45,9 @@ def write_sentence(sentence: Sentence, issue: Issue, words: Words) -> str:
     """
     if callable(sentence):
         return sentence(issue)
-    return Formatter().vformat(sentence, issue.subjects, _Fields(issue, words))
+    names = [name for _, name, *_ in Formatter().parse(sentence) if name and not name.isdigit()]
+    fields = {name: words[name](issue) if name in words else get_figure(issue, name) for name in names}
+    return sentence.format(*issue.subjects, **fields)
 
 
 def get_figure(issue: Issue, name: str) -> float:
@@ -360,15 +352,12 @@ EXAMPLES = {
 """What to keep from where an operation is not defined, or has no derivative."""
 
 
-def _hint_at_delay(issue: Issue) -> str:
-    """Return a hint behind why a line search failed if a delay is estimated."""
-    return _DELAYED if get_figure(issue, "delayed") == 1.0 else ""
-
-
 _DELAYED = (
     " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, and the "
     "fit may have ended at one. Fix the delay at its estimate to see."
 )
+"""Behind why a line search failed if a delay is estimated."""
+
 _WORDS: Words = {
     "where": _locate,
     "repair": _write_repair,
@@ -388,7 +377,7 @@ _WORDS: Words = {
     "off by": _measure_sigma,
     "undefined": lambda issue: capitalise(write_undefined(issue)),
     "definition": lambda issue: capitalise(suggest_definition(issue.subjects[1])),
-    "delay": _hint_at_delay,
+    "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
 }
 """Fields of the sentences that are no figures."""
 

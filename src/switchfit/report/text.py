@@ -32,9 +32,9 @@ from switchfit.report.frames import list_holds
 from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.certificate import WEAK, Certificate, Identifiability, analyse_solution
+from switchfit.uncertainty.certificate import WEAK
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel
-from switchfit.uncertainty.verdict import DIFFERENT, Verdict, find_issues, judge
+from switchfit.uncertainty.verdict import DIFFERENT, find_issues
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which the report calls it asymmetric."""
@@ -76,27 +76,14 @@ METHODS = {
 }
 
 
-@format_text.register(Fit)
-def report(
-    fit: Fit,
-    certificate: Certificate | None = None,
-    found: Identifiability | None = None,
-    *,
-    verdict: Verdict | None = None,
-    full: bool = False,
-    files: Mapping[str, str] | None = None,
-) -> str:
+@format_text.register(Estimate)
+def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
     """Return the report: the verdict, the problem, the course of the fit, its quality, the unknowns, the warnings.
 
     Parameters
     ----------
-    fit : Fit
-    certificate : Certificate, optional
-        Its failures count in the verdict; if left out, only what can be checked without the model is checked.
-    found : Identifiability, optional
-        If left out, that from the Hessian alone.
-    verdict : Verdict, optional
-        Of this fit; computed if left out.
+    estimate : Estimate
+        The failures of its certificate count in the verdict if it is known.
     full : bool
         All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
         screen, without the warnings that the verdict covers.
@@ -108,32 +95,22 @@ def report(
     str
         Several lines without a newline at the end; the verdict first.
     """
-    verdict = judge(fit, certificate) if verdict is None else verdict
     limits = EVERYTHING if full else SCREEN
     runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    weak = analyse_solution(fit, None) if found is None else found
-    course = [*list_experiments(fit, limits.experiments, runs, full=full), *list_course(fit, full=full)]
-    channels = _format_channels(fit, limits.channels, runs)
+    course = [*list_experiments(estimate, limits.experiments, runs, full=full), *list_course(estimate, full=full)]
+    channels = _format_channels(estimate, limits.channels, runs)
     sections = {
         "Fit": _format_rows(course),
-        "Quality of the fit": [*_format_rows(list_quality(fit, full=full)), *channels],
-        "Unknowns": _format_unknowns(fit, limits.unknowns, unknowns),
-        "Held fixed": _format_fixed(fit, limits.fixed),
-        f"Correlations above {SMALL_CORRELATION:g}": _format_correlations(fit, limits.correlations, full=full),
-        "Determined worst by the data": _describe_weak(fit, weak, limits.directions),
-        "Warnings": _format_warnings(fit, verdict, limits.warnings, full=full),
+        "Quality of the fit": [*_format_rows(list_quality(estimate, full=full)), *channels],
+        "Unknowns": _format_unknowns(estimate, limits.unknowns, unknowns),
+        "Held fixed": _format_fixed(estimate, limits.fixed),
+        f"Correlations above {SMALL_CORRELATION:g}": _format_correlations(estimate, limits.correlations, full=full),
+        "Determined worst by the data": _describe_weak(estimate, limits.directions),
+        "Warnings": _format_warnings(estimate, limits.warnings, full=full),
     }
     written = ["\n".join([title, *lines]) for title, lines in sections.items() if lines]
-    shown = "\n\n".join(["\n".join(wrap_text(str(verdict))), *written])
+    shown = "\n\n".join(["\n".join(wrap_text(str(estimate.verdict))), *written])
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
-
-
-@format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
-    """Return the report of an estimate, with its certificate if it is known, and J evaluated along weak directions."""
-    verdict = estimate.verdict
-    found = estimate.identifiability
-    return report(estimate, estimate.known_certificate, found, verdict=verdict, full=full, files=files)
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
@@ -504,9 +481,10 @@ def list_correlations(fit: Fit) -> list[tuple[str, str]]:
     return [(f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}") for i, j in above]
 
 
-def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
+def _describe_weak(estimate: Estimate, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly determine, as lines."""
-    weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
+    found = estimate.identifiability
+    weak = [d for d in found.directions if d.eigenvalue < WEAK] if estimate.status.successful else []
     return _list_sentences([write_direction(found, direction) for direction in weak], most, "direction")
 
 
@@ -538,10 +516,11 @@ _COVERED = {
 """Kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
 
 
-def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> list[str]:
+def _format_warnings(estimate: Estimate, most: int, *, full: bool) -> list[str]:
     """Return the warnings as lines; on one screen without those that the verdict covers."""
-    covered = set() if full else set().union(*(_COVERED.get(reason.kind, set()) for reason in verdict.reasons))
-    issues = [add_dates(str(issue), fit) for issue in find_issues(fit) if issue.kind not in covered]
+    reasons = () if full else estimate.verdict.reasons
+    covered = set().union(*(_COVERED.get(reason.kind, set()) for reason in reasons))
+    issues = [add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
     return _list_sentences(issues, most, "warning")
 
 

@@ -371,8 +371,6 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     """
     from scipy.interpolate import PchipInterpolator  # here, since importing it takes longer than a profile
 
-    from switchfit.report.axes import label_unknown_axis
-
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
@@ -397,15 +395,14 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
         ax.plot(x, parabola, "--", color=REFERENCE, linewidth=LINE, label="quadratic approximation")
     for level in (*(level for level in LEVELS if level < profile.level), profile.level):
         height = profile.fit.quantile(level) ** 2
-        ax.axhline(height, color=TRANSITION, linewidth=THIN, linestyle=":")
-        style.name_line(ax, f"{100 * level:.3g} %", height, "right")
+        style.draw_level(ax, f"{100 * level:.3g} %", height, "right", colour=TRANSITION, line=":")
     ax.axvline(profile.value, color=FIT, linewidth=THIN)
     inside = profile.sample_times[(profile.sample_times >= x[0]) & (profile.sample_times <= x[-1])]
     if len(inside):
         ax.plot(inside, np.zeros(len(inside)), "|", color=TRANSITION, markersize=9, clip_on=False, label="sample times")
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(0.0, top)
-    label_unknown_axis(ax, profile.name, profile.unit, _find_run(profile))
+    style.label_unknown_axis(ax, profile.name, profile.unit, _find_run(profile))
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
     ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
@@ -422,8 +419,6 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
     most : int, optional
         Of more channels, those are shown whose residuals widen the standard errors most, the worst first.
     """
-    from switchfit.report.axes import put_ticks
-
     shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
     if len(shown) > most:
         shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:most]
@@ -443,7 +438,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
         ax.set_title(title)
     for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times of another kind
         label = label_time(shown[k][1])
-        put_ticks(ax, shown[k][1])
+        style.put_ticks(ax, shown[k][1])
         if k + 1 == len(shown) or label_time(shown[k + 1][1]) != label:
             ax.set_xlabel(label)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):

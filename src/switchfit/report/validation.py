@@ -29,7 +29,7 @@ from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_tex
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent
 from switchfit.uncertainty.prediction import Prediction
-from switchfit.uncertainty.residuals import explain_channel
+from switchfit.uncertainty.residuals import explain_channel, list_channels
 
 RULED_OUT = 10.0
 """Difference in BIC from which the evidence against a model is very strong."""
@@ -53,7 +53,7 @@ def plot_prediction(
     ax : matplotlib.axes.Axes, optional
         For one channel.
     """
-    names = [name for comparison in prediction.fit.comparisons[prediction.experiment] for name in comparison.names]
+    names = [c.names[k] for c, k in plot.list_outputs(prediction.fit, prediction.experiment)]
     one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
         named = partial(style.draw_legend_above, height=1.08)
@@ -80,17 +80,14 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     labels : bool, optional
         Whether to name the modes above.
     """
-    from switchfit.report.axes import label_axis
-
     fit, e = prediction.fit, prediction.experiment
-    comparison, k = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))][number]
+    comparison, k = plot.list_outputs(fit, e)[number]
     trajectory = fit.trajectories[e]
     order, end = np.argsort(prediction.times, kind="stable"), trajectory.mode_spans[-1][2]
     times, y = prediction.times[order], prediction.outputs[order, number]
     plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
-    dots = plot.draw_dots(len(comparison.times))
-    ax.plot(comparison.times, comparison.measured[:, k], zorder=3, label="measured", **dots)
+    plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
     plot.plot_modes(trajectory, ax, labels=labels)
     first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
     if last > end:
@@ -99,7 +96,7 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
         ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
     ax.set_xlim(first, last)
     ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
-    return label_axis(ax, prediction)
+    return style.label_axis(ax, prediction)
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -151,18 +148,13 @@ def tabulate_predicted(found: Validation) -> Table:
     """
     rows, titles = [], ["", "values", "fit (%)", "R²", "rms error", "lag 1", "P(white)"]
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
-    single = len(found.comparisons) == 1
-    for run, comparisons in zip(found.run_names, found.comparisons, strict=True):
-        for comparison in comparisons:
-            rmse = comparison.rmse
-            for k, name in enumerate(comparison.names):
-                label = name if single else f"{run} {name}"
-                explained, test = explain_channel(comparison, k), tests.get(label)
-                white = "" if test is None or np.isnan(test.whiteness) else f"{test.whiteness:.2g}"
-                count = int(np.isfinite(comparison.measured[:, k]).sum())
-                shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
-                lag = "" if test is None else f"{test.correlation:+.2f}"
-                rows.append([label, f"{count}", *shares, f"{rmse[k]:.3g}", lag, white])
+    for label, _, comparison, k in list_channels(found.comparisons, found.run_names):
+        explained, test = explain_channel(comparison, k), tests.get(label)
+        white = "" if test is None or np.isnan(test.whiteness) else f"{test.whiteness:.2g}"
+        count = int(np.isfinite(comparison.measured[:, k]).sum())
+        shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
+        lag = "" if test is None else f"{test.correlation:+.2f}"
+        rows.append([label, f"{count}", *shares, f"{comparison.rmse[k]:.3g}", lag, white])
     return Table(rows, "<" + ">" * 6, titles)
 
 
@@ -182,25 +174,24 @@ def plot_validation(
     ax : matplotlib.axes.Axes, optional
         For one channel.
     """
-    channels = [[(c, k) for c in run for k in range(len(c.names))] for run in found.comparisons]
-    panels = [(e, output, c, k) for e, run in enumerate(channels) for output, (c, k) in enumerate(run)]
-    runs = [f"{name} " if len(channels) > 1 else "" for name in found.run_names]
-    one = style.choose_panel([f"{runs[e]}{c.names[k]}" for e, _, c, k in panels], channel, ax, "channel")
+    runs = range(len(found.comparisons))
+    panels = [(e, output) for e in runs for output in range(len(plot.list_outputs(found, e)))]
+    prefixes = [f"{name} " if len(runs) > 1 else "" for name in found.run_names]
+    names = [f"{prefixes[e]}{c.names[k]}" for e in runs for c, k in plot.list_outputs(found, e)]
+    one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
         more = plot.make_transition_handles([_find_intervals(found, panels[one][0], level)], level)
         named = partial(style.draw_legend_above, more=more, height=1.08)
         return style.draw_on(ax, lambda ax: named(draw_validation(found, *panels[one], level, ax)), (8.0, 3.9))
-    intervals = {e: _find_intervals(found, e, level) for e in range(len(channels))[: plot.LARGEST_FIGURE]}
+    intervals = {e: _find_intervals(found, e, level) for e in runs[: plot.LARGEST_FIGURE]}
     figure = plot.plot_runs(found, intervals, dict(enumerate(found.predictions)), level=level, label="predicted")
-    for block, run in zip(figure.subfigs, channels, strict=False):
-        for panel, (comparison, k) in zip(block.axes[::2], run, strict=False):
+    for e, block in enumerate(figure.subfigs):
+        for panel, (comparison, k) in zip(block.axes[::2], plot.list_outputs(found, e), strict=False):
             _write_percent(comparison, k, panel)
     return figure
 
 
-def draw_validation(
-    found: Validation, e: int, output: int, comparison: Comparison, k: int, level: float, ax: Axes
-) -> Axes:
+def draw_validation(found: Validation, e: int, output: int, level: float, ax: Axes) -> Axes:
     """Draw measured against predicted for one channel with bands.
 
     Parameters
@@ -208,13 +199,10 @@ def draw_validation(
     found : Validation
     e, output : int, from 0
         Which run, and which of its outputs.
-    comparison : Comparison
-    k : int, from 0
-        Which of its channels that is.
     level : float, between 0 and 1
     ax : matplotlib.axes.Axes
     """
-    trajectory = found.trajectories[e]
+    trajectory, (comparison, k) = found.trajectories[e], plot.list_outputs(found, e)[output]
     plot.plot_comparison(comparison, trajectory, k, ax, label="predicted")
     if found.predictions:
         plot.plot_bands(found.predictions[e], output, level, ax)

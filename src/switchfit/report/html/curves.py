@@ -255,12 +255,8 @@ def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
     """
     modes, left, right = zip(*fit.trajectories[e].mode_spans, strict=True)
     places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
-    spans: dict[str, Any] = {
-        "left": np.array(left),
-        "right": np.array(right),
-        "colour": [colours[mode] for mode in modes],
-    }
-    return spans | {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
+    ends = {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
+    return {"left": np.array(left), "right": np.array(right), "colour": [colours[mode] for mode in modes], **ends}
 
 
 def list_transitions(fit: Fit, e: int) -> Columns:
@@ -317,10 +313,7 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
         costs = np.array([evaluate_moved(estimate, place, value) for value in values])
         run = list_dated(estimate)[place]
         slider = {"place": place, "name": estimate.theta_names[place], "theta": theta}
-        slider |= {
-            "clock": None if run is None else describe_clock(run),
-            "unit": format_unit(estimate.theta_units[place]),
-        }
+        slider |= {"clock": run and describe_clock(run), "unit": format_unit(estimate.theta_units[place])}
         found.append({**slider, "values": drop_nan(values), "costs": drop_nan(costs)})
     return found
 
