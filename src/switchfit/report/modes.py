@@ -37,7 +37,7 @@ from switchfit.report.plot import (
     plot_transitions,
     replace_infinities,
 )
-from switchfit.report.sentences import ALLOWED
+from switchfit.report.sentences import ALLOWED, capitalise
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
@@ -546,7 +546,7 @@ def write_log(log: OnlineLog) -> str:
     since = format_estimate(now.since, float(error), log)[0]
     changes = format_count(len(now.transition_times), "change")
     first = f"{now.mode} since {since}{unit}, after {changes} of mode up to {end}{unit}."
-    lines = wrap_text(f"{first} {now.status.value[0].upper()}{now.status.value[1:]}.")
+    lines = wrap_text(f"{first} {capitalise(now.status.value)}.")
     lines += ["", *_list_modes(log), *_list_parameters(log), *_list_alarms(log), ""]
     counts = Counter(status.name for status in log.status)
     counted = ", ".join(f"{number} {name}" for name, number in counts.items())

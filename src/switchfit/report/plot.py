@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,24 +36,6 @@ COLUMNS, WIDTHS = 4, (0.0, 8.0, 5.5, 4.5, 4.0)
 """Experiments side by side; inches of each of so many."""
 LONGEST_TIMELINE = 30
 """Experiments in one timeline."""
-PLOTS: dict[str, Callable[..., Any]] = {}
-"""Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
-
-
-@draw_figure.register(Estimate)
-def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> Axes | Figure:
-    """Draw one of the plots of an estimate.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    what : str
-        A name in `PLOTS`.
-    settings
-        Keyword arguments of its function.
-    """
-    drawn: Axes | Figure = PLOTS[what](estimate, **settings)
-    return drawn
 
 
 def has_bands(fit: Any) -> TypeGuard[Estimate]:
@@ -617,21 +599,10 @@ def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     return style.label_axis(ax, trajectory)
 
 
-PLOTS |= {"fit": plot_fit, "convergence": plot_convergence, "timeline": plot_timeline}
-
-
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
 NO_POSITIONS = {"v", "vel", "velocity", "speed", "a", "acc", "acceleration", "force", "f", "rate", "d", "dot"}
 """Parts of names that say that a channel is no position."""
-
-
-class Plane(NamedTuple):
-    """Two channels of one of the data of an experiment: which data, and which channels."""
-
-    data: int
-    x: int
-    y: int
 
 
 def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | None:
@@ -680,20 +651,20 @@ def plot_plane(
     named = None if channels is None else as_names(channels, "channels", "two names of channels")
     if named is not None and len(named) != 2:
         raise ValueError(f"channels must be two names; got {shorten(channels)}.")
-    plane = _choose_plane(estimate, experiment, named)
-    return style.draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, ax), (6.4, 5.6))
+    (comparison, plane), trajectory = _choose_plane(estimate, experiment, named), estimate.trajectories[experiment]
+    return style.draw_on(ax, lambda ax: _draw_plane(comparison, plane, trajectory, ax), (6.4, 5.6))
 
 
-def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> Plane:
-    """Return the two channels that are named, or that are positions by their names; ValueError if there are none."""
+def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> tuple[Comparison, list[int]]:
+    """Return the data with the two channels that are named, or that are positions by their names, and their places."""
     trajectory = estimate.trajectories[e]
-    for number, comparison in enumerate(estimate.comparisons[e]):
+    for comparison in estimate.comparisons[e]:
         units = [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
         if channels is not None and set(channels) <= set(comparison.names):
-            return Plane(number, *(comparison.names.index(name) for name in channels))
+            return comparison, [comparison.names.index(name) for name in channels]
         found = None if channels is not None else find_plane(comparison.names, units)
         if found is not None:
-            return Plane(number, *found)
+            return comparison, list(found)
     names = join_names([name for comparison in estimate.comparisons[e] for name in comparison.names])
     what = "are positions in a plane by their names" if channels is None else f"are {shorten(channels)}"
     raise ValueError(
@@ -701,9 +672,7 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) 
     )
 
 
-def _draw_plane(estimate: Estimate, e: int, plane: Plane, ax: Axes) -> Axes:
-    trajectory, comparison = estimate.trajectories[e], estimate.comparisons[e][plane.data]
-    both = [plane.x, plane.y]
+def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory, ax: Axes) -> Axes:
     x, y = comparison.measured[:, both].T
     draw_measured(comparison, x, y, ax)
     colours = choose_mode_colours([trajectory], lines=True)
@@ -715,10 +684,29 @@ def _draw_plane(estimate: Estimate, e: int, plane: Plane, ax: Axes) -> Axes:
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
         ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
-    ax.set_xlabel(label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
-    ax.set_ylabel(label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
+    labels = [label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)) for k in both]
+    ax.set_xlabel(labels[0])
+    ax.set_ylabel(labels[1])
     ax.set_aspect("equal", adjustable="datalim")
     return style.draw_legend_above(ax)
 
 
-PLOTS["plane"] = plot_plane
+PLOTS: dict[str, Callable[..., Any]]
+PLOTS = {"fit": plot_fit, "convergence": plot_convergence, "timeline": plot_timeline, "plane": plot_plane}
+"""Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
+
+
+@draw_figure.register(Estimate)
+def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> Axes | Figure:
+    """Draw one of the plots of an estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    what : str
+        A name in `PLOTS`.
+    settings
+        Keyword arguments of its function.
+    """
+    drawn: Axes | Figure = PLOTS[what](estimate, **settings)
+    return drawn
