@@ -30,23 +30,20 @@ ALLOWED = "Standard errors allow for the correlation of the residuals."
 
 Sentence = str | Callable[[Issue], str]
 """A template, whose fields are subjects by their number, words, and figures by their name; or a function."""
-Words = Mapping[str, Callable[[Issue], Any]]
-"""What a field stands for that is neither a subject nor a figure."""
 
 
-def write_sentence(sentence: Sentence, issue: Issue, words: Words) -> str:
+def write_sentence(sentence: Sentence, issue: Issue) -> str:
     """Return the sentence on an issue.
 
     Parameters
     ----------
     sentence : str or callable
     issue : Issue
-    words : mapping of str to callable
     """
     if callable(sentence):
         return sentence(issue)
     names = [name for _, name, *_ in Formatter().parse(sentence) if name and not name.isdigit()]
-    fields = {name: words[name](issue) if name in words else get_figure(issue, name) for name in names}
+    fields = {name: _WORDS[name](issue) if name in _WORDS else get_figure(issue, name) for name in names}
     return sentence.format(*issue.subjects, **fields)
 
 
@@ -262,7 +259,7 @@ _LOG_ISSUES: dict[str, Sentence] = {
 def write_issue(issue: Issue) -> str:
     """Return an issue as a sentence or two."""
     if issue.kind in _ISSUES:
-        return write_sentence(_ISSUES[issue.kind], issue, _WORDS)
+        return write_sentence(_ISSUES[issue.kind], issue)
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
@@ -311,7 +308,7 @@ def _write_at(issue: Issue) -> str:
 def _write_jump(issue: Issue) -> str:
     """Return where the cost jumps, as the beginning of a sentence; empty where that is not known."""
     template = "The cost jumps from {before:.8g} to {after:.8g} where {0} passes {at:.8g}: "
-    return write_sentence(template, issue, {}) if np.isfinite(get_figure(issue, "at")) else ""
+    return write_sentence(template, issue) if np.isfinite(get_figure(issue, "at")) else ""
 
 
 def write_undefined(issue: Issue) -> str:
@@ -357,29 +354,6 @@ _DELAYED = (
     "fit may have ended at one. Fix the delay at its estimate to see."
 )
 """Behind why a line search failed if a delay is estimated."""
-
-_WORDS: Words = {
-    "where": _locate,
-    "repair": _write_repair,
-    **{name: partial(_add_unit, name=name) for name in ("time", "step", "typical")},
-    "names": _join,
-    "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
-    "held mode": lambda issue: capitalise(_name_mode(*issue.subjects[:2], position=get_figure(issue, "position"))),
-    "undetermined": _name_undetermined,
-    "correlated": _list_correlated,
-    "non-normal": _list_non_normal,
-    "wrong entries": _list_wrong,
-    "passage": _write_passage,
-    "jump": _write_jump,
-    "places": _write_at,
-    "kind": lambda issue: issue.kind,
-    "orders": lambda issue: ", ".join(f"{order:.2f}" for order in list_figures(issue, "orders")),
-    "off by": _measure_sigma,
-    "undefined": lambda issue: capitalise(write_undefined(issue)),
-    "definition": lambda issue: capitalise(suggest_definition(issue.subjects[1])),
-    "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
-}
-"""Fields of the sentences that are no figures."""
 
 _BOUND = (
     "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known. Move the "
@@ -513,7 +487,7 @@ def write_reason(reason: Issue) -> str:
     ----------
     reason : Issue
     """
-    return write_sentence(_REASONS[reason.kind], reason, _REASON_WORDS) if reason.kind in _REASONS else str(reason)
+    return write_sentence(_REASONS[reason.kind], reason) if reason.kind in _REASONS else str(reason)
 
 
 def write_step(step: Issue) -> str:
@@ -647,10 +621,10 @@ _UNCONVERGED: Mapping[str, str] = {
 
 
 _SEARCHES: Mapping[str, str] = {
-    "jump": "where the cost jumps, at {places}",
-    "switch": "where the cost jumps, at {places}",
-    "kink": "where the slope of the cost jumps, at {places}",
-    "not finite": "beside where the cost is not finite, at {places}",
+    "jump": "where the cost jumps, at {where it failed}",
+    "switch": "where the cost jumps, at {where it failed}",
+    "kink": "where the slope of the cost jumps, at {where it failed}",
+    "not finite": "beside where the cost is not finite, at {where it failed}",
     "wrong slope": "since the derivatives do not belong to the cost",
     "rounding": "since what the cost can still fall is less than its rounding error",
     "valley": "in a narrow valley of the cost",
@@ -661,7 +635,7 @@ _SEARCHES: Mapping[str, str] = {
 def _write_ending(issue: Issue) -> str:
     status, kind = (*issue.subjects, "", "")[:2]
     text = f"{_UNCONVERGED.get(status, 'not converged')} {_SEARCHES.get(kind, '')}".rstrip()
-    return write_sentence(text, issue, _REASON_WORDS)
+    return write_sentence(text, issue)
 
 
 def _describe_many(issue: Issue) -> str:
@@ -705,58 +679,42 @@ def _write_prediction(issue: Issue) -> str:
     return f"the fitted parameters do not predict this run within the noise and their own error ({figures})"
 
 
-_REASON_WORDS: Words = {
-    "names": lambda issue: _name(issue.subjects),
-    "mode": lambda issue: _name_mode(*issue.subjects[:2]),
-    "explanation": _explain,
-    "explanation of the worst": _explain_worst,
-    "agreement": _count_starts,
-    "fits": _count_fits,
-    "least": _name_least,
-    "act": lambda issue: "acts" if len(issue.subjects) == 1 else "act",
-    "per cent": lambda issue: 100 * get_figure(issue, "share"),
-    "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
-    "places": lambda issue: write_places(issue.subjects[2:], list_figures(issue, "at"), digits=6),
-    "statuses": lambda issue: ", ".join(issue.subjects[:LISTED_NAMES]),
-}
-"""Fields of the reasons that are no figures."""
-
 _REASONS: dict[str, Sentence] = {
     "converged": "converged",
     "looked": _write_looks,
     "fits": _write_fit,
     "predicts": _write_prediction,
     "predicts badly": _write_prediction,
-    "prediction errors correlated": "the residuals of {names} are correlated",
+    "prediction errors correlated": "the residuals of {first names} are correlated",
     "nothing left to test": "as many unknowns were estimated from this run as it has values, so that nothing is left "
     "to test",
-    "input not explained": "the residuals depend on {names}: the model misses a part of it",
-    "own unknowns not converged": "the estimation of {names} did not converge",
+    "input not explained": "the residuals depend on {first names}: the model misses a part of it",
+    "own unknowns not converged": "the estimation of {first names} did not converge",
     "a minimum": "a minimum (KKT residual {optimality:.1e})",
-    "at kinks": "{names} at a kink of the cost",
+    "at kinks": "{first names} at a kink of the cost",
     "not converged": _write_ending,
     "undefined": write_undefined,
     "switch": "{1}, which derivatives do not include",
     "unexplained": "{explanation of the worst}",
     "little explained": "{explanation of the worst}",
     "model suspected": _write_wrong_model,
-    "outliers suspected": "{explanation of the worst}, what is left of {names} has outliers: values or the model are "
-    "wrong there",
-    "sigma suspected": "{explanation of the worst}, what is left of {names} is {size:.2g} sigma and looks like noise: "
-    "sigma is too small",
+    "outliers suspected": "{explanation of the worst}, what is left of {first names} has outliers: values or the model "
+    "are wrong there",
+    "sigma suspected": "{explanation of the worst}, what is left of {first names} is {size:.2g} sigma and looks like "
+    "noise: sigma is too small",
     "too few samples": "{samples:.0f} values for {unknowns:.0f} unknowns leave nothing to check the fit with",
     "a mode collapsed": "{mode} collapsed",
     "a mode is short": "{mode} is at its minimum duration",
-    "idle": "the cost does not depend on {names}",
+    "idle": "the cost does not depend on {first names}",
     "other starts are better": "{agreement}",
     "few starts agree": "{agreement}",
-    "search cut short": "{names} ended by its limit of time",
-    "not determined": "the data hardly determine {names}",
-    "not read": "no function of the model reads {names}",
-    "acts elsewhere": "{names} {act} only in modes or at transitions that do not occur",
-    "without effect": "the cost does not depend on {names}",
-    "at bounds": "{names} at a bound",
-    "integration error": "the integration error of {names} is {error:.1e}, relative",
+    "search cut short": "{first names} ended by its limit of time",
+    "not determined": "the data hardly determine {first names}",
+    "not read": "no function of the model reads {first names}",
+    "acts elsewhere": "{first names} {act} only in modes or at transitions that do not occur",
+    "without effect": "the cost does not depend on {first names}",
+    "at bounds": "{first names} at a bound",
+    "integration error": "the integration error of {first names} is {error:.1e}, relative",
     "many fits": _describe_many,
     "some not converged": "{fits} did not converge ({statuses})",
     "some unexplained": "the model is far from the data in {fits}{least}",
@@ -768,8 +726,8 @@ _REASONS: dict[str, Sentence] = {
     "some not determined": "the data hardly determine the unknowns of {fits}",
     "ended elsewhere": "{fits} ended in another minimum, fit {0} farthest off",
     "resampled fit": "the fit that was resampled is {0}",
-    "intervals too short": "{level in per cent:.0f} % intervals of {names} hold the truth in {per cent:.0f} % of the "
-    "fits",
+    "intervals too short": "{level in per cent:.0f} % intervals of {first names} hold the truth in {per cent:.0f} % of "
+    "the fits",
     "stopped": "stopped, {fits} were not done",
     "study": "{fits} converged, in one minimum",
 }
@@ -806,3 +764,38 @@ _STEPS = {
     "profiles": "take estimate.profile() for them",
     "go on": "call it again with the same folder",
 }
+
+_WORDS: Mapping[str, Callable[[Issue], Any]] = {
+    "where": _locate,
+    "repair": _write_repair,
+    **{name: partial(_add_unit, name=name) for name in ("time", "step", "typical")},
+    "names": _join,
+    "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
+    "held mode": lambda issue: capitalise(_name_mode(*issue.subjects[:2], position=get_figure(issue, "position"))),
+    "undetermined": _name_undetermined,
+    "correlated": _list_correlated,
+    "non-normal": _list_non_normal,
+    "wrong entries": _list_wrong,
+    "passage": _write_passage,
+    "jump": _write_jump,
+    "places": _write_at,
+    "kind": lambda issue: issue.kind,
+    "orders": lambda issue: ", ".join(f"{order:.2f}" for order in list_figures(issue, "orders")),
+    "off by": _measure_sigma,
+    "undefined": lambda issue: capitalise(write_undefined(issue)),
+    "definition": lambda issue: capitalise(suggest_definition(issue.subjects[1])),
+    "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
+    "first names": lambda issue: _name(issue.subjects),
+    "mode": lambda issue: _name_mode(*issue.subjects[:2]),
+    "explanation": _explain,
+    "explanation of the worst": _explain_worst,
+    "agreement": _count_starts,
+    "fits": _count_fits,
+    "least": _name_least,
+    "act": lambda issue: "acts" if len(issue.subjects) == 1 else "act",
+    "per cent": lambda issue: 100 * get_figure(issue, "share"),
+    "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
+    "where it failed": lambda issue: write_places(issue.subjects[2:], list_figures(issue, "at"), digits=6),
+    "statuses": lambda issue: ", ".join(issue.subjects[:LISTED_NAMES]),
+}
+"""What a field of a sentence stands for that is neither a subject nor a figure."""
