@@ -137,10 +137,13 @@ def plot_runs(
     colours = choose_mode_colours(result.trajectories)
     for place, e in enumerate(runs):
         block = figure.add_subfigure(grid[divmod(place, columns)])
-        _draw_experiment(result, e, block, panels[place // columns], colours, intervals[e], label)
+        _draw_experiment(result, e, block, panels[place // columns], colours, label)
         if e in predictions:
             _draw_bands(bool(result.comparisons[e]), block.axes, predictions[e], level)
-    handles = style.collect_handles(figure.axes) | make_transition_handles(list(intervals.values()), level)
+        times = [begin for _, begin, _ in result.trajectories[e].mode_spans[1:]]
+        for ax in block.axes:  # labels in one of them, so that they come last in the legend
+            plot_transitions(times, intervals[e], ax, level=level if ax is block.axes[-1] else None)
+    handles = style.collect_handles(figure.axes)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for e in runs for mode, a, b in result.trajectories[e].mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
@@ -264,7 +267,7 @@ def plot_modes(
     return _label_time_axis(ax, trajectory)
 
 
-def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
+def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes, *, level: float | None = None) -> Axes:
     """Draw the transition times as vertical lines, each in a band that is its interval.
 
     Parameters
@@ -273,6 +276,8 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
     intervals : (N, 2) array_like
         Low and high end of each. No band is drawn where one is NaN, or where they are equal.
     ax : matplotlib.axes.Axes
+    level : float, between 0 and 1, optional
+        Of the intervals; lines and bands have labels for a legend where it is given.
 
     Returns
     -------
@@ -280,9 +285,10 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
     """
     ends: FloatArray = np.asarray(intervals, dtype=np.float64).reshape(-1, 2)
     for time, (low, high) in zip(np.asarray(times).tolist(), ends.tolist(), strict=True):
-        ax.axvline(time, color=TRANSITION, linewidth=THIN, zorder=2)
+        line, band = (None, None) if level is None else ("transition", f"transition, {100 * level:g} % interval")
+        ax.axvline(time, color=TRANSITION, linewidth=THIN, zorder=2, label=line)
         if np.isfinite(high - low) and high > low:
-            ax.axvspan(low, high, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1)
+            ax.axvspan(low, high, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1, label=band)
     return ax
 
 
@@ -327,21 +333,18 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
 
 def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: Axes) -> Axes:
     """Draw the rows of a timeline, the first on top; of many experiments those that are explained worst."""
-    from matplotlib.patches import Patch
-
     runs = choose_runs(fit, LONGEST_TIMELINE)
     colours = choose_mode_colours(fit.trajectories)
     ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
     first, last = float(ends.min()), float(ends.max())
     inches = ax.bbox.width / ax.figure.dpi / (last - first)
-    unnamed: dict[str, Any] = {}
     for row, e in enumerate(runs):
         for mode, begin, end in (span for span in fit.trajectories[e].mode_spans if span[2] > span[1]):
-            ax.barh(row, end - begin, 0.7, begin, color=colours[mode], edgecolor=TRANSITION, linewidth=THIN / 2)
-            if inches * (end - begin) > 0.085 * len(mode) + 0.1:
+            fits = inches * (end - begin) > 0.085 * len(mode) + 0.1
+            bar: dict[str, Any] = {"color": colours[mode], "edgecolor": TRANSITION, "linewidth": THIN / 2}
+            ax.barh(row, end - begin, 0.7, begin, label="" if fits else mode, **bar)
+            if fits:
                 ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
-            else:
-                unnamed[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION)
         for low, high in intervals[e].tolist():
             if np.isfinite(high - low):
                 look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
@@ -352,7 +355,7 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
     ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
     title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
-    return style.draw_legend_above(ax, unnamed, title=title)
+    return style.draw_legend_above(ax, title=title)
 
 
 def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
@@ -392,13 +395,7 @@ def _count_panels(result: Fit | Validation, e: int) -> int:
 
 
 def _draw_experiment(
-    result: Fit | Validation,
-    e: int,
-    block: Any,
-    rows: int,
-    colours: Mapping[str, str],
-    intervals: FloatArray,
-    label: str,
+    result: Fit | Validation, e: int, block: Any, rows: int, colours: Mapping[str, str], label: str
 ) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
     trajectory, with_data = result.trajectories[e], bool(result.comparisons[e])
@@ -412,10 +409,8 @@ def _draw_experiment(
         plot_residuals(comparison, trajectory, k, below)
     for state, ax in enumerate(() if with_data else axes):
         plot_state(trajectory, state, ax)
-    times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
     for number, ax in enumerate(axes):
         plot_modes(trajectory, ax, colours=colours, labels=number == 0)
-        plot_transitions(times, intervals, ax)
         if ax is not axes[-1]:
             ax.tick_params(labelbottom=False)
             ax.xaxis.offsetText.set_visible(False)
@@ -513,26 +508,6 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
         with style.draw_within(ax, band):
             ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
     return ax
-
-
-def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> dict[str, Any]:
-    """Return entries of the legend for the transitions and their intervals.
-
-    Parameters
-    ----------
-    intervals : sequence of (N, 2)
-        As of `plot_transitions`, of each of the runs that are shown.
-    level : float, between 0 and 1
-    """
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    every, handles = np.concatenate([np.zeros((0, 2)), *intervals]), dict[str, Any]()
-    if len(every):
-        handles["transition"] = Line2D([], [], color=TRANSITION, linewidth=THIN)
-    if np.any(every[:, 1] > every[:, 0]):
-        handles[f"transition, {100 * level:g} % interval"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
-    return handles
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------

@@ -10,9 +10,8 @@ matplotlib is imported where a figure is made: it takes longer to load than half
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -139,23 +138,19 @@ def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
     return handles
 
 
-def draw_legend_above(
-    ax: Axes, more: Mapping[str, Any] = MappingProxyType({}), *, title: str | None = None, height: float = 1.0
-) -> Axes:
+def draw_legend_above(ax: Axes, *, title: str | None = None, height: float = 1.0) -> Axes:
     """Draw the legend of an axes above it, with as many columns as it has room for.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
-    more : mapping of label to handle, optional
-        Entries of what has no label in the axes.
     title : str, optional
     height : float, optional
         Of its lower edge, in heights of the axes; names of modes reach to 1.08.
     """
     from switchfit.report.axes import fit_legend
 
-    if handles := collect_handles([ax]) | dict(more):
+    if handles := collect_handles([ax]):
         look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
         look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, height)}
         ax.legend(handles.values(), handles.keys(), title=title, borderaxespad=0.2, **look)

@@ -180,8 +180,7 @@ def plot_validation(
     names = [f"{prefixes[e]}{c.names[k]}" for e in runs for c, k in plot.list_outputs(found, e)]
     one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
-        more = plot.make_transition_handles([_find_intervals(found, panels[one][0], level)], level)
-        named = partial(style.draw_legend_above, more=more, height=1.08)
+        named = partial(style.draw_legend_above, height=1.08)
         return style.draw_on(ax, lambda ax: named(draw_validation(found, *panels[one], level, ax)), (8.0, 3.9))
     intervals = {e: _find_intervals(found, e, level) for e in runs[: plot.LARGEST_FIGURE]}
     figure = plot.plot_runs(found, intervals, dict(enumerate(found.predictions)), level=level, label="predicted")
@@ -208,7 +207,7 @@ def draw_validation(found: Validation, e: int, output: int, level: float, ax: Ax
         plot.plot_bands(found.predictions[e], output, level, ax)
     plot.plot_modes(trajectory, ax, colours=plot.choose_mode_colours(found.trajectories))
     times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
-    plot.plot_transitions(times, _find_intervals(found, e, level), ax)
+    plot.plot_transitions(times, _find_intervals(found, e, level), ax, level=level)
     return _write_percent(comparison, k, ax)
 
 
