@@ -513,7 +513,7 @@ def test_ticks_are_at_midnight_of_the_zone(fits):
 def test_ticks_of_any_span(span):
     from matplotlib.figure import Figure
 
-    from switchfit.report.axes import label_axis
+    from switchfit.report.style import label_axis
 
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), ("on",), (), 0.0, span, origin="2020-03-28T12:00Z")
     ax = Figure(figsize=(6, 2)).subplots()

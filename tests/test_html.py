@@ -185,7 +185,7 @@ def test_numbers_are_those_of_the_estimate(toss, toss_page):
     table = next(t for t in Reader(toss_page).tables if t[0][1] == "value")
     rows, note = tabulate_unknowns(toss, range(len(toss.theta)), ends=True)
     assert [row[0] for row in table[1:]] == list(toss.theta_names)
-    assert table == [[row[k] for k in rows.columns] for row in rows.rows]
+    assert table == [[row[k] for k in rows.columns] for row in [rows.titles, *rows.rows]]
     head = table[0]
     low, high = head.index("95 % from"), head.index("to")
     for i, row in enumerate(table[1:]):
@@ -501,7 +501,7 @@ def test_a_notebook_shows_the_verdict_the_numbers_and_a_figure(toss):
     reader = notebook(toss)
     assert str(toss.verdict) in reader.words
     rows, _ = tabulate_unknowns(toss, range(len(toss.theta)))
-    assert reader.tables == [[[row[k] for k in rows.columns] for row in rows.rows]]
+    assert reader.tables == [[[row[k] for k in rows.columns] for row in [rows.titles, *rows.rows]]]
     assert [tag for tag, _ in reader.elements].count("img") == 1
     assert len(toss._repr_html_()) < 150_000
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import itertools
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from string import Formatter
@@ -21,7 +21,7 @@ from switchfit.fit.result import Fit, Kink, Step, Termination, compute_scaled_sp
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.unknowns import ActiveConstraint
-from switchfit.report import sentences, verdict
+from switchfit.report import sentences
 from switchfit.report.formats import format_rounded
 from switchfit.report.plot import (
     choose_mode_colours,
@@ -33,7 +33,6 @@ from switchfit.report.plot import (
     plot_transitions,
 )
 from switchfit.report.style import MODE_COLOURS
-from switchfit.report.text import report as write_report
 from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.verdict import find_issues
 
@@ -125,6 +124,12 @@ def several(count: int, names=None) -> Fit:
         cost=29.0 * count,
         history=tuple(IterationRecord(k, 900.0 / (k + 1), 10.0**-k, 1.0, theta, k + 1) for k in range(3)),
     )
+
+
+def write_report(fit: Fit, certificate=None, **settings) -> str:
+    """Return the report of an estimate that has these fields and no model."""
+    known = {field.name: getattr(fit, field.name) for field in fields(Fit)}
+    return sf.Estimate(**known, saved_certificate=certificate).report(**settings)
 
 
 def report(fit: Fit) -> str:
@@ -535,7 +540,7 @@ def test_bands_in_a_figure_are_the_intervals():
 def test_convergence_is_logarithmic():
     figure, ax = axes()
     history = [IterationRecord(k, 1.0, value, 1.0, np.zeros(1), k) for k, value in enumerate([50.0, 1e-2, 0.0])]
-    assert plot_convergence(history, ax, tolerance=1e-7) is ax
+    assert plot_convergence(made(history=history, tolerance=1e-7), ax=ax) is ax
     assert ax.get_yscale() == "log"
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("iteration", "optimality (KKT residual)")
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), [50.0, 1e-2, np.nan])
@@ -580,18 +585,17 @@ def test_what_is_held_fixed_is_printed_as_a_number():
 # --- sentences --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("module", [sentences, verdict])
-def test_fields_of_sentences_are_words_or_figures(module):
+@pytest.mark.parametrize("table", [sentences._ISSUES, sentences._REASONS])
+def test_fields_of_sentences_are_words_or_figures(table):
     """A field of another name would be written as nan."""
     library = Path(sf.__file__).parent
     sources = (path for path in library.rglob("*.py") if "report" not in path.parts)
     nodes = itertools.chain.from_iterable(ast.walk(ast.parse(path.read_text())) for path in sources)
     known = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    table = module._ISSUES if module is sentences else module._REASONS
     templates = [text for text in table.values() if isinstance(text, str)]
-    fields = {field for text in templates for _, field, *_ in Formatter().parse(text) if field}
-    assert len(fields) > 10
-    assert {field for field in fields if not field.isdigit()} <= module._WORDS.keys() | known
+    found = {field for text in templates for _, field, *_ in Formatter().parse(text) if field}
+    assert len(found) > 10
+    assert {field for field in found if not field.isdigit()} <= sentences._WORDS.keys() | known
 
 
 if __name__ == "__main__":

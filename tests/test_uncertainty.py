@@ -11,13 +11,13 @@ import scipy.signal
 import scipy.stats
 from models import STILL, VEHICLE_TRUTH, curve, drive, positions, rest
 from test_report import comparison_of, made, trajectory_of, warnings_of
+from test_report import write_report as report
 
 import switchfit as sf
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import disagreement
 from switchfit.optimize import Status
-from switchfit.report.text import report
 from switchfit.uncertainty.certificate import Identifiability, analyse, certify
 from switchfit.uncertainty.residuals import correct_correlation, diagnose, diagnose_channel
 

@@ -17,7 +17,7 @@ from switchfit import cli
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
 from switchfit.optimize import Status
-from switchfit.report.verdict import format_share
+from switchfit.report.sentences import format_share
 from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.answers import Doubt, Numbers, compare_with_sigma, find_doubts, find_levels
 from switchfit.uncertainty.residuals import correct_correlation

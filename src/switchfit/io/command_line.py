@@ -30,11 +30,10 @@ from switchfit.report.formats import (
     format_iso,
     format_table,
     format_time,
-    format_unknown,
-    list_dated_unknowns,
+    list_dated,
     list_jumps,
 )
-from switchfit.report.verdict import write_reason, write_step
+from switchfit.report.sentences import write_reason, write_step
 from switchfit.runtime.errors import InputError
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
@@ -138,12 +137,12 @@ def describe(problem: Problem, *, full: bool = False) -> str:
     rows = []
     numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
     columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
-    dated = list_dated_unknowns(problem)
+    dated = list_dated(problem)
     for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
-        ends = [format_unknown(end, run) for end in (lower, upper)]
+        ends = [format_time(end, run) for end in (lower, upper)]
         bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{ends[0]}, {ends[1]}]"
         known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
-        rows.append((name, f"{format_unknown(value, run)}{'' if run else unit_suffix(unit)}", bounds, known, scale))
+        rows.append((name, f"{format_time(value, run)}{'' if run else unit_suffix(unit)}", bounds, known, scale))
     if not full and len(rows) > MOST_UNKNOWNS:
         kept = MOST_UNKNOWNS - 2
         rows = [*rows[:kept], (f"and {len(rows) - kept} more", "", "", "", "")]

@@ -22,7 +22,7 @@ from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
 from switchfit.report.formats import add_dates, format_iso, format_rounded, label_quantity, list_dated
 from switchfit.report.frames import ERROR, list_holds
-from switchfit.report.verdict import write_reason
+from switchfit.report.sentences import write_reason
 from switchfit.runtime.frames import describe_frame
 from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.answers import UNLIKELY

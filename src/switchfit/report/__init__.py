@@ -15,5 +15,4 @@ from switchfit.report import (  # noqa: F401
     text,
     uncertainty,
     validation,
-    verdict,
 )

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib import rcParams
-from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num, num2date
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
@@ -19,7 +18,6 @@ from matplotlib.ticker import Formatter, Locator
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
-from switchfit.report.formats import Timed, label_time, label_unknown
 
 DOTS = 96
 """Dots per inch in a notebook."""
@@ -107,52 +105,7 @@ LONGEST = 1000 * 365.25
 """Days from 1970 that an axis may reach."""
 
 
-def label_axis(ax: Axes, run: Timed) -> Axes:
-    """Label an axis of times; where they are dates, put its ticks at dates. What is drawn remains in numbers.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-    run : Timed
-    """
-    ax.set_xlabel(label_time(run))
-    return put_ticks(ax, run)
-
-
-def put_ticks(ax: Axes, run: Timed) -> Axes:
-    """Put the ticks of the horizontal axis at dates, where times are dates.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-    run : Timed
-    """
-    if run.origin is not None:
-        scale = _Scale(run.origin, run.time_unit)
-        if np.all(np.abs(scale.to_days(ax.xaxis.get_view_interval())) < LONGEST):
-            locator = DateLocator(scale)
-            ax.xaxis.set_major_locator(locator)
-            ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
-    return ax
-
-
-def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axes:
-    """Label a horizontal axis of values of an unknown, with ticks at dates if it is a time of a run with dates.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-    name, unit : str
-    run : Timed or None
-    """
-    ax.set_xlabel(label_unknown(name, unit, run))
-    if run is not None:
-        return put_ticks(ax, run)
-    ax.ticklabel_format(axis="x", useOffset=False)
-    return ax
-
-
-class _Scale:
+class Scale:
     """Times as the days of matplotlib, and back."""
 
     def __init__(self, origin: Origin, time_unit: str) -> None:
@@ -172,10 +125,10 @@ class DateLocator(Locator):
 
     Parameters
     ----------
-    scale : _Scale
+    scale : Scale
     """
 
-    def __init__(self, scale: _Scale) -> None:
+    def __init__(self, scale: Scale) -> None:
         self.scale = scale
         self.dates = AutoDateLocator(tz=scale.zone, minticks=2, maxticks=MOST_TICKS)
 
@@ -198,11 +151,11 @@ class DateFormatter(Formatter):
 
     Parameters
     ----------
-    scale : _Scale
+    scale : Scale
     locator : DateLocator
     """
 
-    def __init__(self, scale: _Scale, locator: DateLocator) -> None:
+    def __init__(self, scale: Scale, locator: DateLocator) -> None:
         self.scale = scale
         self.dates = ConciseDateFormatter(
             locator.dates, tz=scale.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS

@@ -18,13 +18,13 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.formats import (
-    Clock,
     Table,
     format_estimate,
     format_table,
-    format_unknown,
+    format_time,
     label_quantity,
     label_unknown,
+    list_dated,
     wrap_text,
 )
 from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN
@@ -85,8 +85,7 @@ def write_fits(fits: Fits) -> str:
         lines.append(f"resampled: {what}")
     minima = [f"{format_count(_count_minima(fits), 'minimum', 'minima')}:"] if isinstance(fits, Multistart) else []
     table, note = tabulate_study(fits)
-    written = format_table(*table, indent="") if table.rows else []
-    return "\n".join([*lines, "", *minima, *written, *([note] if note else [])])
+    return "\n".join([*lines, "", *minima, *format_table(*table, indent=""), *([note] if note else [])])
 
 
 def _count_minima(study: Multistart) -> int:
@@ -109,29 +108,26 @@ def tabulate_study(study: Fits) -> tuple[Table, str]:
     if len(fits) > LISTED_FITS:
         listed = fits.worst_first[:LISTED_WORST].tolist()
         notes.append(f"the worst {LISTED_WORST} of {len(fits)} fits; .to_pandas() has all of them")
-    shown, errors = select_unknowns(fits, LISTED_COLUMNS), fits.standard_errors
-    rows = [["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]]
+    shown, errors, clocks = select_unknowns(fits, LISTED_COLUMNS), fits.standard_errors, list_dated(fits)
+    titles, rows = ["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))], []
     for k in listed:
-        cells = [part for i in shown for part in format_estimate(fits.theta[k, i], errors[k, i], find_clock(fits, i))]
+        cells = [part for i in shown for part in format_estimate(fits.theta[k, i], errors[k, i], clocks[i])]
         rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
     notes += filter(None, [_count_rest(fits, shown)])
-    return Table(rows, ">" + "<>" + "><" * len(shown)), "\n".join(notes)
+    return Table(rows, "><>" + "><" * len(shown), titles), "\n".join(notes)
 
 
 @tabulate_study.register
 def tabulate_minima(study: Multistart) -> tuple[Table, str]:
     """Return a row for each of the ten lowest minima: J, how many starts ended there, and where it is."""
-    rows = []
+    rows, clocks = [], list_dated(study)
     shown = select_unknowns(study, LISTED_PLACES)
     for k in range(min(_count_minima(study), LISTED_MINIMA)):
         here = np.flatnonzero(study.clusters == k)
         places = []
         for i in shown:
-            clock = find_clock(study, i)
-            value = format_unknown(study.theta[here[0], i], clock) + (
-                "" if clock else unit_suffix(study.theta_units[i])
-            )
-            places.append(f"{study.theta_names[i]} = {value}")
+            unit = "" if clocks[i] else unit_suffix(study.theta_units[i])
+            places.append(f"{study.theta_names[i]} = {format_time(study.theta[here[0], i], clocks[i])}{unit}")
         more = len(study.theta_names) - len(shown)
         place = ", ".join(places) + (f" and {more} more" if more else "")
         rows.append((f"J = {study.cost[here].min():.9g}", format_count(len(here), "start"), place))
@@ -161,15 +157,15 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
     with np.errstate(invalid="ignore"):
         reported = np.median(study.standard_errors[study.success], axis=0)
-    rows: list[Sequence[str]] = [("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")]
-    shown = select_unknowns(study, LISTED_UNKNOWNS)
+    rows, shown, clocks = [], select_unknowns(study, LISTED_UNKNOWNS), list_dated(study)
     for i in shown:
-        truth = format_unknown(study.truth[i], find_clock(study, i), spread[i])
+        truth = format_time(study.truth[i], clocks[i], spread[i])
         error = "-" if np.isnan(reported[i]) else f"{reported[i]:.3e}"
         covered = "-" if np.isnan(coverage[i]) else f"{100 * coverage[i]:.1f} %"
         sizes = f"{bias[i]:+.2e}", f"{spread[i] / np.sqrt(count):.1e}", f"{spread[i]:.3e}"
         rows.append((_label(study, i), truth, *sizes, error, covered))
-    return Table(rows, "<" + ">" * 6), _count_rest(study, shown)
+    titles = ("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")
+    return Table(rows, "<" + ">" * 6, titles), _count_rest(study, shown)
 
 
 @tabulate_study.register
@@ -177,22 +173,15 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
     """Return a row for each unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
     if int(study.success.sum()) < 2:
         return Table([], ""), TOO_FEW
-    rows: list[Sequence[str]] = [("", "estimate", "bias", "standard error", "95 % interval (BCa)")]
-    shown = select_unknowns(study, LISTED_UNKNOWNS)
+    rows, shown, clocks = [], select_unknowns(study, LISTED_UNKNOWNS), list_dated(study)
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
     for k in shown:
-        clock = find_clock(study, k)
-        ends = ", ".join(format_unknown(end, clock, error[k]) for end in intervals[k])
+        ends = ", ".join(format_time(end, clocks[k], error[k]) for end in intervals[k])
         spread = f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends}]"
         spread = spread if study.resampled[k] else ("-", "-", "of one run alone")
-        rows.append((_label(study, k), format_unknown(study.estimate[k], clock, error[k]), *spread))
-    return Table(rows, "<" + ">" * 4), _count_rest(study, shown)
-
-
-def find_clock(fits: Fits, k: int) -> Clock | None:
-    """Return what the numbers of unknown k are as dates; None if they are no dates."""
-    origin = fits.date_origins[k]
-    return None if origin is None else Clock(origin, fits.theta_units[k])
+        rows.append((_label(study, k), format_time(study.estimate[k], clocks[k], error[k]), *spread))
+    titles = ("", "estimate", "bias", "standard error", "95 % interval (BCa)")
+    return Table(rows, "<" + ">" * 4, titles), _count_rest(study, shown)
 
 
 def _label(fits: Fits, k: int) -> str:
@@ -356,10 +345,8 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
 
 def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
     """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
-    from switchfit.report.axes import label_unknown_axis
-
-    clock = find_clock(fits, k)
-    label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
+    clock = list_dated(fits)[k]
+    style.label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
     if clock is None:
         ax.locator_params(axis="x", nbins=4)
 
@@ -428,8 +415,6 @@ def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figur
 
 
 def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
-    from matplotlib.ticker import MaxNLocator
-
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
     costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
     floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding
@@ -447,7 +432,7 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
     ax.set_ylim(
         floor / 3, max(3 * np.nanmax(height, initial=floor), 1e3 * floor)
     )  # all in one minimum: a few decades, not one tick
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.locator_params(axis="x", integer=True)
     ax.set_xlim(0.5, len(order) + 0.5)
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")
@@ -483,7 +468,8 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
     # Ends that agree to what the search tells apart stand in the middle, and rounding does not fill the axis.
     same = span <= SAME * np.maximum(np.abs(low), np.abs(high))
     places = np.where(same, 0.5, (ends - low) / np.where(same, 1.0, span))
-    rows, clocks = np.arange(len(shown)), [find_clock(study, i) for i in shown]
+    rows, dated = np.arange(len(shown)), list_dated(study)
+    clocks = [dated[i] for i in shown]
     for rank, r in enumerate(sorted(np.flatnonzero(there), key=lambda r: study.cost[r])):
         k = int(study.clusters[r])
         label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
@@ -492,7 +478,7 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
     settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
     for row in rows[: len(shown) if there.any() else 0]:
         error = np.nan if same[row] else span[row] / 10
-        first, last = (format_unknown(end, clocks[row], error) for end in (low[row], high[row]))
+        first, last = (format_time(end, clocks[row], error) for end in (low[row], high[row]))
         if not same[row]:
             ax.text(-0.04, row, first, ha="right", **settings)
         ax.text(1.04, row, last, ha="left", **settings)

@@ -12,18 +12,17 @@ from __future__ import annotations
 import datetime
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from switchfit.batch.fits import Fits
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
-from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.runtime.presentation import format_count
@@ -95,9 +94,6 @@ PLACES = ((86400.0, ""), (3600.0, " %Hh"), (60.0, " %H:%M"), (1.0, " %H:%M:%S"))
 """Seconds of the last place that is shown, and what is shown behind the day."""
 
 
-Run = TypeVar("Run", Trajectory, Experiment)
-
-
 class Timed(Protocol):
     """What has times: a trajectory, an experiment, residuals of a channel."""
 
@@ -117,21 +113,22 @@ class Clock(NamedTuple):
     time_unit: str
 
 
-def format_time(time: float, run: Timed, error: float = np.nan, *, digits: int = 6) -> str:
-    """Return a time as text: a date, or a number without its unit.
+def format_time(time: float, run: Timed | None, error: float = np.nan, *, digits: int = 6) -> str:
+    """Return a time, or the value of an unknown, as text: a date, or a number without its unit.
 
     Parameters
     ----------
     time : float
-    run : Timed
+    run : Timed or None
+        None for what is no time.
     error : float, optional
         Its standard error, from which the resolution of a date follows; if it is not known, a date is written to a
         thousandth of the time unit, as far as there is something to be written.
     digits : int, optional
         Significant digits of a number.
     """
-    date = None if run.origin is None else run.origin.find_date(time, run.time_unit)
-    if date is None:
+    date = None if run is None or run.origin is None else run.origin.find_date(time, run.time_unit)
+    if run is None or date is None:
         return f"{time:.{digits}g}"
     unit = SECONDS[normalize_time_unit(run.time_unit)]
     if np.isfinite(error) and error > 0:
@@ -177,8 +174,12 @@ def format_iso(time: float, run: Timed) -> str:
 
 def format_span(first: float, last: float, run: Timed) -> str:
     """Return two times as text: "0 to 6 h", or "2020-03-02 to 2020-04-21"."""
-    text = f"{format_time(first, run)} to {format_time(last, run)}"
-    return text if run.origin is not None else f"{text}{unit_suffix(run.time_unit)}"
+    return f"{format_time(first, run)} to {format_time(last, run)}{suffix_time(run)}"
+
+
+def suffix_time(run: Timed) -> str:
+    """Return what stands behind a time: its unit, such as " h"; nothing behind a date."""
+    return unit_suffix(run.time_unit) if run.origin is None else ""
 
 
 def describe_origin(run: Timed) -> str:
@@ -206,22 +207,19 @@ def label_unknown(name: str, unit: str, run: Timed | None) -> str:
     return label_quantity(name, unit) if run is None else label_time(run, name)
 
 
-def list_dated(fit: Fit) -> list[Trajectory | None]:
-    """Return the trajectory of each unknown that is a time of an experiment with dates; None for every other."""
-    places = [np.append(own, end) for own, end in zip(fit.transition_places, fit.final_places, strict=True)]
-    return _spread_runs(len(fit.theta_names), fit.trajectories, places)
-
-
-def list_dated_unknowns(problem: Problem) -> list[Experiment | None]:
-    """Return the experiment of each unknown of a problem that is a time and a date; None for every other."""
-    return _spread_runs(len(problem.theta_names), problem.experiments, problem.unknowns.times)
-
-
-def _spread_runs(count: int, runs: Sequence[Run], times: Sequence[NDArray[np.intp]]) -> list[Run | None]:
-    """Return for each unknown the run with dates of which it is a time, from the places of the times of each run."""
-    found: list[Run | None] = [None] * count
-    for run, places in zip(runs, times, strict=True):
-        for place in places[places >= 0].tolist() if run.origin is not None else ():
+def list_dated(result: Fit | Problem | Fits) -> list[Timed | None]:
+    """Return what has each unknown that is a time with dates as a time: its run; None for every other unknown."""
+    if isinstance(result, Fits):
+        origins = zip(result.date_origins, result.theta_units, strict=True)
+        return [None if origin is None else Clock(origin, unit) for origin, unit in origins]
+    if isinstance(result, Problem):
+        pairs: Iterable[tuple[Timed, Any]] = zip(result.experiments, result.unknowns.times, strict=True)
+    else:
+        places = map(np.append, result.transition_places, result.final_places)
+        pairs = zip(result.trajectories, places, strict=True)
+    found: list[Timed | None] = [None] * len(result.theta_names)
+    for run, own in pairs:
+        for place in own[own >= 0].tolist() if run.origin is not None else ():
             found[place] = run
     return found
 
@@ -269,21 +267,8 @@ def describe_clock(run: Timed) -> dict[str, Any] | None:
     return {"start": run.origin.instant / 1e6 + shift, "length": length, "zone": known, "named": named}
 
 
-def format_unknown(value: float, run: Timed | None, error: float = np.nan) -> str:
-    """Return the value of an unknown without its unit: a date if it is a time of a run with dates.
-
-    Parameters
-    ----------
-    value : float
-    run : Timed or None
-    error : float, optional
-        Its standard error.
-    """
-    return f"{value:.6g}" if run is None else format_time(value, run, error)
-
-
 def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str, str]:
-    """Return the estimate of an unknown as `format_unknown` does, otherwise rounded, and "± error".
+    """Return the estimate of an unknown, a date or rounded, and "± error".
 
     Parameters
     ----------
@@ -292,7 +277,7 @@ def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str,
     run : Timed or None
     """
     number, spread, _ = format_rounded(value, error)
-    return number if run is None else format_time(value, run, error), spread
+    return number if run is None or run.origin is None else format_time(value, run, error), spread
 
 
 class Table(NamedTuple):
@@ -301,17 +286,19 @@ class Table(NamedTuple):
     Attributes
     ----------
     rows : sequence of sequences of str, of the same length each
-        A header is a row like others.
     alignment : str
         A character for each column: "<" aligns it to the left, ">" to the right.
+    titles : sequence of str
+        Of the columns; empty for a table without a header.
     """
 
     rows: Sequence[Sequence[str]]
     alignment: str
+    titles: Sequence[str] = ()
 
     @property
     def columns(self) -> list[int]:
-        """Columns that have an entry in some row."""
+        """Columns that have an entry in some row; the others are left out."""
         return [k for k in range(len(self.alignment)) if any(row[k] for row in self.rows)]
 
 
@@ -322,32 +309,21 @@ MOST_JUMPS = 6
 """Times of jumps that are listed; of more, the first ones and the last."""
 
 
-def format_table(rows: Sequence[Sequence[str]], alignment: str, *, indent: str = "  ") -> list[str]:
-    """Return rows as lines with their columns aligned, two spaces between them; columns without an entry are left out.
+def format_table(
+    rows: Sequence[Sequence[str]], alignment: str, titles: Sequence[str] = (), *, indent: str = "  "
+) -> list[str]:
+    """Return the lines of a table with its columns aligned, two spaces between them.
 
     Parameters
     ----------
-    rows : sequence of sequences of str, of the same length each
-        A header is a row like others.
-    alignment : str
-        A character for each column: "<" aligns it to the left, ">" to the right.
+    rows, alignment, titles
+        As of `Table`.
     indent : str, optional
         What every line begins with.
     """
-    columns = Table(rows, alignment).columns
-    widths = {k: max(len(row[k]) for row in rows) for k in columns}
-    return [(indent + "  ".join(f"{row[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for row in rows]
-
-
-def name_columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a header without the titles of columns that have no entry, so that these are left out.
-
-    Parameters
-    ----------
-    titles : sequence of str
-    rows : sequence of sequences of str
-    """
-    return [title if any(row[k] for row in rows) else "" for k, title in enumerate(titles)]
+    columns, lines = Table(rows, alignment).columns, [titles, *rows] if titles and rows else rows
+    widths = {k: max(len(line[k]) for line in lines) for k in columns}
+    return [(indent + "  ".join(f"{line[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for line in lines]
 
 
 def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:
@@ -376,5 +352,4 @@ def list_jumps(times: FloatArray, run: Timed) -> str:
     shown = [format_time(time, run) for time in times.tolist()]
     if len(shown) > MOST_JUMPS:
         shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
-    unit = "" if run.origin is not None else unit_suffix(run.time_unit)
-    return f"{format_count(len(times), 'jump')} at {', '.join(shown)}{unit}" if shown else ""
+    return f"{format_count(len(times), 'jump')} at {', '.join(shown)}{suffix_time(run)}" if shown else ""

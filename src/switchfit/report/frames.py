@@ -21,7 +21,7 @@ from switchfit.report.formats import format_iso, format_unit, get_unit, list_dat
 from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
-from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, correct_intervals
+from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, correct_intervals, list_channels
 
 ERROR, LOW, HIGH = "{} std. error", "{} low", "{} high"
 """Names of the columns beside an unknown: its standard error, and the ends of its 95 % interval."""
@@ -128,25 +128,21 @@ def _split(values: FloatArray, rows: tuple[str], names: Sequence[str], units: Se
 def _describe_residuals(estimate: Estimate) -> Frame:
     """Return a row for each value that was measured, in the order of runs, data and channels."""
     parts: list[dict[str, NDArray[Any]]] = []
-    for e, comparisons in enumerate(estimate.comparisons):
-        for comparison in comparisons:
-            channels = range(len(comparison.names))
-            units = [get_unit(comparison, k, estimate.trajectories[e]) for k in channels]
-            k, i = np.nonzero(np.isfinite(comparison.measured.T))
-            sigma = np.full(len(i), np.nan) if comparison.sigma is None else comparison.sigma[i, k]
-            residual = comparison.residuals[i, k]
-            columns: dict[str, NDArray[Any]] = {
-                "run": np.full(len(i), estimate.run_names[e]),
-                "channel": np.array(comparison.names, dtype=str)[k],
-                "time": comparison.times[i],
-                "measured": comparison.measured[i, k],
-                "fitted": comparison.fitted[i, k],
-                "residual": residual,
-                "sigma": sigma,
-                "standardized": residual / sigma,
-                "unit": np.array(units, dtype=str)[k],
-            }
-            parts.append(columns)
+    for _, e, comparison, k in list_channels(estimate.comparisons, estimate.run_names):
+        i = np.flatnonzero(np.isfinite(comparison.measured[:, k]))
+        sigma = np.full(len(i), np.nan) if comparison.sigma is None else comparison.sigma[i, k]
+        columns: dict[str, NDArray[Any]] = {
+            "run": np.full(len(i), estimate.run_names[e]),
+            "channel": np.full(len(i), comparison.names[k]),
+            "time": comparison.times[i],
+            "measured": comparison.measured[i, k],
+            "fitted": comparison.fitted[i, k],
+            "residual": comparison.residuals[i, k],
+            "sigma": sigma,
+            "standardized": comparison.residuals[i, k] / sigma,
+            "unit": np.full(len(i), get_unit(comparison, k, estimate.trajectories[e])),
+        }
+        parts.append(columns)
     rows = ("sample",)
     names = list(parts[0]) if parts else []
     variables = [Variable(name, np.concatenate([part[name] for part in parts]), rows) for name in names]

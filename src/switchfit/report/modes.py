@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,17 +17,27 @@ from switchfit.problem.validation import join_names
 from switchfit.report import style
 from switchfit.report.formats import (
     Clock,
+    Table,
     Timed,
     format_estimate,
     format_rounded,
     format_table,
     format_time,
     label_quantity,
-    name_columns,
+    label_time,
+    suffix_time,
     wrap_text,
 )
-from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state, plot_transitions
-from switchfit.report.sentences import ALLOWED
+from switchfit.report.plot import (
+    choose_mode_colours,
+    plot_band,
+    plot_comparison,
+    plot_modes,
+    plot_state,
+    plot_transitions,
+    replace_infinities,
+)
+from switchfit.report.sentences import ALLOWED, capitalise
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
@@ -238,15 +248,19 @@ def write_search(search: ModeSearch) -> str:
 
 def _tabulate_segments(
     modes: Sequence[str], times: FloatArray, errors: FloatArray, ends: Sequence[str], run: Timed
-) -> Iterator[Sequence[str]]:
-    """Yield a header, and a row for each segment: mode, from, the standard error of that, and to."""
-    dated = None if run.origin is None else run
-    unit, spread_unit = (f" ({run.time_unit})", "") if dated is None else ("", f" {run.time_unit}")
-    known = [format_estimate(time, error, dated) for time, error in zip(times.tolist(), errors.tolist(), strict=True)]
+) -> Table:
+    """Return a row for each segment: mode, from, the standard error of that, and to."""
+    known = [format_estimate(time, error, run) for time, error in zip(times.tolist(), errors.tolist(), strict=True)]
     shown = [ends[0], *(time for time, _ in known), ends[1]]
+    spread_unit = "" if run.origin is None else f" {run.time_unit}"
     spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in known)]
-    yield "mode", f"from{unit}", "", f"to{unit}"
-    yield from zip(modes, shown[:-1], spreads, shown[1:], strict=True)
+    titles = ["mode", _title_time(run, "from"), "", _title_time(run, "to")]
+    return Table(list(zip(modes, shown[:-1], spreads, shown[1:], strict=True)), "<>>>", titles)
+
+
+def _title_time(run: Timed, name: str) -> str:
+    """Return the title of a column of times, with their unit unless they are dates."""
+    return name if run.origin is not None else label_time(run, name)
 
 
 def list_segments(search: ModeSearch) -> list[str]:
@@ -257,7 +271,7 @@ def list_segments(search: ModeSearch) -> list[str]:
         ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
         if len(best.sequences) > 1:
             lines.append(f"{search.run_names[e]}:")
-        lines += format_table(list(_tabulate_segments(sequence, times, errors[e], ends, run)), "<>>>")
+        lines += format_table(*_tabulate_segments(sequence, times, errors[e], ends, run))
     return lines
 
 
@@ -288,15 +302,15 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
     discounted = is_discounted(search)
     extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
-    header = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
-    rows = [header]
+    titles = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
+    rows: list[list[str]] = []
     for fit in search.fitted:
         cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
             cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
         cells += [f"{getattr(fit, name):.1f}" for name in likely]
         rows += _extend_row(cells, _list_lines(search, fit))
-    return format_table(rows, "<" + ">" * (len(header) - 2) + "<")
+    return format_table(rows, "<" + ">" * (len(titles) - 2) + "<", titles)
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
@@ -304,11 +318,12 @@ def list_alternatives(search: ModeSearch) -> list[str]:
     name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
     lowest = getattr(search.chosen[0], name)
     label = name_criterion(name) if name == "mbic" else name_decider(search)
-    rows = [["weight", f"{label} above the best", _title_sequences(search, "alternatives")]]
+    titles = ["weight", f"{label} above the best", _title_sequences(search, "alternatives")]
+    rows: list[list[str]] = []
     for fit in search.chosen[:LISTED]:
         rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
     more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
-    return ["", *format_table(rows, ">><"), *more]
+    return ["", *format_table(rows, ">><", titles), *more]
 
 
 def _title_sequences(search: ModeSearch, what: str) -> str:
@@ -376,8 +391,6 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     search : ModeSearch
     ax : matplotlib.axes.Axes
     """
-    from matplotlib.ticker import MaxNLocator
-
     numbers = [fit.switches for fit in search.fitted]
     names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
     names += ["criterion"] if is_discounted(search) or not names else []
@@ -393,7 +406,7 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax.set_ylim(bottom=-1.0)
     ax.set_xlabel("number of switches")
     ax.set_ylabel("above the lowest")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.locator_params(axis="x", integer=True)
     if ax.lines:
         ax.legend(fontsize=SMALL)
     return ax
@@ -425,9 +438,7 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
     stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), ax)
     if search.best is not None:
-        from switchfit.report.axes import label_axis  # here, since it imports matplotlib
-
-        label_axis(ax, search.best.trajectories[e])
+        style.label_axis(ax, search.best.trajectories[e])
     return ax
 
 
@@ -467,14 +478,14 @@ def write_insertion(found: Insertion) -> str:
     lines = [] if pulses else ["No short pulse of any mode lowers J."]
     if pulses:
         best = pulses[0]
-        at = format_time(best.time, run) + ("" if run.origin is not None else f" {run.time_unit}")
+        at = format_time(best.time, run) + suffix_time(run)
         speed = f"{-best.rate:.4g} per {run.time_unit} of its length"
         lines += wrap_text(f"A short pulse of {best.mode} at {at} lowers J fastest: by {speed}.")
-        rows = [("mode", "time" if run.origin is not None else f"time ({run.time_unit})", "dJ / d length", "in")]
+        rows = []
         for pulse in pulses:
             interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
             rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
-        lines += ["", *format_table(rows, "<>><")]
+        lines += ["", *format_table(rows, "<>><", ["mode", _title_time(run, "time"), "dJ / d length", "in"])]
     undefined = [
         f"{mode} in {found.modes[m]}"
         for m in np.unique(found.active).tolist()
@@ -529,13 +540,13 @@ def write_log(log: OnlineLog) -> str:
     ----------
     log : OnlineLog
     """
-    run, unit = (None, unit_suffix(log.time_unit)) if log.origin is None else (log, "")
+    unit = suffix_time(log)
     now, end = log.now, format_time(log.now.time, log)
     error = now.time_errors[-1] if len(now.time_errors) else np.nan
-    since = format_estimate(now.since, float(error), run)[0]
+    since = format_estimate(now.since, float(error), log)[0]
     changes = format_count(len(now.transition_times), "change")
     first = f"{now.mode} since {since}{unit}, after {changes} of mode up to {end}{unit}."
-    lines = wrap_text(f"{first} {now.status.value[0].upper()}{now.status.value[1:]}.")
+    lines = wrap_text(f"{first} {capitalise(now.status.value)}.")
     lines += ["", *_list_modes(log), *_list_parameters(log), *_list_alarms(log), ""]
     counts = Counter(status.name for status in log.status)
     counted = ", ".join(f"{number} {name}" for name, number in counts.items())
@@ -550,8 +561,8 @@ def _list_modes(log: OnlineLog) -> list[str]:
     """Return a line for each of the last modes: from, the standard error of that, and to."""
     now = log.now
     ends = format_time(float(log.since[0]), log), "now"
-    header, *rows = _tabulate_segments(now.mode_sequence, now.transition_times, now.time_errors, ends, log)
-    return format_table([header, *rows[-LISTED_LAST:]], "<>>>")
+    table = _tabulate_segments(now.mode_sequence, now.transition_times, now.time_errors, ends, log)
+    return format_table(*table._replace(rows=table.rows[-LISTED_LAST:]))
 
 
 def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]]:
@@ -576,16 +587,15 @@ def _list_parameters(log: OnlineLog) -> list[str]:
 
 def _list_alarms(log: OnlineLog) -> list[str]:
     """Return a line for each of the last alarms: when it came, what it said then, and whether it was retracted."""
-    run, unit = (None, f" ({log.time_unit})") if log.origin is None else (log, "")
     rows = []
     for alarm in log.alarms[-LISTED_LAST:]:
-        began, spread = format_estimate(alarm.transition_time, alarm.standard_error, run)
+        began, spread = format_estimate(alarm.transition_time, alarm.standard_error, log)
         began = began if spread else format_time(alarm.transition_time, log)
         refuted = "retracted" if alarm in log.retracted else ""
         rows.append([format_time(alarm.time, log), alarm.mode, began, spread, f"{alarm.statistic:.1f}", refuted])
-    titles = name_columns([f"alarm at{unit}", "mode", f"since{unit}", " ", "statistic", "and then"], rows)
+    titles = [_title_time(log, "alarm at"), "mode", _title_time(log, "since"), "", "statistic", "and then"]
     more = [f"  {len(log.alarms) - LISTED_LAST} earlier ones in .alarms"] if len(log.alarms) > LISTED_LAST else []
-    return ["", *format_table([titles, *rows], "><>>><"), *more] if rows else ["", "  no alarm"]
+    return ["", *format_table(rows, "><>>><", titles), *more] if rows else ["", "  no alarm"]
 
 
 @draw_figure.register(OnlineLog)
@@ -596,8 +606,6 @@ def plot_log(log: OnlineLog) -> Figure:
     ----------
     log : OnlineLog
     """
-    from switchfit.report.axes import label_axis, put_ticks  # here, since it imports matplotlib
-
     values = _list_values(log)[:LISTED_LAST]
     figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))
     figure.get_layout_engine().set(h_pad=ROOM)  # type: ignore[union-attr,call-arg]
@@ -608,8 +616,8 @@ def plot_log(log: OnlineLog) -> Figure:
         _plot_value(log.times, value, error, ax)
         ax.set_ylabel(label_quantity(name, unit))
     for ax in axes[:-1]:
-        put_ticks(ax, log)
-    label_axis(axes[-1], log)
+        style.put_ticks(ax, log)
+    style.label_axis(axes[-1], log)
     return style.turn_off_formulas(figure)
 
 
@@ -623,7 +631,7 @@ def plot_probability(log: OnlineLog, ax: Axes) -> Axes:
     """
     stack_probabilities(log.times, log.modes, log.probability, ax)
     now = log.now
-    reach = QUANTILE * np.where(np.isfinite(now.time_errors), now.time_errors, np.nan)
+    reach = QUANTILE * now.time_errors
     ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
     return plot_transitions(now.transition_times, ends, ax)
 
@@ -640,8 +648,7 @@ def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
     for alarm in log.alarms:
         face = "none" if alarm in log.retracted else FIT
         ax.plot(alarm.time, alarm.statistic, "o", markersize=4, color=FIT, markerfacecolor=face)
-    ax.axhline(log.threshold, color=REFERENCE, linestyle="--", linewidth=THIN)
-    style.name_line(ax, "threshold", log.threshold, "left", color=REFERENCE)
+    style.draw_level(ax, "threshold", log.threshold, "left")
     if np.max(log.statistic) > FAR * log.threshold:
         ax.set_yscale("symlog", linthresh=log.threshold, linscale=2.0)
     ax.set_ylim(0.0, max(1.5 * log.threshold, ax.get_ylim()[1]))
@@ -651,13 +658,12 @@ def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
 
 def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> Axes:
     """Draw a parameter with its 95 % band, which is cut off where it is much wider than at the end."""
-    known = np.isfinite(error)
-    low, high = value - QUANTILE * error, value + QUANTILE * error
+    band = np.stack([value - QUANTILE * error, value + QUANTILE * error], axis=1)
     ax.plot(times, value, "-", color=FIT, linewidth=LINE, zorder=3)
-    reach = 3.0 * QUANTILE * error[-1] if known[-1] else 0.0
+    reach = 3.0 * QUANTILE * np.nan_to_num(error[-1], posinf=0.0)
     ax.set_ylim(*ax.get_ylim() + reach * np.array([-1.0, 1.0]))
     ax.set_autoscaley_on(False)
-    ax.fill_between(times, low, high, where=known, color=FIT, alpha=0.2, linewidth=0, zorder=2, label="95 %")
+    plot_band(times, replace_infinities(band), ax, alpha=0.2, label="95 %")
     ax.axhline(value[-1], color=TRANSITION, linestyle=":", linewidth=THIN, zorder=1)
     ax.tick_params(labelsize=SMALL)
     return ax

@@ -14,7 +14,6 @@ from html import escape
 import numpy as np
 
 from switchfit.batch.fits import Fits
-from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.result import ModeSearch
 from switchfit.problem.problem import Problem
@@ -24,8 +23,7 @@ from switchfit.report.formats import (
     describe_origin,
     format_time,
     format_unit,
-    format_unknown,
-    list_dated_unknowns,
+    list_dated,
 )
 from switchfit.report.plot import plot_fit
 from switchfit.report.text import SCREEN, select_unknowns, tabulate_unknowns
@@ -70,7 +68,7 @@ def show_problem(problem: Problem) -> str:
     ----------
     problem : Problem
     """
-    runs = [["experiment", "modes", "horizon", "", "samples"]]
+    runs, rows = [], []
     for number, experiment in enumerate(problem.experiments, start=1):
         ends = experiment.ends_of_modes(experiment.initial_times)
         samples = sum(getattr(item, "count", 0) for item in experiment.data)
@@ -80,12 +78,12 @@ def show_problem(problem: Problem) -> str:
         name = experiment.name or str(number)
         runs.append([name, modes, horizon, unit, f"{samples}" if samples else ""])
     own = problem.unknowns
-    rows = [["unknown", "first guess", "lower", "upper", "", "prior"]]
     columns = zip(own.names, own.initial, own.lower, own.upper, own.units, own.priors.texts(), strict=True)
-    for run, (name, value, lower, upper, unit, prior) in zip(list_dated_unknowns(problem), columns, strict=True):
-        bounds = [format_unknown(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
-        rows.append([name, format_unknown(value, run), *bounds, "" if run else format_unit(unit), prior])
-    first, second = Table(runs, "<<<<>"), Table(rows, "<>>><<")
+    for run, (name, value, lower, upper, unit, prior) in zip(list_dated(problem), columns, strict=True):
+        bounds = [format_time(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
+        rows.append([name, format_time(value, run), *bounds, "" if run else format_unit(unit), prior])
+    first = Table(runs, "<<<<>", ["experiment", "modes", "horizon", "", "samples"])
+    second = Table(rows, "<>>><<", ["unknown", "first guess", "lower", "upper", "", "prior"])
     return f"<div>{write_table(first, most=MOST_ROWS)}{write_table(second, most=2 * SCREEN.unknowns)}</div>"
 
 
@@ -98,7 +96,7 @@ def show_fits(fits: Fits) -> str:
     fits : Fits
     """
     table, note = tabulate_study(fits)
-    written = write_table(table, header=not isinstance(fits, Multistart)) if table.rows else ""
+    written = write_table(table) if table.rows else ""
     figure = write_figure(fits.plot(), "the fits") if len(fits) else ""
     return f"<div>{write_verdict_line(fits.verdict)}{written}{write_notes(note.splitlines())}{figure}</div>"
 
@@ -112,7 +110,7 @@ def show_validation(found: Validation) -> str:
     found : Validation
     """
     table = tabulate_predicted(found)
-    few = len(table.rows) - 1 <= LARGEST_FIGURE
+    few = len(table.rows) <= LARGEST_FIGURE
     figure = write_figure(found.plot(), "measured and predicted") if few else ""
     return f"<div>{write_verdict_line(found.verdict)}{write_table(table, most=MOST_ROWS)}{figure}</div>"
 
@@ -182,27 +180,25 @@ def write_verdict_line(verdict: Verdict) -> str:
     return f'<p style="{style}">{escape(str(verdict))}</p>'
 
 
-def write_table(table: Table, *, header: bool = True, most: int = sys.maxsize) -> str:
+def write_table(table: Table, *, most: int = sys.maxsize) -> str:
     """Return a table as HTML; columns without an entry are left out.
 
     Parameters
     ----------
     table : Table
-    header : bool, optional
-        Whether its first row is one.
     most : int, optional
-        Of more rows below the header the first are shown, and the others counted.
+        Of more rows the first are shown, and the others counted.
     """
+    head = f"<thead>{_write_row(table, table.titles, 'th')}</thead>" if table.titles else ""
+    body = "".join(_write_row(table, row, "td") for row in table.rows[:most])
+    more = len(table.rows) - most
+    return f"<table>{head}<tbody>{body}</tbody></table>{write_notes([f'And {more} more.'] if more > 0 else [])}"
+
+
+def _write_row(table: Table, row: Sequence[str], tag: str) -> str:
     sides = {k: "right" if table.alignment[k] == ">" else "left" for k in table.columns}
-    lines = []
-    for number, row in enumerate(table.rows[: most + header]):
-        tag = "th" if header and not number else "td"
-        cells = [f'<{tag} style="text-align: {side}">{escape(row[k])}</{tag}>' for k, side in sides.items()]
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    more = len(table.rows) - len(lines)
-    head = f"<thead>{lines.pop(0)}</thead>" if header else ""
-    rest = write_notes([f"And {more} more."] if more else [])
-    return f"<table>{head}<tbody>{''.join(lines)}</tbody></table>{rest}"
+    cells = [f'<{tag} style="text-align: {side}">{escape(row[k])}</{tag}>' for k, side in sides.items()]
+    return f"<tr>{''.join(cells)}</tr>"
 
 
 def write_figure(figure: Figure, what: str) -> str:

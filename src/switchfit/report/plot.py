@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +18,6 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
-from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
@@ -38,24 +36,6 @@ COLUMNS, WIDTHS = 4, (0.0, 8.0, 5.5, 4.5, 4.0)
 """Experiments side by side; inches of each of so many."""
 LONGEST_TIMELINE = 30
 """Experiments in one timeline."""
-PLOTS: dict[str, Callable[..., Any]] = {}
-"""Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
-
-
-@draw_figure.register(Estimate)
-def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> Axes | Figure:
-    """Draw one of the plots of an estimate.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    what : str
-        A name in `PLOTS`.
-    settings
-        Keyword arguments of its function.
-    """
-    drawn: Axes | Figure = PLOTS[what](estimate, **settings)
-    return drawn
 
 
 def has_bands(fit: Any) -> TypeGuard[Estimate]:
@@ -150,17 +130,20 @@ def plot_runs(
     runs = list(intervals)
     columns = min(max(len(runs), 1), COLUMNS)
     blocks = [runs[first : first + columns] for first in range(0, len(runs), columns)]
-    panels = [max(len(_list_panels(result, e)) for e in block) for block in blocks]
+    panels = [max(_count_panels(result, e) for e in block) for block in blocks]
     heights = [0.6 + 2.5 * number for number in panels]
     figure = style.make_figure(WIDTHS[columns] * columns, 0.7 + sum(heights))
     grid = figure.add_gridspec(len(blocks), columns, height_ratios=heights)
     colours = choose_mode_colours(result.trajectories)
     for place, e in enumerate(runs):
         block = figure.add_subfigure(grid[divmod(place, columns)])
-        _draw_experiment(result, e, block, panels[place // columns], colours, intervals[e], label)
+        _draw_experiment(result, e, block, panels[place // columns], colours, label)
         if e in predictions:
             _draw_bands(bool(result.comparisons[e]), block.axes, predictions[e], level)
-    handles = style.collect_handles(figure.axes) | make_transition_handles(list(intervals.values()), level)
+        times = [begin for _, begin, _ in result.trajectories[e].mode_spans[1:]]
+        for ax in block.axes:  # labels in one of them, so that they come last in the legend
+            plot_transitions(times, intervals[e], ax, level=level if ax is block.axes[-1] else None)
+    handles = style.collect_handles(figure.axes)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for e in runs for mode, a, b in result.trajectories[e].mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
@@ -192,13 +175,9 @@ def plot_comparison(
     matplotlib.axes.Axes
     """
     measured = replace_infinities(comparison.measured[:, channel])
-    if comparison.kind == "measurements":
-        ax.plot(comparison.times, measured, label="measured", zorder=3, **draw_dots(len(measured)))
-        _mark_outliers(comparison, measured, channel, ax)
-    else:
-        look: dict[str, Any] = {"color": REFERENCE, "linewidth": LINE, "zorder": 3}
-        ax.plot(comparison.times, measured, "--", label="reference signal", **look)
-    times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
+    draw_measured(comparison, comparison.times, measured, ax)
+    _mark_outliers(comparison, measured, channel, ax)
+    times, curve = break_at_transitions(comparison.curve_times, replace_infinities(comparison.curve[:, channel]))
     with style.draw_within(ax, curve):
         ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
     ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
@@ -224,10 +203,9 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
     if comparison.kind == "measurements":
         ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
-        _mark_outliers(comparison, residual, channel, ax)
     else:
-        times, line = _break_at_gaps(comparison.times, residual, trajectory)
-        ax.plot(times, line, "-", color=style.REFERENCE, linewidth=THIN, zorder=3)
+        ax.plot(*break_at_transitions(comparison.times, residual), "-", color=style.REFERENCE, linewidth=THIN, zorder=3)
+    _mark_outliers(comparison, residual, channel, ax)
     if comparison.sigma is not None:
         sigma = replace_infinities(comparison.sigma[:, channel])
         for side, label in ((sigma, "± sigma"), (-sigma, "")):
@@ -252,7 +230,7 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     -------
     matplotlib.axes.Axes
     """
-    times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
+    times, curve = break_at_transitions(trajectory.times, replace_infinities(trajectory.states[:, state]))
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
     ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
     return _label_time_axis(ax, trajectory)
@@ -289,7 +267,7 @@ def plot_modes(
     return _label_time_axis(ax, trajectory)
 
 
-def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
+def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes, *, level: float | None = None) -> Axes:
     """Draw the transition times as vertical lines, each in a band that is its interval.
 
     Parameters
@@ -298,6 +276,8 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
     intervals : (N, 2) array_like
         Low and high end of each. No band is drawn where one is NaN, or where they are equal.
     ax : matplotlib.axes.Axes
+    level : float, between 0 and 1, optional
+        Of the intervals; lines and bands have labels for a legend where it is given.
 
     Returns
     -------
@@ -305,51 +285,35 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
     """
     ends: FloatArray = np.asarray(intervals, dtype=np.float64).reshape(-1, 2)
     for time, (low, high) in zip(np.asarray(times).tolist(), ends.tolist(), strict=True):
-        ax.axvline(time, color=TRANSITION, linewidth=THIN, zorder=2)
+        line, band = (None, None) if level is None else ("transition", f"transition, {100 * level:g} % interval")
+        ax.axvline(time, color=TRANSITION, linewidth=THIN, zorder=2, label=line)
         if np.isfinite(high - low) and high > low:
-            ax.axvspan(low, high, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1)
+            ax.axvspan(low, high, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1, label=band)
     return ax
 
 
-def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance: float) -> Axes:
-    """Draw the optimality against iteration on a logarithmic scale.
-
-    Parameters
-    ----------
-    history : sequence of IterationRecord
-        As in `Fit.history`. An optimality of 0 is left out.
-    ax : matplotlib.axes.Axes
-    tolerance : float
-        Drawn as a line.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-    """
-    from matplotlib.ticker import MaxNLocator
-
-    optimality = np.array([record.optimality for record in history], dtype=np.float64)
-    shown = np.where(optimality > 0, optimality, np.nan)
-    ax.set_yscale("log")
-    ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
-    ax.axhline(tolerance, color=style.REFERENCE, linestyle="--", linewidth=THIN)
-    style.name_line(ax, "tolerance", tolerance, "left", color=style.REFERENCE)  # where the curve is far above it
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("iteration")
-    ax.set_ylabel("optimality (KKT residual)")
-    return ax
-
-
-def plot_course(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw the optimality of a fit against iteration, with its tolerance.
+def plot_convergence(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the optimality of a fit against iteration on a logarithmic scale, with its tolerance.
 
     Parameters
     ----------
     estimate : Fit
+        An optimality of 0 in its history is left out.
     ax : matplotlib.axes.Axes, optional
     """
-    draw = partial(plot_convergence, estimate.history, tolerance=estimate.tolerance)
-    return style.draw_on(ax, draw, (6.4, 3.4))
+    return style.draw_on(ax, lambda ax: _draw_convergence(estimate, ax), (6.4, 3.4))
+
+
+def _draw_convergence(fit: Fit, ax: Axes) -> Axes:
+    optimality = np.array([record.optimality for record in fit.history], dtype=np.float64)
+    shown = np.where(optimality > 0, optimality, np.nan)
+    ax.set_yscale("log")
+    ax.plot([record.iteration for record in fit.history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
+    style.draw_level(ax, "tolerance", fit.tolerance, "left")  # where the curve is far above it
+    ax.locator_params(axis="x", integer=True)
+    ax.set_xlabel("iteration")
+    ax.set_ylabel("optimality (KKT residual)")
+    return ax
 
 
 def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
@@ -369,21 +333,18 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
 
 def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: Axes) -> Axes:
     """Draw the rows of a timeline, the first on top; of many experiments those that are explained worst."""
-    from matplotlib.patches import Patch
-
     runs = choose_runs(fit, LONGEST_TIMELINE)
     colours = choose_mode_colours(fit.trajectories)
     ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
     first, last = float(ends.min()), float(ends.max())
     inches = ax.bbox.width / ax.figure.dpi / (last - first)
-    unnamed: dict[str, Any] = {}
     for row, e in enumerate(runs):
         for mode, begin, end in (span for span in fit.trajectories[e].mode_spans if span[2] > span[1]):
-            ax.barh(row, end - begin, 0.7, begin, color=colours[mode], edgecolor=TRANSITION, linewidth=THIN / 2)
-            if inches * (end - begin) > 0.085 * len(mode) + 0.1:
+            fits = inches * (end - begin) > 0.085 * len(mode) + 0.1
+            bar: dict[str, Any] = {"color": colours[mode], "edgecolor": TRANSITION, "linewidth": THIN / 2}
+            ax.barh(row, end - begin, 0.7, begin, label="" if fits else mode, **bar)
+            if fits:
                 ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
-            else:
-                unnamed[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION)
         for low, high in intervals[e].tolist():
             if np.isfinite(high - low):
                 look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
@@ -394,7 +355,7 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
     ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
     title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
-    return style.draw_legend_above(ax, unnamed, title=title)
+    return style.draw_legend_above(ax, title=title)
 
 
 def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
@@ -417,38 +378,39 @@ def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = Fal
 # --- the figure of a fit ----------------------------------------------------------------------------------------------
 
 
-def _list_panels(result: Fit | Validation, e: int) -> list[tuple[Comparison | None, int]]:
-    """Return what the panels of an experiment show: (comparison, channel), or (None, state) where there is no data."""
-    channels: list[tuple[Comparison | None, int]] = [(c, k) for c in result.comparisons[e] for k in range(len(c.names))]
-    return channels or [(None, k) for k in range(len(result.trajectories[e].state_names))]
+def list_outputs(result: Fit | Validation, e: int) -> list[tuple[Comparison, int]]:
+    """Return the outputs of an experiment, each as one of its data and the channel of that.
+
+    Parameters
+    ----------
+    result : Fit or Validation
+    e : int, from 0
+    """
+    return [(comparison, k) for comparison in result.comparisons[e] for k in range(len(comparison.names))]
+
+
+def _count_panels(result: Fit | Validation, e: int) -> int:
+    """Return how many channels of an experiment are drawn, or states where there is no data."""
+    return len(list_outputs(result, e)) or len(result.trajectories[e].state_names)
 
 
 def _draw_experiment(
-    result: Fit | Validation,
-    e: int,
-    block: Any,
-    rows: int,
-    colours: Mapping[str, str],
-    intervals: FloatArray,
-    label: str,
+    result: Fit | Validation, e: int, block: Any, rows: int, colours: Mapping[str, str], label: str
 ) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
-    trajectory, panels, with_data = result.trajectories[e], _list_panels(result, e), bool(result.comparisons[e])
+    trajectory, with_data = result.trajectories[e], bool(result.comparisons[e])
+    drawn = _count_panels(result, e) * (1 + with_data)
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
     axes: list[Axes] = [block.add_subplot(grid[0])]
-    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1 : len(panels) * (1 + with_data)]]
-    places = iter(axes)
-    for comparison, k in panels:
-        if comparison is None:
-            plot_state(trajectory, k, next(places))
-        else:
-            plot_comparison(comparison, trajectory, k, next(places), label=label)
-            plot_residuals(comparison, trajectory, k, next(places))
-    times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
+    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1:drawn]]
+    for (comparison, k), ax, below in zip(list_outputs(result, e), axes[::2], axes[1::2], strict=False):
+        plot_comparison(comparison, trajectory, k, ax, label=label)
+        plot_residuals(comparison, trajectory, k, below)
+    for state, ax in enumerate(() if with_data else axes):
+        plot_state(trajectory, state, ax)
     for number, ax in enumerate(axes):
         plot_modes(trajectory, ax, colours=colours, labels=number == 0)
-        plot_transitions(times, intervals, ax)
         if ax is not axes[-1]:
             ax.tick_params(labelbottom=False)
             ax.xaxis.offsetText.set_visible(False)
@@ -542,35 +504,30 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
     matplotlib.axes.Axes
     """
     if np.isfinite(band).any():
-        inner = np.flatnonzero(np.diff(times) == 0) + 1
-        broken = np.insert(times, inner, times[inner])
-        low, high = (np.insert(edge, inner, np.nan) for edge in band.T)
+        times, low, high = break_at_transitions(times, *band.T)
         with style.draw_within(ax, band):
-            ax.fill_between(broken, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
+            ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
     return ax
 
 
-def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> dict[str, Any]:
-    """Return entries of the legend for the transitions and their intervals.
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes) -> Axes:
+    """Draw samples as dots, or a reference signal as a dashed line.
 
     Parameters
     ----------
-    intervals : sequence of (N, 2)
-        As of `plot_transitions`, of each of the runs that are shown.
-    level : float, between 0 and 1
+    comparison : Comparison
+        Whose measured values they are.
+    x, y : (K,)
+    ax : matplotlib.axes.Axes
     """
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    every, handles = np.concatenate([np.zeros((0, 2)), *intervals]), dict[str, Any]()
-    if len(every):
-        handles["transition"] = Line2D([], [], color=TRANSITION, linewidth=THIN)
-    if np.any(every[:, 1] > every[:, 0]):
-        handles[f"transition, {100 * level:g} % interval"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
-    return handles
-
-
-# --- parts ------------------------------------------------------------------------------------------------------------
+    if comparison.kind == "measurements":
+        ax.plot(x, y, label="measured", zorder=3, **draw_dots(len(x)))
+    else:
+        ax.plot(x, y, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
+    return ax
 
 
 def draw_dots(count: int) -> dict[str, Any]:
@@ -582,8 +539,8 @@ def draw_dots(count: int) -> dict[str, Any]:
 
 def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax: Axes) -> None:
     """Draw circles round the samples that a robust loss weighs down."""
-    if comparison.downweighted is not None and comparison.downweighted[:, channel].any():
-        there = comparison.downweighted[:, channel]
+    there = None if comparison.downweighted is None else comparison.downweighted[:, channel]
+    if there is not None and there.any():
         look: dict[str, Any] = {"color": FIT, "markersize": 8, "markerfacecolor": "none", "markeredgewidth": 1.0}
         ax.plot(comparison.times[there], values[there], "o", zorder=5, label="weighed down", **look)
 
@@ -598,38 +555,29 @@ def replace_infinities(values: FloatArray) -> FloatArray:
     return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
 
 
-def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Return a curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
-    values = replace_infinities(values)
-    if len(times) != len(trajectory.times):
-        return times, values
-    inner = trajectory.segments[1:-1]
-    return np.insert(times, inner, times[inner]), np.insert(values, inner, np.nan)
+def break_at_transitions(times: FloatArray, *values: FloatArray) -> list[FloatArray]:
+    """Return times and values with a gap at each transition, whose time stands there twice: curves may jump there.
+
+    Parameters
+    ----------
+    times : (L,)
+        In order.
+    values : (L,) each
+    """
+    inner = np.flatnonzero(np.diff(times) == 0) + 1
+    return [np.insert(times, inner, times[inner]), *(np.insert(each, inner, np.nan) for each in values)]
 
 
 def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     """Label the axis of times, and limit it to the experiment's horizon."""
-    from switchfit.report.axes import label_axis
-
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
-    return label_axis(ax, trajectory)
-
-
-PLOTS |= {"fit": plot_fit, "convergence": plot_course, "timeline": plot_timeline}
+    return style.label_axis(ax, trajectory)
 
 
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
 NO_POSITIONS = {"v", "vel", "velocity", "speed", "a", "acc", "acceleration", "force", "f", "rate", "d", "dot"}
 """Parts of names that say that a channel is no position."""
-
-
-class Plane(NamedTuple):
-    """Two channels of one of the data of an experiment: which data, and which channels."""
-
-    data: int
-    x: int
-    y: int
 
 
 def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | None:
@@ -678,20 +626,20 @@ def plot_plane(
     named = None if channels is None else as_names(channels, "channels", "two names of channels")
     if named is not None and len(named) != 2:
         raise ValueError(f"channels must be two names; got {shorten(channels)}.")
-    plane = _choose_plane(estimate, experiment, named)
-    return style.draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, ax), (6.4, 5.6))
+    (comparison, plane), trajectory = _choose_plane(estimate, experiment, named), estimate.trajectories[experiment]
+    return style.draw_on(ax, lambda ax: _draw_plane(comparison, plane, trajectory, ax), (6.4, 5.6))
 
 
-def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> Plane:
-    """Return the two channels that are named, or that are positions by their names; ValueError if there are none."""
+def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> tuple[Comparison, list[int]]:
+    """Return the data with the two channels that are named, or that are positions by their names, and their places."""
     trajectory = estimate.trajectories[e]
-    for number, comparison in enumerate(estimate.comparisons[e]):
+    for comparison in estimate.comparisons[e]:
         units = [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
         if channels is not None and set(channels) <= set(comparison.names):
-            return Plane(number, *(comparison.names.index(name) for name in channels))
+            return comparison, [comparison.names.index(name) for name in channels]
         found = None if channels is not None else find_plane(comparison.names, units)
         if found is not None:
-            return Plane(number, *found)
+            return comparison, list(found)
     names = join_names([name for comparison in estimate.comparisons[e] for name in comparison.names])
     what = "are positions in a plane by their names" if channels is None else f"are {shorten(channels)}"
     raise ValueError(
@@ -699,13 +647,9 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) 
     )
 
 
-def _draw_plane(estimate: Estimate, e: int, plane: Plane, ax: Axes) -> Axes:
-    trajectory, comparison = estimate.trajectories[e], estimate.comparisons[e][plane.data]
-    both = [plane.x, plane.y]
-    if comparison.kind == "measurements":
-        ax.plot(*comparison.measured[:, both].T, label="measured", zorder=2, **draw_dots(len(comparison.times)))
-    else:
-        ax.plot(*comparison.measured[:, both].T, "--", color=REFERENCE, linewidth=LINE, label="reference signal")
+def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory, ax: Axes) -> Axes:
+    x, y = comparison.measured[:, both].T
+    draw_measured(comparison, x, y, ax)
     colours = choose_mode_colours([trajectory], lines=True)
     segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
     for (mode, begin, end), first, last in segments:
@@ -715,10 +659,29 @@ def _draw_plane(estimate: Estimate, e: int, plane: Plane, ax: Axes) -> Axes:
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
         ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
-    ax.set_xlabel(label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
-    ax.set_ylabel(label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
+    labels = [label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)) for k in both]
+    ax.set_xlabel(labels[0])
+    ax.set_ylabel(labels[1])
     ax.set_aspect("equal", adjustable="datalim")
     return style.draw_legend_above(ax)
 
 
-PLOTS["plane"] = plot_plane
+PLOTS: dict[str, Callable[..., Any]]
+PLOTS = {"fit": plot_fit, "convergence": plot_convergence, "timeline": plot_timeline, "plane": plot_plane}
+"""Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
+
+
+@draw_figure.register(Estimate)
+def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> Axes | Figure:
+    """Draw one of the plots of an estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    what : str
+        A name in `PLOTS`.
+    settings
+        Keyword arguments of its function.
+    """
+    drawn: Axes | Figure = PLOTS[what](estimate, **settings)
+    return drawn

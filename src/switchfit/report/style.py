@@ -10,15 +10,15 @@ matplotlib is imported where a figure is made: it takes longer to load than half
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import shorten
+from switchfit.report.formats import Timed, label_time, label_unknown
 from switchfit.runtime.presentation import Axes, Figure, join_first
 
 if TYPE_CHECKING:
@@ -138,31 +138,29 @@ def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
     return handles
 
 
-def draw_legend_above(
-    ax: Axes, more: Mapping[str, Any] = MappingProxyType({}), *, title: str | None = None, height: float = 1.0
-) -> Axes:
+def draw_legend_above(ax: Axes, *, title: str | None = None, height: float = 1.0) -> Axes:
     """Draw the legend of an axes above it, with as many columns as it has room for.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
-    more : mapping of label to handle, optional
-        Entries of what has no label in the axes.
     title : str, optional
     height : float, optional
         Of its lower edge, in heights of the axes; names of modes reach to 1.08.
     """
     from switchfit.report.axes import fit_legend
 
-    if handles := collect_handles([ax]) | dict(more):
+    if handles := collect_handles([ax]):
         look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
         look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, height)}
         ax.legend(handles.values(), handles.keys(), title=title, borderaxespad=0.2, **look)
     return ax
 
 
-def name_line(ax: Axes, text: str, y: float, side: Literal["left", "right"], **settings: Any) -> Axes:
-    """Write the name of a horizontal line above one of its ends.
+def draw_level(
+    ax: Axes, text: str, y: float, side: Literal["left", "right"], *, colour: str = REFERENCE, line: str = "--"
+) -> Axes:
+    """Draw a horizontal line with its name above one of its ends.
 
     Parameters
     ----------
@@ -170,11 +168,60 @@ def name_line(ax: Axes, text: str, y: float, side: Literal["left", "right"], **s
     text : str
     y : float
     side : {"left", "right"}
-    settings
-        Others of ``Axes.annotate``.
+    colour : str, optional
+    line : str, optional
+        Its style.
     """
-    place = (0.01 if side == "left" else 0.995, y)
-    ax.annotate(text, place, xycoords=("axes fraction", "data"), ha=side, va="bottom", fontsize=SMALL, **settings)
+    ax.axhline(y, color=colour, linestyle=line, linewidth=THIN)
+    look: dict[str, Any] = {"ha": side, "va": "bottom", "fontsize": SMALL, "color": colour}
+    ax.annotate(text, (0.01 if side == "left" else 0.995, y), xycoords=("axes fraction", "data"), **look)
+    return ax
+
+
+def label_axis(ax: Axes, run: Timed) -> Axes:
+    """Label an axis of times; where they are dates, put its ticks at dates. What is drawn remains in numbers.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    run : Timed
+    """
+    ax.set_xlabel(label_time(run))
+    return put_ticks(ax, run)
+
+
+def put_ticks(ax: Axes, run: Timed) -> Axes:
+    """Put the ticks of the horizontal axis at dates, where times are dates.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    run : Timed
+    """
+    if run.origin is not None:
+        from switchfit.report.axes import LONGEST, DateFormatter, DateLocator, Scale
+
+        scale = Scale(run.origin, run.time_unit)
+        if np.all(np.abs(scale.to_days(ax.xaxis.get_view_interval())) < LONGEST):
+            locator = DateLocator(scale)
+            ax.xaxis.set_major_locator(locator)
+            ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
+    return ax
+
+
+def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axes:
+    """Label a horizontal axis of values of an unknown, with ticks at dates if it is a time of a run with dates.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    name, unit : str
+    run : Timed or None
+    """
+    ax.set_xlabel(label_unknown(name, unit, run))
+    if run is not None:
+        return put_ticks(ax, run)
+    ax.ticklabel_format(axis="x", useOffset=False)
     return ax
 
 

@@ -10,11 +10,12 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit, Step, disagreement
-from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.fit.trajectory import Comparison
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.report.formats import (
     Table,
+    Timed,
     add_dates,
     describe_origin,
     format_rounded,
@@ -25,17 +26,15 @@ from switchfit.report.formats import (
     get_unit,
     list_dated,
     list_jumps,
-    name_columns,
     wrap_text,
 )
 from switchfit.report.frames import list_holds
-from switchfit.report.sentences import ALLOWED
+from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
-from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.certificate import WEAK, Certificate, Identifiability, analyse_solution
+from switchfit.uncertainty.certificate import WEAK
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel
-from switchfit.uncertainty.verdict import DIFFERENT, Verdict, find_issues, judge
+from switchfit.uncertainty.verdict import DIFFERENT, find_issues
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which the report calls it asymmetric."""
@@ -77,27 +76,14 @@ METHODS = {
 }
 
 
-@format_text.register(Fit)
-def report(
-    fit: Fit,
-    certificate: Certificate | None = None,
-    found: Identifiability | None = None,
-    *,
-    verdict: Verdict | None = None,
-    full: bool = False,
-    files: Mapping[str, str] | None = None,
-) -> str:
+@format_text.register(Estimate)
+def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
     """Return the report: the verdict, the problem, the course of the fit, its quality, the unknowns, the warnings.
 
     Parameters
     ----------
-    fit : Fit
-    certificate : Certificate, optional
-        Its failures count in the verdict; if left out, only what can be checked without the model is checked.
-    found : Identifiability, optional
-        If left out, that from the Hessian alone.
-    verdict : Verdict, optional
-        Of this fit; computed if left out.
+    estimate : Estimate
+        The failures of its certificate count in the verdict if it is known.
     full : bool
         All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
         screen, without the warnings that the verdict covers.
@@ -109,32 +95,22 @@ def report(
     str
         Several lines without a newline at the end; the verdict first.
     """
-    verdict = judge(fit, certificate) if verdict is None else verdict
     limits = EVERYTHING if full else SCREEN
     runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    weak = analyse_solution(fit, None) if found is None else found
-    course = [*list_experiments(fit, limits.experiments, runs, full=full), *list_course(fit, full=full)]
-    channels = _format_channels(fit, limits.channels, runs)
+    course = [*list_experiments(estimate, limits.experiments, runs, full=full), *list_course(estimate, full=full)]
+    channels = _format_channels(estimate, limits.channels, runs)
     sections = {
         "Fit": _format_rows(course),
-        "Quality of the fit": [*_format_rows(list_quality(fit, full=full)), *channels],
-        "Unknowns": _format_unknowns(fit, limits.unknowns, unknowns),
-        "Held fixed": _format_fixed(fit, limits.fixed),
-        f"Correlations above {SMALL_CORRELATION:g}": _format_correlations(fit, limits.correlations, full=full),
-        "Determined worst by the data": _describe_weak(fit, weak, limits.directions),
-        "Warnings": _format_warnings(fit, verdict, limits.warnings, full=full),
+        "Quality of the fit": [*_format_rows(list_quality(estimate, full=full)), *channels],
+        "Unknowns": _format_unknowns(estimate, limits.unknowns, unknowns),
+        "Held fixed": _format_fixed(estimate, limits.fixed),
+        f"Correlations above {SMALL_CORRELATION:g}": _format_correlations(estimate, limits.correlations, full=full),
+        "Determined worst by the data": _describe_weak(estimate, limits.directions),
+        "Warnings": _format_warnings(estimate, limits.warnings, full=full),
     }
     written = ["\n".join([title, *lines]) for title, lines in sections.items() if lines]
-    shown = "\n\n".join(["\n".join(wrap_text(str(verdict))), *written])
+    shown = "\n\n".join(["\n".join(wrap_text(str(estimate.verdict))), *written])
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
-
-
-@format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
-    """Return the report of an estimate, with its certificate if it is known, and J evaluated along weak directions."""
-    verdict = estimate.verdict
-    found = estimate.identifiability
-    return report(estimate, estimate.known_certificate, found, verdict=verdict, full=full, files=files)
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
@@ -281,12 +257,11 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
 def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
     """Return the table of the channels as lines; of more than `most`, those that are explained worst."""
     table, shares = tabulate_channels(fit)
-    header, *rows = table.rows
-    if not rows:
+    if not table.rows:
         return []
-    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(rows), most)].tolist())
-    lines = format_table([header, *(rows[k] for k in kept)], table.alignment)
-    more = len(rows) - len(kept)
+    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(table.rows), most)].tolist())
+    lines = format_table(*table._replace(rows=[table.rows[k] for k in kept]))
+    more = len(table.rows) - len(kept)
     return ["", *lines] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
 
 
@@ -315,7 +290,7 @@ def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
                 rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
                 shares.append(np.inf if np.isnan(share) else share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
-    return Table([name_columns(titles, rows), *rows], "<>><>>"), shares
+    return Table(rows, "<>><>>", titles), shares
 
 
 def _format_size(values: FloatArray, digits: int) -> str:
@@ -376,7 +351,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         errors_shown = (error, relative, plain if corrected else "") if known else ("", "", "")
         rows.append([name, value, *errors_shown, low, high, format_unit(fit.theta_units[i]), guess, note])
     titles = ["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]
-    table = Table([name_columns(titles, rows), *rows], "<><><>><><")
+    table = Table(rows, "<><><>><><", titles)
     if not known or corrected:
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent." if known else ""
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
@@ -387,7 +362,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     return table, f"Standard errors from {matrix}.{ROBUST + other if robust else ''}"
 
 
-def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> str:
+def format_end(end: float, ends: FloatArray, run: Timed | None) -> str:
     """Return an end of an interval to the third digit of its width, as a date if it is one; "" if it is unknown.
 
     Parameters
@@ -395,13 +370,13 @@ def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> s
     end : float
     ends : (2,)
         Both of them.
-    run : Trajectory, optional
-        Of the experiment with dates that this is a time of.
+    run : Timed or None
+        What this is a time of; None for what is no time.
     """
     width = ends[1] - ends[0]
     if not (np.isfinite(end) and np.isfinite(width) and width > 0):
         return ""
-    if run is not None:
+    if run is not None and run.origin is not None:
         return format_time(end, run, width / 4)
     return format_rounded(end, width / 10)[0]
 
@@ -443,7 +418,7 @@ def _is_sided(ends: FloatArray, symmetric: FloatArray, value: float) -> bool:
     return not (np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above))
 
 
-def _format_interval(ends: FloatArray, run: Trajectory | None) -> str:
+def _format_interval(ends: FloatArray, run: Timed | None) -> str:
     if run is None:
         return f"[{ends[0]:.4g}, {ends[1]:.4g}]"
     return f"[{format_end(ends[0], ends, run)}, {format_end(ends[1], ends, run)}]"
@@ -457,7 +432,7 @@ def _mark_unknown(fit: Fit, name: str) -> str:
 
 def _format_fixed(fit: Fit, most: int) -> list[str]:
     """Return the table of what was not estimated, as lines."""
-    rows, alignment = tabulate_fixed(fit)
+    rows, alignment, _ = tabulate_fixed(fit)
     return format_table(rows[:most], alignment) + ([f"  and {len(rows) - most} more"] if len(rows) > most else [])
 
 
@@ -507,9 +482,10 @@ def list_correlations(fit: Fit) -> list[tuple[str, str]]:
     return [(f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}") for i, j in above]
 
 
-def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
+def _describe_weak(estimate: Estimate, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly determine, as lines."""
-    weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
+    found = estimate.identifiability
+    weak = [d for d in found.directions if d.eigenvalue < WEAK] if estimate.status.successful else []
     return _list_sentences([write_direction(found, direction) for direction in weak], most, "direction")
 
 
@@ -541,10 +517,11 @@ _COVERED = {
 """Kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
 
 
-def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> list[str]:
+def _format_warnings(estimate: Estimate, most: int, *, full: bool) -> list[str]:
     """Return the warnings as lines; on one screen without those that the verdict covers."""
-    covered = set() if full else set().union(*(_COVERED.get(reason.kind, set()) for reason in verdict.reasons))
-    issues = [add_dates(str(issue), fit) for issue in find_issues(fit) if issue.kind not in covered]
+    reasons = () if full else estimate.verdict.reasons
+    covered = set().union(*(_COVERED.get(reason.kind, set()) for reason in reasons))
+    issues = [add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
     return _list_sentences(issues, most, "warning")
 
 

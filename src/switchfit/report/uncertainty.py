@@ -7,16 +7,15 @@ from functools import partial
 
 import numpy as np
 
-from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.formats import (
     Table,
+    Timed,
     describe_origin,
     format_rounded,
     format_table,
     format_time,
-    format_unknown,
     label_time,
     list_dated,
     wrap_text,
@@ -96,7 +95,7 @@ def write_derivative_check(check: DerivativeCheck) -> str:
     ----------
     check : DerivativeCheck
     """
-    rows = [["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]]
+    rows, titles = [], ["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]
     for k, (h, remainders) in enumerate(zip(check.steps, check.remainders, strict=True)):
         orders = [""] * 3 if k == 0 else ["-" if np.isnan(order) else f"{order:.2f}" for order in check.orders[k - 1]]
         cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
@@ -104,7 +103,7 @@ def write_derivative_check(check: DerivativeCheck) -> str:
     lines = [
         "Taylor remainders of J along a random direction",
         "",
-        *format_table(rows, ">" * 7),
+        *format_table(rows, ">" * 7, titles),
         "",
         "Paper's equations (6)-(17) against the derivatives of the discretised cost, relative:",
         f"  gradient {_format_gap(check.gradient_gap)}",
@@ -237,13 +236,13 @@ def tabulate_diagnostics(diagnostics: ResidualDiagnostics) -> Table:
     ----------
     diagnostics : ResidualDiagnostics
     """
-    rows = [["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]]
+    rows, titles = [], ["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]
     for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
         size = [f"{len(channel.values)}", f"{channel.rms:.3g}", f"{channel.mean:+.2f}"]
         correlation = [f"{channel.correlation:+.2f}", f"{channel.effective:.0f}"]
         tests = [_format_probability(channel.whiteness), _format_probability(channel.normality)]
         rows.append([label, *size, *correlation, *tests, f"{channel.outliers}"])
-    return Table(rows, "<" + ">" * 8)
+    return Table(rows, "<" + ">" * 8, titles)
 
 
 def _format_probability(value: float) -> str:
@@ -286,8 +285,8 @@ def write_profile(profile: Profile) -> str:
     return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
 
 
-def _find_run(profile: Profile) -> Trajectory | None:
-    """Return the trajectory of a profile of a time that is a date; None for any other."""
+def _find_run(profile: Profile) -> Timed | None:
+    """Return the run of a profile of a time that is a date; None for any other."""
     return list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
 
 
@@ -315,7 +314,7 @@ def list_profile_notes(profile: Profile) -> Iterator[str]:
     profile : Profile
     """
     run, (low, high) = _find_run(profile), profile.interval()
-    show, unit = partial(format_unknown, run=run), "" if run is not None else unit_suffix(profile.unit)
+    show, unit = partial(format_time, run=run), "" if run is not None else unit_suffix(profile.unit)
     limits, outermost = profile.trace.limits.values(), profile.values[[0, -1]]
     for side, end, limit, last in zip(("downward", "upward"), profile.ends, limits, outermost, strict=True):
         if end in _ENDS:
@@ -372,8 +371,6 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     """
     from scipy.interpolate import PchipInterpolator  # here, since importing it takes longer than a profile
 
-    from switchfit.report.axes import label_unknown_axis
-
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
@@ -398,15 +395,14 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
         ax.plot(x, parabola, "--", color=REFERENCE, linewidth=LINE, label="quadratic approximation")
     for level in (*(level for level in LEVELS if level < profile.level), profile.level):
         height = profile.fit.quantile(level) ** 2
-        ax.axhline(height, color=TRANSITION, linewidth=THIN, linestyle=":")
-        style.name_line(ax, f"{100 * level:.3g} %", height, "right")
+        style.draw_level(ax, f"{100 * level:.3g} %", height, "right", colour=TRANSITION, line=":")
     ax.axvline(profile.value, color=FIT, linewidth=THIN)
     inside = profile.sample_times[(profile.sample_times >= x[0]) & (profile.sample_times <= x[-1])]
     if len(inside):
         ax.plot(inside, np.zeros(len(inside)), "|", color=TRANSITION, markersize=9, clip_on=False, label="sample times")
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(0.0, top)
-    label_unknown_axis(ax, profile.name, profile.unit, _find_run(profile))
+    style.label_unknown_axis(ax, profile.name, profile.unit, _find_run(profile))
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
     ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
@@ -423,8 +419,6 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
     most : int, optional
         Of more channels, those are shown whose residuals widen the standard errors most, the worst first.
     """
-    from switchfit.report.axes import put_ticks
-
     shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
     if len(shown) > most:
         shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:most]
@@ -444,7 +438,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
         ax.set_title(title)
     for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times of another kind
         label = label_time(shown[k][1])
-        put_ticks(ax, shown[k][1])
+        style.put_ticks(ax, shown[k][1])
         if k + 1 == len(shown) or label_time(shown[k + 1][1]) != label:
             ax.set_xlabel(label)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):

@@ -18,7 +18,8 @@ from switchfit.report.formats import (
     format_time,
     get_unit,
     label_quantity,
-    list_dated_unknowns,
+    list_dated,
+    suffix_time,
     wrap_text,
 )
 from switchfit.report.plot import plot_modes
@@ -28,7 +29,7 @@ from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_tex
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent
 from switchfit.uncertainty.prediction import Prediction
-from switchfit.uncertainty.residuals import explain_channel
+from switchfit.uncertainty.residuals import explain_channel, list_channels
 
 RULED_OUT = 10.0
 """Difference in BIC from which the evidence against a model is very strong."""
@@ -52,7 +53,7 @@ def plot_prediction(
     ax : matplotlib.axes.Axes, optional
         For one channel.
     """
-    names = [name for comparison in prediction.fit.comparisons[prediction.experiment] for name in comparison.names]
+    names = [c.names[k] for c, k in plot.list_outputs(prediction.fit, prediction.experiment)]
     one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
         named = partial(style.draw_legend_above, height=1.08)
@@ -79,17 +80,14 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     labels : bool, optional
         Whether to name the modes above.
     """
-    from switchfit.report.axes import label_axis
-
     fit, e = prediction.fit, prediction.experiment
-    comparison, k = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))][number]
+    comparison, k = plot.list_outputs(fit, e)[number]
     trajectory = fit.trajectories[e]
     order, end = np.argsort(prediction.times, kind="stable"), trajectory.mode_spans[-1][2]
     times, y = prediction.times[order], prediction.outputs[order, number]
     plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
-    dots = plot.draw_dots(len(comparison.times))
-    ax.plot(comparison.times, comparison.measured[:, k], zorder=3, label="measured", **dots)
+    plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
     plot.plot_modes(trajectory, ax, labels=labels)
     first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
     if last > end:
@@ -98,7 +96,7 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
         ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
     ax.set_xlim(first, last)
     ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
-    return label_axis(ax, prediction)
+    return style.label_axis(ax, prediction)
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -116,7 +114,7 @@ def write_validation(found: Validation) -> str:
     errors, names = found.corrected_standard_errors, found.theta_names
     rows = {}
     columns = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
-    for (name, value, error, unit), run in zip(columns, list_dated_unknowns(found.problem), strict=True):
+    for (name, value, error, unit), run in zip(columns, list_dated(found.problem), strict=True):
         shown, spread = format_estimate(float(value), float(error), run)
         rows[name] = [name, shown, spread if spread != "held" else "", unit]
     refit = () if found.refit is None else found.refit.theta_names
@@ -134,10 +132,10 @@ def write_validation(found: Validation) -> str:
         chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
         lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
     if found.inputs:
-        tests = [["residuals of", "and input", "P(none)"]]
+        tests = []
         for test in found.inputs:
             tests.append([test.channel, test.input, "-" if np.isnan(test.probability) else f"{test.probability:.2g}"])
-        lines += ["", "Correlation with inputs", *format_table(tests, "<<>")]
+        lines += ["", "Correlation with inputs", *format_table(tests, "<<>", ["residuals of", "and input", "P(none)"])]
     return "\n".join(lines)
 
 
@@ -148,21 +146,16 @@ def tabulate_predicted(found: Validation) -> Table:
     ----------
     found : Validation
     """
-    rows = [["", "values", "fit (%)", "R²", "rms error", "lag 1", "P(white)"]]
+    rows, titles = [], ["", "values", "fit (%)", "R²", "rms error", "lag 1", "P(white)"]
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
-    single = len(found.comparisons) == 1
-    for run, comparisons in zip(found.run_names, found.comparisons, strict=True):
-        for comparison in comparisons:
-            rmse = comparison.rmse
-            for k, name in enumerate(comparison.names):
-                label = name if single else f"{run} {name}"
-                explained, test = explain_channel(comparison, k), tests.get(label)
-                white = "" if test is None or np.isnan(test.whiteness) else f"{test.whiteness:.2g}"
-                count = int(np.isfinite(comparison.measured[:, k]).sum())
-                shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
-                lag = "" if test is None else f"{test.correlation:+.2f}"
-                rows.append([label, f"{count}", *shares, f"{rmse[k]:.3g}", lag, white])
-    return Table(rows, "<" + ">" * 6)
+    for label, _, comparison, k in list_channels(found.comparisons, found.run_names):
+        explained, test = explain_channel(comparison, k), tests.get(label)
+        white = "" if test is None or np.isnan(test.whiteness) else f"{test.whiteness:.2g}"
+        count = int(np.isfinite(comparison.measured[:, k]).sum())
+        shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
+        lag = "" if test is None else f"{test.correlation:+.2f}"
+        rows.append([label, f"{count}", *shares, f"{comparison.rmse[k]:.3g}", lag, white])
+    return Table(rows, "<" + ">" * 6, titles)
 
 
 @draw_figure.register(Validation)
@@ -181,25 +174,23 @@ def plot_validation(
     ax : matplotlib.axes.Axes, optional
         For one channel.
     """
-    channels = [[(c, k) for c in run for k in range(len(c.names))] for run in found.comparisons]
-    panels = [(e, output, c, k) for e, run in enumerate(channels) for output, (c, k) in enumerate(run)]
-    runs = [f"{name} " if len(channels) > 1 else "" for name in found.run_names]
-    one = style.choose_panel([f"{runs[e]}{c.names[k]}" for e, _, c, k in panels], channel, ax, "channel")
+    runs = range(len(found.comparisons))
+    panels = [(e, output) for e in runs for output in range(len(plot.list_outputs(found, e)))]
+    prefixes = [f"{name} " if len(runs) > 1 else "" for name in found.run_names]
+    names = [f"{prefixes[e]}{c.names[k]}" for e in runs for c, k in plot.list_outputs(found, e)]
+    one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
-        more = plot.make_transition_handles([_find_intervals(found, panels[one][0], level)], level)
-        named = partial(style.draw_legend_above, more=more, height=1.08)
+        named = partial(style.draw_legend_above, height=1.08)
         return style.draw_on(ax, lambda ax: named(draw_validation(found, *panels[one], level, ax)), (8.0, 3.9))
-    intervals = {e: _find_intervals(found, e, level) for e in range(len(channels))[: plot.LARGEST_FIGURE]}
+    intervals = {e: _find_intervals(found, e, level) for e in runs[: plot.LARGEST_FIGURE]}
     figure = plot.plot_runs(found, intervals, dict(enumerate(found.predictions)), level=level, label="predicted")
-    for block, run in zip(figure.subfigs, channels, strict=False):
-        for panel, (comparison, k) in zip(block.axes[::2], run, strict=False):
+    for e, block in enumerate(figure.subfigs):
+        for panel, (comparison, k) in zip(block.axes[::2], plot.list_outputs(found, e), strict=False):
             _write_percent(comparison, k, panel)
     return figure
 
 
-def draw_validation(
-    found: Validation, e: int, output: int, comparison: Comparison, k: int, level: float, ax: Axes
-) -> Axes:
+def draw_validation(found: Validation, e: int, output: int, level: float, ax: Axes) -> Axes:
     """Draw measured against predicted for one channel with bands.
 
     Parameters
@@ -207,19 +198,16 @@ def draw_validation(
     found : Validation
     e, output : int, from 0
         Which run, and which of its outputs.
-    comparison : Comparison
-    k : int, from 0
-        Which of its channels that is.
     level : float, between 0 and 1
     ax : matplotlib.axes.Axes
     """
-    trajectory = found.trajectories[e]
+    trajectory, (comparison, k) = found.trajectories[e], plot.list_outputs(found, e)[output]
     plot.plot_comparison(comparison, trajectory, k, ax, label="predicted")
     if found.predictions:
         plot.plot_bands(found.predictions[e], output, level, ax)
     plot.plot_modes(trajectory, ax, colours=plot.choose_mode_colours(found.trajectories))
     times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
-    plot.plot_transitions(times, _find_intervals(found, e, level), ax)
+    plot.plot_transitions(times, _find_intervals(found, e, level), ax, level=level)
     return _write_percent(comparison, k, ax)
 
 
@@ -288,12 +276,12 @@ def tabulate_models(found: ModelComparison) -> Table:
     ----------
     found : ModelComparison
     """
-    rows = [["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]]
+    rows, titles = [], ["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]
     for k in _list_best_first(found):
         aicc = [f"{found.aicc[k]:.2f}", f"{found.delta_aicc[k]:.2f}", f"{found.weights[k]:.2g}"]
         bic = [f"{found.bic[k]:.2f}", f"{found.delta_bic[k]:.2f}"]
         rows.append([found.names[k], f"{found.unknown_counts[k]}", f"{found.log_likelihood[k]:.2f}", *aicc, *bic])
-    return Table(rows, "<" + ">" * 7)
+    return Table(rows, "<" + ">" * 7, titles)
 
 
 @draw_figure.register(ModelComparison)
@@ -365,21 +353,20 @@ def write_design(design: Design) -> str:
     """
     path, units = design.trajectory, design.problem.unknowns.units
     columns = (design.theta_names, units, design.theta, design.standard_errors_before, design.standard_errors)
-    rows = [("unknown", "value", "standard error as given", "as designed", "")]
+    rows, titles = [], ["unknown", "value", "standard error as given", "as designed", ""]
     for name, unit, value, *errors in zip(*columns, strict=True):
         before, after = ("none" if np.isnan(error) else f"{error:.3g}" for error in errors)
         rows.append((name, f"{value:.6g}", before, after, unit_suffix(unit).strip()))
     before, after = (f"{value:.4g}" for value in (design.criterion_before, design.criterion_after))
     rows.append((f"{MEANING[design.criterion]} of covariance", "", before, after, ""))
     head = f"{design.criterion}-optimal design of {design.run} for {join_first(design.names)}."
-    lines = [*wrap_text(head), "", *format_table(rows, "<>>><")]
+    lines = [*wrap_text(head), "", *format_table(rows, "<>>><", titles)]
     for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL)):
         lines += ["", *wrap_text(template.format(", ".join(names)))] if names else []
     for name, values in design.inputs.items():
         lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
     for sensor, times in design.sample_times.items():
-        unit = "" if path.origin is not None else unit_suffix(path.time_unit)
-        listed = ", ".join(format_time(time, path) for time in times.tolist()) + unit
+        listed = ", ".join(format_time(time, path) for time in times.tolist()) + suffix_time(path)
         lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
     return "\n".join(lines)
 

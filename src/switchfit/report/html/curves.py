@@ -255,12 +255,8 @@ def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
     """
     modes, left, right = zip(*fit.trajectories[e].mode_spans, strict=True)
     places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
-    spans: dict[str, Any] = {
-        "left": np.array(left),
-        "right": np.array(right),
-        "colour": [colours[mode] for mode in modes],
-    }
-    return spans | {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
+    ends = {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
+    return {"left": np.array(left), "right": np.array(right), "colour": [colours[mode] for mode in modes], **ends}
 
 
 def list_transitions(fit: Fit, e: int) -> Columns:
@@ -272,14 +268,13 @@ def list_transitions(fit: Fit, e: int) -> Columns:
     e : int, from 0
     """
     errors, run, intervals = correct_errors(fit), fit.trajectories[e], find_transition_intervals(fit, e)
-    dated = None if run.origin is None else run
     own = [t for t in fit.transitions if t.experiment == e]
     values, shown = [], []
     for t, ends in zip(own, intervals, strict=True):
-        value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], dated)
-        unit = format_unit(t.unit) if dated is None or error else ""
+        value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], run)
+        unit = format_unit(t.unit) if run.origin is None or error else ""
         values.append(" ".join(filter(None, (value, error, unit))))
-        low, high = (format_end(end, ends, dated) for end in ends)
+        low, high = (format_end(end, ends, run) for end in ends)
         shown.append(f"{low} to {high}" if low and high else "not known")
     numbers = {"x": np.array([t.time for t in own], dtype=float), "low": intervals[:, 0], "high": intervals[:, 1]}
     words: dict[str, Any] = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
@@ -318,10 +313,7 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
         costs = np.array([evaluate_moved(estimate, place, value) for value in values])
         run = list_dated(estimate)[place]
         slider = {"place": place, "name": estimate.theta_names[place], "theta": theta}
-        slider |= {
-            "clock": None if run is None else describe_clock(run),
-            "unit": format_unit(estimate.theta_units[place]),
-        }
+        slider |= {"clock": run and describe_clock(run), "unit": format_unit(estimate.theta_units[place])}
         found.append({**slider, "values": drop_nan(values), "costs": drop_nan(costs)})
     return found
 

@@ -47,9 +47,8 @@ from switchfit.report.html.curves import (
     list_transitions,
 )
 from switchfit.report.plot import choose_mode_colours, find_plane
-from switchfit.report.sentences import join_words
+from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
-from switchfit.report.verdict import format_share, list_reasons, write_reason, write_step
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.residuals import explain_channel, explain_worst, rank_runs
 from switchfit.uncertainty.verdict import find_issues
@@ -327,11 +326,10 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
     everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
     unknowns, _ = text.tabulate_unknowns(estimate, text.select_unknowns(estimate, FIRST_ROWS), ends=True)
     channels, shares = text.tabulate_channels(estimate)
-    worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())]
     certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
     pairs = text.list_correlations(estimate)
     correlated = _list_correlated(estimate)
-    tried = [["strategy", "lowest J after it", "evaluations", "seconds"]]
+    tried = []
     for step in estimate.steps:
         cost = f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed"
         tried.append([step.strategy, cost, f"{step.evaluations}", f"{step.seconds:.2g}"])
@@ -344,8 +342,8 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "unknowns_note": note,
         "fixed": text.tabulate_fixed(estimate),
         "course": text.list_experiments(estimate, MOST_UNKNOWNS, full=True) + course_rows,
-        "steps_tried": Table(tried, "<>>>"),
-        "channels": Table([channels.rows[k] for k in worst], channels.alignment),
+        "steps_tried": Table(tried, "<>>>", ["strategy", "lowest J after it", "evaluations", "seconds"]),
+        "channels": channels._replace(rows=[channels.rows[k] for k in np.argsort(shares, kind="stable")]),
         "diagnostics": tabulate_diagnostics(estimate.residuals),
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
         "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
