@@ -114,9 +114,11 @@ class Scale:
         self.length = SECONDS[normalize_time_unit(time_unit)] / SECONDS["d"]
 
     def to_days(self, times: Sequence[float]) -> FloatArray:
+        """Return times as days since 1970."""
         return self.start + np.asarray(times, dtype=np.float64) * self.length
 
     def to_times(self, days: Sequence[float]) -> FloatArray:
+        """Return days since 1970 as times."""
         return (np.asarray(days, dtype=np.float64) - self.start) / self.length
 
 
