@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from dataclasses import replace
 from functools import partial
 
@@ -538,6 +539,7 @@ class Interrupted:
 
     def __call__(self, runs):
         if runs.start == 4:
+            time.sleep(0.5)  # the others are done by then
             raise KeyboardInterrupt
         return {"value": np.arange(runs.start, runs.stop)}
 

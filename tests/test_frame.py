@@ -45,11 +45,7 @@ def test_what_is_read_stands_where_the_header_says():
     assert call.extension_start.offset == program.EXTENSION
     assert call.args.offset + structure("Args").args.offset == program.ARGUMENTS
     assert call.rets.offset + structure("Rets").rets.offset == program.RESULTS
-    assert (buffer.data.offset, buffer.rank.offset, buffer.dims.offset) == (
-        program.DATA,
-        program.RANK,
-        program.DIMENSIONS,
-    )
+    assert (buffer.data.offset, buffer.dims.offset) == (program.DATA, program.DIMENSIONS)
     assert structure("Extension_Base").type.offset == 8
     assert structure("Metadata_Extension").metadata.offset == 24
     metadata, version = structure("Metadata"), structure("Api_Version")

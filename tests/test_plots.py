@@ -185,8 +185,8 @@ def drifting():
 
 def test_figures_shade_the_interval_of_the_table(drifting):
     fit = drifting
-    (row,) = (row for row in csv.DictReader(write_unknowns(fit).splitlines()) if row["name"] == "tau_1")
-    table = [float(row["low 95 %"]), float(row["high 95 %"])]
+    (row,) = (row for row in csv.DictReader(write_unknowns(fit).splitlines()) if row["unknown"] == "tau_1")
+    table = [float(row["low"]), float(row["high"])]
     naive = fit.confidence_intervals()[fit.theta_names.index("tau_1")]
     assert table[1] - table[0] > 1.5 * (naive[1] - naive[0])
     band = [patch for patch in fit.plot().axes[0].patches if to_hex(patch.get_facecolor()) == TRANSITION]
