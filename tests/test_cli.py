@@ -259,10 +259,17 @@ def test_ctrl_c_that_is_ignored_stays_so(folder, monkeypatch):
         signal.signal(signal.SIGINT, before)
 
 
-def test_check_names_what_is_wrong_in_the_problem_file(folder, tmp_path):
-    for name in ("log.csv", "room.py"):
-        (tmp_path / name).write_text((folder / name).read_text())
+def test_check_without_running_the_model(folder, tmp_path):
+    (tmp_path / "log.csv").write_text((folder / "log.csv").read_text())
+    (tmp_path / "room.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
     path = tmp_path / "problem.toml"
+    path.write_text(PROBLEM)
+    result = run("check", path, "--no-run")
+    assert result.exit_code == 0, result.stderr
+    assert "on -> off on [0, 6] s, at 2 s" in result.stdout
+    assert "12 samples of T, 0.25 to 5.75" in result.stdout
+    assert "No Python file was run" in result.stdout
+    assert not (tmp_path / "ran").exists()
     for old, new, message in (
         ('columns = ["T"]', 'columns = ["U"]', "log.csv has no column 'U'; its columns are t, T."),
         ("transition_times = [2.0]", "transition_times = [7.0]", "experiments[1]: transition_times must increase"),
@@ -272,9 +279,12 @@ def test_check_names_what_is_wrong_in_the_problem_file(folder, tmp_path):
         ("heating = 0.4", "heating = { value = 0.4, lower = 1.0 }", "parameters.heating: Parameter value 0.4 lies"),
     ):
         path.write_text(PROBLEM.replace(old, new))
-        result = run("check", path)
+        result = run("check", path, "--no-run")
         assert result.exit_code == 2
         assert message in result.stderr
+    path.write_text('problem = "room.py:make"\n')
+    assert run("check", path, "--no-run").exit_code == 0
+    assert not (tmp_path / "ran").exists()
 
 
 def test_error_of_our_own_is_not_hidden(folder, monkeypatch):
@@ -361,7 +371,7 @@ def test_check_as_json(folder):
     assert found["unknowns"][1]["upper"] is None
     full = read_json(run("check", folder / "problem.toml", "--json", "--full"))
     assert full["derivatives"]["gradient_gap"] < 1e-4
-    assert found["issues"] == []
+    assert read_json(run("check", folder / "problem.toml", "--json", "--no-run"))["issues"] == []
 
 
 def test_simulate_as_json(folder, tmp_path):

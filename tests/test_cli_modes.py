@@ -251,7 +251,7 @@ def write_problem(folder, old="", new="", name="changed.toml"):
 LIBRARY = PROBLEM[PROBLEM.index("[library]") :]
 
 
-@pytest.mark.parametrize("command", [("fit",), ("check",), ("simulate", "--json")])
+@pytest.mark.parametrize("command", [("fit",), ("check",), ("check", "--no-run"), ("simulate", "--json")])
 def test_other_commands_say_what_to_do_without_a_sequence(folder, command):
     result = run(*command, folder / "problem.toml")
     assert result.exit_code == 2

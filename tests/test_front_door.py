@@ -82,7 +82,7 @@ columns = ["T"]
     ("command", "mistake"),
     [
         *((["fit"], mistake) for mistake in MISTAKES),
-        (["check"], "column"),
+        (["check", "--no-run"], "column"),
         (["modes"], "column"),
         (["simulate", "--json"], "column"),
     ],

@@ -15,7 +15,7 @@ from switchfit.engine.native.experiment import find_directions, places_in_librar
 from switchfit.engine.native.templates import Sizes
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.command_line import describe_experiments, summarize_estimate
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file import load_problem, read_experiments
 from switchfit.problem.functions import use_float64
 
 DOSES = np.array([0.0, 8.0, 16.0, 24.0])
@@ -327,7 +327,8 @@ def folder(tmp_path, values):
 def test_problem_file(folder, values):
     problem = load_problem(folder / "problem.toml").problem
     assert sf.evaluate(problem).cost == pytest.approx(sf.evaluate(make_problem(values)).cost, rel=1e-9)
-    assert "4 jumps at 0, 8, 16, 24 h" in describe_experiments(problem.experiments)
+    runs = read_experiments(folder / "problem.toml")
+    assert "4 jumps at 0, 8, 16, 24 h" in describe_experiments(runs.experiments)
 
 
 START = dt.datetime(2024, 5, 1, 6, tzinfo=dt.UTC)

@@ -482,10 +482,11 @@ def test_times_out_of_order_are_said_with_their_line(problem, write, times, mess
 def test_check_says_what_is_odd(problem):
     loaded = problem(("sigma", 'time_scale = 1e-3\nobserve = "model.py:observe"\nsigma'), ('"Weg"', '"Weg", "Winkel"'))
     assert [issue.kind for issue in loaded.issues] == ["log: wrapped angle"]
-    result = CliRunner().invoke(cli.app, ["check", str(loaded.path)])
-    assert result.exit_code == 0, result.stderr
-    assert "9 samples of Weg (m), Winkel (deg), 0 to 0.8 s" in result.stdout
-    assert "a.csv, line 9: the angle 'Winkel' jumps by a turn of 360; repair='unwrap" in result.stdout
+    for options in ([], ["--no-run"]):
+        result = CliRunner().invoke(cli.app, ["check", str(loaded.path), *options])
+        assert result.exit_code == 0, result.stderr
+        assert "9 samples of Weg (m), Winkel (deg), 0 to 0.8 s" in result.stdout
+        assert "a.csv, line 9: the angle 'Winkel' jumps by a turn of 360; repair='unwrap" in result.stdout
 
 
 def test_units_are_those_of_the_values_and_not_of_sigma(problem, write):

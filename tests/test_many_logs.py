@@ -101,7 +101,7 @@ def test_a_pattern_is_a_run_for_each_log(folder, pattern):
 def test_a_bad_log_is_left_out_of_a_problem(folder):
     spoil(folder)
     (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", "logs/*.csv"))
-    for command in (["check"], ["fit", "--max-iterations", "30"]):
+    for command in (["check"], ["check", "--no-run"], ["fit", "--max-iterations", "30"]):
         result = run(command[0], folder / "problem.toml", *command[1:])
         assert result.exit_code == 2
         said = (

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 def check(
     problem: terminal.ProblemPath,
+    no_run: Annotated[
+        bool, typer.Option("--no-run", help="Read the problem file and its data; run no Python file that it names.")
+    ] = False,
     full: Annotated[
         bool,
         typer.Option("--full", help="List all runs and unknowns, and compare with the paper's equations too: seconds."),
@@ -36,6 +39,9 @@ def check(
     Exit code 0: the derivatives are right. 1: they are not. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        if no_run:
+            _check_files(problem, full)
+            return
         from switchfit.io.problem_file import load_problem
 
         loaded = load_problem(problem)
@@ -61,6 +67,22 @@ def check(
         terminal.fail_for_refused(loaded.issues)
         if not derivatives.passed:
             raise typer.Exit(terminal.NOT_CONVERGED)
+
+
+def _check_files(problem: Path, full: bool) -> None:
+    """Print the parts of a problem that are known without running a Python file."""
+    from switchfit.io.problem_file import read_experiments
+
+    runs = read_experiments(problem)
+    from switchfit.io.command_line import describe_experiments
+
+    if runs.experiments:
+        terminal.print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
+        terminal.print_list("Logs", runs.issues)
+    terminal.print_text("No Python file was run: modes, states, functions and names of parameters are not checked.")
+    names = [run.name for run in runs.experiments]
+    terminal.print_json({"runs": names, "issues": [str(issue) for issue in runs.issues]})
+    terminal.fail_for_refused(runs.issues)
 
 
 OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]

@@ -29,6 +29,7 @@ from switchfit.runtime.files import explain_read_errors
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
+    from switchfit.io.problem_file.experiments import Runs
     from switchfit.io.problem_file.logs import Opened
 
 T = TypeVar("T", bound=Table)
@@ -233,6 +234,30 @@ def load_problem(
     return build_problem(path, text, contents, opened, log, searched=searched)
 
 
+def read_experiments(path: str | Path) -> Runs:
+    """Read a problem file and the data files it names, but do not run the Python file that it names.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Runs
+        With data and horizon, but without observation functions; empty if the whole problem is built in Python.
+
+    Raises
+    ------
+    InputError
+        As in `load_problem`.
+    """
+    path = Path(path)
+    contents, opened = _open(path, read_text(path), None)
+    from switchfit.io.problem_file.building import build_without_python
+
+    return build_without_python(path, contents, opened)
+
+
 def _open(path: Path, text: str, log: str | Path | None, *, streamed: bool = False) -> tuple[Contents, list[Opened]]:
     """Return the checked tables of a file and its open logs; arguments as of `load_problem`."""
     contents = parse_contents(path, text)
@@ -295,4 +320,4 @@ def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
     return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})
 
 
-__all__ = ["OPTIONS", "OptionsTable", "load_problem"]
+__all__ = ["OPTIONS", "OptionsTable", "load_problem", "read_experiments"]

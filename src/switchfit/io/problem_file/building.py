@@ -21,11 +21,13 @@ from switchfit.io.problem_file.experiments import (
     build_experiments,
     build_parameter,
     build_system,
+    check_model_name,
     make,
 )
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
 from switchfit.io.user_files import build_at, load_object
+from switchfit.models import BUILT_IN
 from switchfit.modes.library import build_library
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError, Issue
@@ -193,6 +195,24 @@ def build_problem(
     build_at(f"{path}: library", partial(build_library, **given, max_switches=1), problem)
     provenance = describe_sources(path, text, log, contents.model_dump(exclude_none=True), options)
     return ProblemFile(path, problem, options, provenance, runs.issues, given, built)
+
+
+def build_without_python(path: Path, contents: Contents, opened: Sequence[Opened]) -> Runs:
+    """Return the experiments of a file; the Python file that it names is not run.
+
+    Parameters
+    ----------
+    path : Path
+    contents : Contents
+    opened : sequence of Opened
+    """
+    if contents.problem is not None:
+        return Runs((), ())
+    if contents.model is not None and contents.model.name not in BUILT_IN:
+        check_model_name(f"{path}: model", contents.model)
+    for name, table in contents.parameters.items():
+        build_at(f"{path}: parameters.{name}", build_parameter, table)
+    return build_experiments(path, contents, opened, None)
 
 
 def _load_from_python(path: Path, contents: Contents) -> Problem:

@@ -27,7 +27,7 @@ from switchfit.io.problem_file.tables import (
     ParameterTable,
     PriorTable,
 )
-from switchfit.io.user_files import build_at, call, load_object
+from switchfit.io.user_files import build_at, call, find_object, load_object
 from switchfit.models import BUILT_IN
 from switchfit.problem.data import Input, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Jump, Parameter
@@ -51,11 +51,7 @@ def build_system(path: Path, table: ModelTable) -> HybridSystem:
     if table.name in BUILT_IN:
         found = BUILT_IN[table.name]
     else:
-        if ".py" not in table.name:
-            raise InputError(
-                f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of "
-                "your own as 'file.py:object'."
-            )
+        check_model_name(what, table)
         found = load_object(table.name, path.parent, what)
     return make(found, table, what, HybridSystem)
 
@@ -84,6 +80,22 @@ def make(found: Any, table: ModelTable, what: str, kind: type[T]) -> T:
     return found
 
 
+def check_model_name(what: str, table: ModelTable) -> None:
+    """Raise InputError unless a model that is not built in is named as an object of a Python file.
+
+    Parameters
+    ----------
+    what : str
+        Place in the problem file, for messages.
+    table : ModelTable
+    """
+    if ".py" not in table.name:
+        raise InputError(
+            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of your "
+            "own as 'file.py:object'."
+        )
+
+
 def _check_arguments(factory: Callable[..., Any], table: ModelTable, what: str) -> dict[str, Any]:
     """Return the arguments of a table; raise if the factory does not take them."""
     try:
@@ -94,40 +106,47 @@ def _check_arguments(factory: Callable[..., Any], table: ModelTable, what: str) 
     return table.arguments
 
 
-def build_jump(folder: Path, table: JumpTable, where: str) -> Jump:
-    """Return a jump.
+def build_jump(folder: Path, table: JumpTable, system: HybridSystem | None, where: str) -> Jump:
+    """Return a jump; without a system, one whose map was not loaded.
 
     Parameters
     ----------
     folder : Path
         Of the problem file.
     table : JumpTable
+    system : HybridSystem or None
     where : str
         Place in the problem file, for messages.
     """
     if ".py" not in table.map.name:
         raise ValueError(f"map must name a function of a Python file, 'file.py:function'; got {table.map.name!r}.")
+    if system is None:
+        find_object(table.map.name, folder, where)
+        return Jump(table.time, lambda t, x, p: x)
     found = load_object(table.map.name, folder, where)
     if table.map.arguments and callable(found):
         found = call(found, f"{where} {table.map.name!r}", **_check_arguments(found, table.map, where))
     return Jump(table.time, found)
 
 
-def build_observe(folder: Path, table: DataTable, system: HybridSystem, where: str) -> Callable[..., Any] | None:
-    """Return the observation h(t, x, p); None for the whole state.
+def build_observe(folder: Path, table: DataTable, system: HybridSystem | None, where: str) -> Callable[..., Any] | None:
+    """Return the observation h(t, x, p); None for the whole state, or without a system.
 
     Parameters
     ----------
     folder : Path
         Of the problem file.
     table : DataTable
-    system : HybridSystem
+    system : HybridSystem or None
     where : str
         Place in the problem file, for messages.
     """
     if table.observe is None:
         return None
     if isinstance(table.observe, str):
+        if system is None:
+            find_object(table.observe, folder, f"{where}.observe")
+            return None
         observe = load_object(table.observe, folder, f"{where}.observe")
         if not callable(observe):
             raise ValueError(f"observe {table.observe!r} must be a function h(t, x, p); got {type(observe).__name__}.")
@@ -136,6 +155,8 @@ def build_observe(folder: Path, table: DataTable, system: HybridSystem, where: s
         raise ValueError(
             f"observe must name one state for each of the {len(table.columns)} columns; got {table.observe}."
         )
+    if system is None:
+        return None
     if system.state_names is None:
         raise ValueError("observe names states, but the model has no state_names; add them to it.")
     unknown = [name for name in table.observe if name not in system.state_names]
@@ -184,11 +205,11 @@ def build_experiments(
     path: Path,
     contents: Contents,
     opened: Sequence[Opened],
-    system: HybridSystem,
+    system: HybridSystem | None,
     *,
     searched: bool = False,
 ) -> Runs:
-    """Return the experiments, one for each log that a pattern stands for.
+    """Return the experiments, one for each log that a pattern stands for; without a system they observe nothing.
 
     Parameters
     ----------
@@ -197,7 +218,7 @@ def build_experiments(
     contents : Contents
     opened : sequence of Opened
         The logs of each experiment.
-    system : HybridSystem
+    system : HybridSystem or None
     searched : bool
         Whether mode sequences are to be found, so that they may be left out.
     """
@@ -261,7 +282,7 @@ class _Run:
     folder: Path
     where: str
     table: ExperimentTable
-    system: HybridSystem
+    system: HybridSystem | None
     parameters: frozenset[str]
 
     def build(self, logs: Sequence[Log]) -> Experiment:
@@ -283,7 +304,7 @@ class _Run:
             name=table.name,
             time_unit=table.time_unit,
             jumps=[
-                build_at(place, build_jump, self.folder, item, f"{place}.map")
+                build_at(place, build_jump, self.folder, item, self.system, f"{place}.map")
                 for place, item in zip(places, table.jumps, strict=True)
             ],
             origin=find_origin(table, logs),
