@@ -442,15 +442,29 @@ def test_simulate_writes_the_times_that_are_asked_for(folder):  # noqa: F811
         assert "--times must be " in result.stderr
 
 
-def test_the_table_of_logs_is_complete(folder):  # noqa: F811
+def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch):  # noqa: F811
     (folder / "logs" / "sunday.csv").write_text("t;T\n0;1\n1;cold\n")
-    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", folder / "table.csv")
-    assert result.exit_code == 2
-    written = pd.read_csv(folder / "table.csv")
-    assert written["verdict"].tolist() == ["good", "refused", "good"]
-    assert written["values"].tolist()[::2] == [12, 12]
+    tables = {}
+    for name in ("table.csv", "table.parquet"):
+        result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", folder / name)
+        assert result.exit_code == 2
+        tables[name] = pd.read_csv(folder / name) if name.endswith("csv") else pd.read_parquet(folder / name)
+    written, parquet = tables.values()
+    assert list(parquet.columns) == list(written.columns)
+    assert parquet["verdict"].tolist() == ["good", "refused", "good"]
+    assert parquet["values"].tolist()[::2] == [12, 12]
     for name in ("chi2", "degrees of freedom", "t0", "tf", "seconds", "tau_1 (s)", "tau_1 (s) std. error", "heating"):
+        assert np.isfinite(parquet[name]).tolist() == [True, False, True], name
         assert np.isfinite(written[name]).tolist() == [True, False, True], name
     assert written["degrees of freedom"].dropna().tolist() == [10, 10]
     np.testing.assert_allclose(written["chi2"].dropna(), 2 * written["cost"].dropna(), rtol=1e-12)
-    assert "cold" in written["message"][1]
+    assert "cold" in parquet["message"][1]
+    import pyarrow.parquet
+
+    schema = pyarrow.parquet.read_schema(folder / "table.parquet")
+    assert schema.field("tau_1 (s) std. error").metadata == {b"unit": b"s"}
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", folder / "new.parquet")
+    assert result.exit_code == 2
+    assert "pip install 'switchfit[parquet]', or give the table a name that ends in .csv" in result.stderr
+    assert not (folder / "new.parquet").exists()

@@ -34,7 +34,7 @@ ProblemForLogs = Annotated[
 ]
 LogTable = Annotated[
     Path | None,
-    option(metavar="FILE.csv", help="With --problem: a table with a row for each log."),
+    option(metavar="FILE.csv", help="With --problem: a table with a row for each log; FILE.parquet too."),
 ]
 Strategy = Annotated[
     Literal["local", "auto", "thorough"] | None,
@@ -211,10 +211,11 @@ def write_estimate(
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
     from switchfit.io.command_line import summarize_estimate
-    from switchfit.io.result_tables import ResultTable, list_logs
+    from switchfit.io.result_tables import ResultTable, check_table, list_logs
 
     logs = list_logs(paths)
     if table is not None:
+        check_table(table)
         terminal.make_folder(table.parent)
     results, fitted = ResultTable(), []
     for name, path in logs:
@@ -229,7 +230,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
             terminal.make_folder(folder)
             write_estimate(estimate, loaded, loaded.options | overrides, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
-            terminal.write_file(table, results.write())
+            terminal.write_file(table, results.write(table))
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
     terminal.print_note(results.summarize(len(logs)))

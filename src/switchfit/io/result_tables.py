@@ -1,6 +1,6 @@
 """Tables of all runs and all unknowns of a fit as CSV, however many.
 
-Fit many logs one by one: find and load them, and write a table with a row for each.
+Fit many logs one by one: find and load them, and write a table with a row for each, as CSV or Parquet.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.io.logs import find_logs, name_files
+from switchfit.io.logs import find_logs, import_library, name_files
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
 from switchfit.report.formats import add_dates, format_iso, format_rounded, label_quantity, list_dated
@@ -211,6 +211,26 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
     return list(zip(name_files(found), map(Path, found), strict=True))
 
 
+PARQUET = (".parquet", ".pq")
+"""Endings of tables that are written as Parquet; all others are CSV."""
+
+
+def check_table(path: Path) -> None:
+    """Raise for a table that cannot be written, before any log is fitted.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    InputError
+        If it is to be Parquet, and pyarrow is not installed.
+    """
+    if path.suffix.lower() in PARQUET:
+        import_library("pyarrow.parquet", "parquet", str(path), "or give the table a name that ends in .csv")
+
+
 @dataclass
 class ResultTable:
     """Results of fits to logs, in the order in which they were fitted.
@@ -219,13 +239,13 @@ class ResultTable:
     ----------
     rows : list of dict
         Of each log its columns; a column that does not apply to it is left out.
-    unknowns : dict of str to None
-        Names of the columns of the unknowns of all logs, with the unit in parentheses.
+    unknowns : dict of str to str
+        Names of the columns of the unknowns of all logs, with the unit in parentheses, and their units.
     refused, failed : int
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    unknowns: dict[str, None] = field(default_factory=dict)
+    unknowns: dict[str, str] = field(default_factory=dict)
     refused: int = 0
     failed: int = 0
 
@@ -269,7 +289,7 @@ class ResultTable:
         unknowns = list_unknowns(estimate)
         for unknown in unknowns:
             shown = label_quantity(unknown["name"], unknown["unit"])
-            self.unknowns[shown] = None
+            self.unknowns[shown] = unknown["unit"]
             row |= {shown: float(unknown["value"]), ERROR.format(shown): float(unknown["standard_error"])}
         row |= {f"{unknown['name']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
         self.rows.append({**row, "message": message})
@@ -298,6 +318,23 @@ class ResultTable:
         fitted = len(self) - self.refused - self.failed
         return f"{format_count(total, 'log')}: {fitted} fitted, {self.failed} not, {self.refused} refused{left}"
 
-    def write(self) -> str:
-        """Return the table as CSV, with the columns that any of the logs has."""
-        return write_rows(self.rows, sorted(list_columns(self.rows), key=lambda name: name == "message"))
+    def write(self, path: Path) -> str | bytes:
+        """Return the content of the table's file, with the columns that any of the logs has.
+
+        Parameters
+        ----------
+        path : Path
+            Its ending says whether it is Parquet or CSV.
+        """
+        columns = sorted(list_columns(self.rows), key=lambda name: name == "message")  # which comes last
+        return self._write_parquet(columns) if path.suffix.lower() in PARQUET else write_rows(self.rows, columns)
+
+    def _write_parquet(self, columns: Sequence[str]) -> bytes:
+        """Return Parquet; an empty cell is null, and the fields of unknowns have their units as metadata."""
+        import pyarrow.parquet
+
+        table, file = pyarrow.table({name: [row.get(name) for row in self.rows] for name in columns}), io.BytesIO()
+        units = [self.unknowns.get(name.removesuffix(ERROR.format("")), "") for name in columns]
+        fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
+        pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
+        return file.getvalue()

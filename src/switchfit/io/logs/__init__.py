@@ -89,7 +89,7 @@ def name_files(paths: Sequence[str | Path]) -> list[str]:
     return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
 
 
-def import_library(name: str, extra: str, what: str) -> Any:
+def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any:
     """Import a library.
 
     Parameters
@@ -100,6 +100,8 @@ def import_library(name: str, extra: str, what: str) -> Any:
         The extra of switchfit that it comes with.
     what : str
         What it is needed for, with the name of the file, as the begin of a sentence.
+    otherwise : str, optional
+        What else to do, as the end of a sentence.
 
     Raises
     ------
@@ -111,7 +113,8 @@ def import_library(name: str, extra: str, what: str) -> Any:
     except ImportError as error:
         library = name.partition(".")[0]
         raise InputError(
-            f"{what} needs {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'."
+            f"{what} needs {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'"
+            f"{', ' if otherwise else ''}{otherwise}."
         ) from error
 
 
