@@ -456,3 +456,23 @@ def test_composite_steps_satisfy_the_conditions_of_their_programmes(seed):
     convex = np.all(np.linalg.eigvalsh(H) >= 0)
     model = lambda s: g @ s + 0.5 * s @ H @ s  # noqa: E731
     assert not convex or model(step) <= model(normal) + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(24, 28))
+def test_a_normal_step_stays_where_the_inequalities_allow(seed):
+    """Across fewer constraints than unknowns ‖c + A v‖² is flat: a hair in its metric is a long way in the unknowns."""
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        jacobian = rng.normal(size=(2, 4)) * 10.0 ** rng.uniform(-4, 1, (2, 1))
+        slack = 10.0 ** rng.uniform(-12, 0, 3)
+        slack[rng.integers(3)] = 0.0
+        reach, lower, upper = (
+            10.0 ** rng.uniform(-2, 1, 4),
+            -(10.0 ** rng.uniform(-6, 1, 4)),
+            10.0 ** rng.uniform(-6, 1, 4),
+        )
+        order = np.diff(np.eye(4), axis=0)
+        room = Room(np.vstack([order, np.eye(4)]), np.append(-slack, lower), np.append(np.full(3, np.inf), upper))
+        step = find_normal_step(Equalities(rng.normal(size=2), jacobian), room, reach, 1.0)
+        products, size = room.normals @ step, np.max(np.abs(step))
+        assert max(np.max(room.lower - products), np.max(products - room.upper)) <= 1e-5 * size

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.optimize import algebra, lapack
-from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, norm, smallest
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, largest, norm, smallest
 from switchfit.optimize.threads import one_thread
 
 NONE = np.zeros(0, dtype=np.intp)
@@ -219,6 +219,10 @@ A matrix of the condition 1e12 brings rows to within 1e-6 of one another.
 SHORT = 0.01
 """Part of Newton's step, in the metric of the matrix, below which a step is refined: it has the other's rounding."""
 
+OUTSIDE = 1e-8
+"""Part of a step by which it may leave the room: daqp's tolerance in the metric of the matrix is a million times as much
+along directions in which that is nearly flat."""
+
 SOLVED, EQUALITY = 1, 5
 """What daqp calls a programme that it has solved, and a row that holds with equality."""
 
@@ -324,6 +328,16 @@ class Room(NamedTuple):
         (lower, upper), own = self.bounds, pull[-step.size :]
         return np.minimum(np.maximum(np.where(own > 0.0, lower, np.where(own < 0.0, upper, step)), lower), upper)
 
+    def move_inside(self, step: FloatArray) -> FloatArray:
+        """Return the step (d,) inside that is nearest to one: itself, unless it leaves by more than `OUTSIDE`."""
+        products, size = self.normals.dot(step), largest(np.abs(step))
+        if max(largest(self.lower - products), largest(products - self.upper)) <= OUTSIDE * size:
+            return step
+        rows, lengths = algebra.unit_rows(self.normals)
+        low, high = (self.lower - products) / (size * lengths), (self.upper - products) / (size * lengths)
+        found = find_least_distance(np.zeros(step.size), rows, low, high)
+        return np.zeros(step.size) if found is None else np.clip(step + size * found[0], *self.bounds)
+
 
 @dataclass(frozen=True, eq=False)
 class QPSolution:
@@ -413,7 +427,7 @@ def solve_programme(
         if refined is not None:
             e, pull = e + refined[0], np.where(active, pull + refined[1], 0.0)
     pull = length * pull / lengths
-    return room.press(length * factor.unwhiten(e), pull), pull
+    return room.move_inside(room.press(length * factor.unwhiten(e), pull)), pull
 
 
 class CholeskyFactor(NamedTuple):
