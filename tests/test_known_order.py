@@ -385,3 +385,8 @@ def test_a_beam_ends_with_the_time(monkeypatch):
         end = find_times(problem, problem.initial_theta)
     assert end.failed
     assert len(passes) == 1
+
+
+def test_a_beam_of_which_no_hypothesis_is_left_proposes_nothing():
+    problem, _ = pose([measure()])
+    assert beam.follow_order(problem, 0, np.array([1e300, 1e300])) == []

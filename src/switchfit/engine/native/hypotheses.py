@@ -210,7 +210,7 @@ class NativeHypotheses:
         records, wide = np.empty((2, K * room, self.record_size)), np.empty((2, K * room, births.shape[1]))
         numbers, ranks = np.zeros((2, K), dtype=np.int64), np.arange(2 * K * room).reshape(2, K * room)
         rank = [places[:k].tolist().count(place) for k, place in enumerate(places.tolist())]
-        at = places * room + rank
+        at = places * room + np.array(rank, dtype=np.int64)
         records[0, at], wide[0, at], numbers[0] = parents, births, np.bincount(places, minlength=K)
         given = records, numbers, ranks, wide, *order
         sizes = K, births.shape[1], first, last, self._cells
