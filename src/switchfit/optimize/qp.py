@@ -220,8 +220,8 @@ SHORT = 0.01
 """Part of Newton's step, in the metric of the matrix, below which a step is refined: it has the other's rounding."""
 
 OUTSIDE = 1e-8
-"""Part of a step by which it may leave the room. The tolerance of daqp is one in the metric of the matrix: a million times
-as much along directions in which that is nearly flat."""
+"""Part of a step by which it may leave the room. The tolerance of daqp is one in the metric of the matrix: a million
+times as much along directions in which that is nearly flat."""
 
 SOLVED, EQUALITY = 1, 5
 """What daqp calls a programme that it has solved, and a row that holds with equality."""
