@@ -120,7 +120,7 @@ def machine_code(evaluator: Evaluator, theta: np.ndarray) -> Any:
         raise RuntimeError("the problem has no machine code")
     tau, p = evaluator.problem.vectors(theta, 0)
     native(tau, p, 1.0)
-    return native._call_in_pieces
+    return lambda: native._function(native._address, *native._counts)
 
 
 def compiled_c(function: Any) -> Any:
