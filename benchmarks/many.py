@@ -1,6 +1,7 @@
 """Many fits at once: Monte Carlo on the paper's vehicle, in a process of its own that uses all cores.
 
-``python -m benchmarks.many RUNS`` prints what was measured as JSON; the part `many` runs it and makes the table.
+``python -m benchmarks.many RUNS`` prints what was measured as JSON; the part `many` runs it and makes the table. With
+``jax`` behind RUNS everything is evaluated by JAX: on a GPU, where there is one.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def positions(t: Any, x: Any, p: Any) -> Any:
     return x[jnp.array([0, 2])]
 
 
-def problem(seen: str) -> sf.Problem:
+def problem(seen: str, engine: str = "auto") -> sf.Problem:
     """The vehicle for 15 s, noise of 0.1 in every channel."""
     if seen == AT_ONE_HERTZ:
         data = sf.Measurements(
@@ -49,10 +50,11 @@ def problem(seen: str) -> sf.Problem:
     else:
         data = sf.Measurements(np.arange(151) / 10, np.zeros((151, 6)), sigma=0.1)
     run = sf.Experiment(data, vehicle.SEQUENCE, vehicle.START, *vehicle.HORIZON)
-    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(vehicle.MU_START, lower=0.05, upper=2.0)})
+    mu = sf.Parameter(vehicle.MU_START, lower=0.05, upper=2.0)
+    return sf.Problem(skid_steer(), run, {"mu": mu}, engine=engine)
 
 
-def measure(runs: int) -> dict[str, Any]:
+def measure(runs: int, engine: str = "auto") -> dict[str, Any]:
     """Seconds a fit: `runs` refits at once, and some of them by `estimate`, one after the other."""
     from switchfit.batch.program import Limits
     from switchfit.batch.simulated import build_study
@@ -61,7 +63,7 @@ def measure(runs: int) -> dict[str, Any]:
 
     found: dict[str, Any] = {}
     for name, (seen, start) in CASES.items():
-        here = problem(seen)
+        here = problem(seen, engine)
         began = time.perf_counter()
         sf.monte_carlo(here, 64, theta=TRUTH, start=start)
         first = time.perf_counter() - began
@@ -151,4 +153,4 @@ def run(report: Report, quick: bool, cores: set[int] | None) -> None:
 
 
 if __name__ == "__main__":
-    print(json.dumps(measure(int(sys.argv[1]))))
+    print(json.dumps(measure(int(sys.argv[1]), *sys.argv[2:])))

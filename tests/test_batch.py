@@ -268,18 +268,21 @@ def test_several_experiments_each_with_its_own_noise():
 
 
 def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
-    """In one call of 16 fits, not of the 1024 that a GPU takes at once: copies of the last fit are padding."""
+    """As with a GPU: in calls of 16 fits, not of 4096, and only what JAX evaluates."""
     from switchfit.batch import program
 
     monkeypatch.setattr(program, "CHUNK_IN_LOCKSTEP", 16)
-    work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
+    work = work_of(room(engine="jax"), TRUTH, np.array([1.7, 1.0]))
     values = np.stack([work.draw_run(k)[0, 0] for k in range(12)])
     varying, starts = work.stack_values({(0, 0): values}), work.starts.repeat(12, axis=0)
     one = Batch(work.problem, work.meshes, varying, LIMITS).fit(starts)
-    monkeypatch.setattr(program, "uses_lockstep", lambda: True)
+    monkeypatch.setattr(program, "has_gpu", lambda: True)
+    assert (program.choose_chunk_size(work.problem), program.choose_chunk_size(room())) == (16, 128)
     other = Batch(work.problem, work.meshes, varying, LIMITS).fit(starts)
+    natively = Batch(replace(work.problem, engine="auto"), work.meshes, varying, LIMITS).fit(starts)
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(one.iterations, other.iterations)
+    np.testing.assert_allclose(one.theta, natively.theta, rtol=0, atol=1e-10)
 
 
 def test_what_is_not_an_ordinary_minimum_is_finished_as_a_single_fit_is():

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.program import Inputs, choose_layout
+from switchfit.batch.program import Inputs, choose_layout, has_gpu
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit
@@ -350,7 +350,7 @@ class LogPosterior:
     @cached_property
     def _cost(self) -> Callable[[Any], Any]:
         """J, with its derivatives as rules."""
-        layout = choose_layout(self.evaluator)
+        layout = choose_layout(self.evaluator, on_gpu=has_gpu())
         inputs = Inputs.of(self.evaluator, layout)
 
         @jax.jit

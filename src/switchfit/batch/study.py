@@ -234,7 +234,7 @@ class Study:
     @property
     def size(self) -> int:
         """Runs in a chunk."""
-        return choose_chunk_size()
+        return choose_chunk_size(self.problem)
 
     @cached_property
     def arguments(self) -> tuple[Arguments, ...]:
