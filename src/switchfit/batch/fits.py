@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self, get_origin, get_type_hints
+from typing import Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.json_records import from_json, to_json
+from switchfit.runtime.json_records import find_dtype, from_json, to_json
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
@@ -76,7 +76,7 @@ def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
     """Return the names of the arrays of a class, and a dataclass of its other fields without the best estimate."""
     hints = {name: hint for name, hint in get_type_hints(kind).items() if name != "best"}
-    declared = [name for name, hint in hints.items() if get_origin(hint) is np.ndarray]
+    declared = [name for name, hint in hints.items() if find_dtype(hint) is not None]
     return declared, make_dataclass(kind.__name__, [item for item in hints.items() if item[0] not in declared])
 
 

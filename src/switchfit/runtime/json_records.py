@@ -184,8 +184,9 @@ def _get_hints(kind: Any) -> dict[str, Any]:
 
 def _read_plain(kind: Any, value: Any) -> Any:
     """Return a number, a text, an array or a member of an enumeration; an error of any kind for anything else."""
-    if get_origin(kind) is np.ndarray:
-        return _read_array(np.dtype(get_args(get_args(kind)[1])[0]), value)
+    dtype = find_dtype(kind)
+    if dtype is not None:
+        return _read_array(dtype, value)
     if get_origin(kind) is Literal:
         return get_args(kind)[get_args(kind).index(value)]
     if issubclass(kind, Enum):
@@ -197,6 +198,20 @@ def _read_plain(kind: Any, value: Any) -> Any:
     if kind is str:
         value.encode()  # JSON can hold half of a surrogate pair, UTF-8 cannot
     return value
+
+
+def find_dtype(kind: Any) -> np.dtype[Any] | None:
+    """Return the dtype of an annotation that stands for an array; None for any other.
+
+    Parameters
+    ----------
+    kind : type
+        ``NDArray[...]``: a name for ``np.ndarray[...]``, or from NumPy 2.5 on an alias with an origin of its own.
+    """
+    if get_origin(kind) not in (np.ndarray, NDArray):
+        return None
+    last = get_args(kind)[-1]
+    return np.dtype((get_args(last) or (last,))[0])
 
 
 def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
