@@ -4,6 +4,7 @@ import io
 import sys
 import threading
 import time
+import types
 
 import pytest
 from test_strategy import FAR, thermostat
@@ -129,3 +130,38 @@ def test_a_fit_writes_to_a_line_that_is_shown_alone():
     line.start()
     assert _write_to(line, "local", None) is not None
     line.end()
+
+
+def test_a_notebook_shows_what_a_long_call_is_doing(monkeypatch, capfd):
+    """A line that says what is done, and a bar; erased at the end."""
+    ipython, module, shown = types.ModuleType("IPython"), types.ModuleType("IPython.display"), []
+    ipython.get_ipython = lambda: types.SimpleNamespace(kernel=1)
+    module.HTML = str
+    module.display = lambda html, display_id: (shown.append(html), types.SimpleNamespace(update=shown.append))[1]
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "IPython.display", module)
+    monkeypatch.setattr(progress, "DELAY", 0.0)
+    monkeypatch.setattr(progress, "REDRAW", 0.001)
+
+    def wait_for(text):
+        end = time.monotonic() + 5.0
+        while not (found := any(text in html for html in shown)) and time.monotonic() < end:
+            time.sleep(0.005)
+        return found
+
+    with progress.show_line("looks for <modes>") as line:
+        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s")
+        line.write("many starts", 3.0)
+        progress.show_detail("start 3 of at most 127", 2.0)
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127")
+    assert shown[-1] == ""
+    count = len(shown)
+    time.sleep(0.1)
+    assert len(shown) == count, "drawn after its end"
+    with progress.show_progress(lambda done, total: done, "Profile of <k>") as report:
+        assert report(1, 4) == 1
+        assert wait_for('<progress value="1" max="4"></progress> Profile of &lt;k&gt;, 1/4, 0 s left')
+    assert shown[-1] == ""
+    assert capfd.readouterr() == ("", "")
+    ipython.get_ipython = lambda: None
+    assert not progress.is_notebook()

@@ -428,7 +428,9 @@ def test_figure_of_a_fit():
     without = plot_fit(made(sigma_known=None, comparisons=((),)))
     assert [ax.get_ylabel() for ax in without.axes] == ["X (m)", "dX (m/s)"]
     assert legend_of(without) == ["fitted", "transition"]
-    failed = plot_fit(made(status=Status.MAX_ITERATIONS)).legends[0].get_title()
+    figure_of_failed = plot_fit(made(status=Status.MAX_ITERATIONS))
+    figure_of_failed.set_size_inches(3.5, 4.0)  # which draws the legend anew
+    failed = figure_of_failed.legends[0].get_title()
     assert (failed.get_text(), to_hex(failed.get_color())) == ("Not a minimum: max iterations", FIT)
     each = plot_fit(several(2, names=["dry", "wet"]))
     assert [block.get_suptitle() for block in each.subfigs] == ["dry", "wet"]
