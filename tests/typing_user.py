@@ -1,6 +1,6 @@
 """What a user writes, for mypy: lists wherever sequences are taken, numbers of all kinds, figures, plain attributes.
 
-`tests/test_typing.py` runs mypy over this file, and the file itself.
+`make check` runs mypy over this file, `tests/test_typing.py` runs it.
 """
 
 from __future__ import annotations
@@ -56,6 +56,15 @@ def make_problem() -> sf.Problem:
     driven = sf.Input([0, 1, 2], [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], kind="linear")
     del other, guessed, driven
     return sf.Problem(system, [run], {"power": 2, "unused": sf.Parameter([1, 2], lower=[0, 0], fixed=True)})
+
+
+def misuse() -> None:
+    """What mypy must refuse: a comment that is not needed is an error too, so that types cannot become Any."""
+    sf.Experiment([], 5, [])  # type: ignore[arg-type]
+    sf.HybridSystem({}, [0.0], state_names=3)  # type: ignore[arg-type]
+    figure: int = sf.Estimate.load("x").plot()  # type: ignore[assignment]
+    sf.Input([0.0], [0.0], kind="step")  # type: ignore[arg-type]
+    del figure
 
 
 def use(problem: sf.Problem, folder: Path) -> list[float]:
