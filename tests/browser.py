@@ -15,7 +15,6 @@ from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
 NAMES = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome", "google-chrome-stable")
-DRAWN = "document.documentElement?.dataset.ready === 'true'"
 
 
 def find_browser():
@@ -69,14 +68,14 @@ class Browser:
         elif event["method"] == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def open(self, path: Path, *, width=1240, height=1000, dark=False, ready=DRAWN):
-        """Load a file, and wait until a condition is true: that its figures are drawn."""
+    def open(self, path: Path, *, width=1240, height=1000, dark=False):
+        """Load a file, and wait until its figures are drawn."""
         features = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.call("Emulation.setEmulatedMedia", features=features)
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.errors, self.requests = [], []
         self.call("Page.navigate", url=path.resolve().as_uri())
-        self.wait(ready)
+        self.wait("document.documentElement?.dataset.ready === 'true'")
         self.evaluate("new Promise((done) => setTimeout(done, 300))")
 
     def wait(self, condition, seconds=60):

@@ -115,12 +115,12 @@ def heater():
     return sf.estimate(heater_problem())
 
 
-def hostile_problem(name=HOSTILE):
+def hostile_problem():
     """Names of everything that a user names, made to do harm; positions x and y among the names."""
     system = sf.HybridSystem(
-        {name: lambda t, x, p: p["$$k$$"] * jnp.ones(2), "b": lambda t, x, p: jnp.zeros(2)},
+        {HOSTILE: lambda t, x, p: p["$$k$$"] * jnp.ones(2), "b": lambda t, x, p: jnp.zeros(2)},
         [0.0, 0.0],
-        state_names=(name, "@{t}{safe} $$y$$"),
+        state_names=(HOSTILE, "@{t}{safe} $$y$$"),
         state_units=("</script>", "m"),
     )
     times = np.linspace(0.1, 4.0, 30)
@@ -128,7 +128,7 @@ def hostile_problem(name=HOSTILE):
     values = np.minimum(times, 2.2)[:, None] * [1.0, 1.0] + noise
     data = sf.Measurements(times, values, sigma=0.05)
     runs = [
-        sf.Experiment(data, (name, "b"), (2.0,), 0.0, 4.0, name=run, time_unit="</script>")
+        sf.Experiment(data, (HOSTILE, "b"), (2.0,), 0.0, 4.0, name=run, time_unit="</script>")
         for run in ("<b>run</b>", "<i>run</i>")
     ]
     return sf.Problem(system, runs, {"$$k$$": sf.Parameter(0.9, unit="<i>")})
@@ -372,9 +372,8 @@ def test_what_was_loaded_without_its_model_has_no_sliders(toss, tmp_path):
     assert "loaded without its model" in Reader(text).words
 
 
-@pytest.mark.parametrize(
-    ("names", "units", "plane"),
-    [
+def test_positions_in_a_plane_are_told_by_names_and_units():
+    for names, units, plane in (
         (("x", "y"), ("m", "m"), (0, 1)),
         (("X", "dX", "Y"), ("m", "m/s", "m"), (0, 2)),
         (("pos_x", "pos_y"), ("", ""), (0, 1)),
@@ -383,10 +382,8 @@ def test_what_was_loaded_without_its_model_has_no_sliders(toss, tmp_path):
         (("v_x", "v_y"), ("", ""), None),
         (("x", "y"), ("m/s", "m/s"), None),
         (("a", "b"), ("m", "m"), None),
-    ],
-)
-def test_positions_in_a_plane_are_told_by_names_and_units(names, units, plane):
-    assert find_plane(names, units) == plane
+    ):
+        assert find_plane(names, units) == plane, names
 
 
 # --- one file ---------------------------------------------------------------------------------------------------------
@@ -411,22 +408,16 @@ def check_alone(text):
 
 
 def test_names_do_no_harm():
-    _, text = fit_and_page("hostile names")
+    fit, text = fit_and_page("hostile names")
     reader = check_alone(text)
     assert reader.count("script") == 3
     drawn = [attributes["id"] for tag, attributes in reader.elements if tag == "img"]
     assert drawn == ["residuals-drawing", "convergence-drawing"]
+    shown = Reader(fit.problem._repr_html_())
+    assert shown.count("script") == 0
     assert HOSTILE in reader.words
-
-
-@pytest.mark.slow
-def test_names_do_no_harm_in_a_notebook():
-    problem = hostile_problem("<b>$$x")
-    fit = sf.estimate(problem, strategy="local")
-    shown = [Reader(result._repr_html_()) for result in (problem, fit, fit.profile("$$k$$"))]
-    for reader, part in zip(shown, ("<b>$$x → b", "<b>run</b>.tau_1", "Profile of $$k$$"), strict=True):
-        assert part in reader.words
-        assert not reader.count("script")
+    assert HOSTILE in shown.words
+    assert "Profile of $$k$$" in Reader(fit.profile("$$k$$")._repr_html_()).words
 
 
 def test_positions_that_are_not_measured_have_no_path():
@@ -593,21 +584,6 @@ def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
 
 
 @pytest.mark.slow
-def test_channels_are_switched_on_and_off(browser, toss_page, tmp_path):
-    browser.open(write(tmp_path, toss_page))
-
-    def heights():
-        return browser.evaluate("document.getElementById('run-0').getBoundingClientRect().height")
-
-    before = heights()
-    browser.evaluate("document.querySelector('[data-channel=\"0-0\"]').click()")
-    browser.wait(f"document.getElementById('run-0').getBoundingClientRect().height < {before - 200}", 10)
-    browser.evaluate("document.querySelector('[data-channel=\"1-0\"]').click()")
-    browser.wait(f"document.getElementById('run-0').getBoundingClientRect().height > {before - 200}", 10)
-    check_quiet(browser)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("width", "dark"), [(390, False), (1240, True)])
 def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dark):
     browser.open(write(tmp_path, toss_page), width=width, dark=dark)
@@ -628,30 +604,23 @@ def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dar
 
 
 @pytest.mark.slow
-def test_it_prints(browser, toss_page, tmp_path):
-    browser.open(write(tmp_path, toss_page))
-    browser.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = false; })")
-    document = browser.print()
-    assert document.startswith(b"%PDF")
-    assert browser.evaluate("[...document.querySelectorAll('details')].every((d) => d.open)")
-    check_quiet(browser)
-
-
-@pytest.mark.slow
-def test_runs_are_chosen_and_shown_together(browser, tmp_path):
-    fit = sf.estimate(sf.Problem(RAMP, ramps(4), {"v": 0.9}))
-    browser.open(write(tmp_path, format_page(fit)))
+def test_runs_are_chosen_channels_switched_off_and_all_of_it_printed(browser, tmp_path):
+    browser.open(write(tmp_path, format_page(sf.estimate(sf.Problem(RAMP, ramps(4), {"v": 0.9})))))
     shown = "[...document.querySelectorAll('#fit .run.shown')].map((r) => r.dataset.run).join()"
     drawn = "[...document.querySelectorAll('#fit .run.shown .figure')].every((f) => f.offsetHeight > 300)"
-    assert browser.evaluate(shown) == "0"
     names = "[...document.querySelectorAll('.slider.shown label')].map((l) => l.textContent).join()"
-    assert browser.evaluate(names) == "run4.tau_1,v"
-    browser.evaluate(f"({CHOOSE})('2')")
-    browser.wait(drawn)
-    assert browser.evaluate(shown) == "2"
-    browser.evaluate(f"({CHOOSE})('all')")
-    browser.wait(drawn)
-    assert browser.evaluate(shown) == "0,1,2,3"
+    height = "document.getElementById('run-0').getBoundingClientRect().height"
+    assert (browser.evaluate(shown), browser.evaluate(names)) == ("0", "run4.tau_1,v")
+    for value, runs in (("2", "2"), ("all", "0,1,2,3")):
+        browser.evaluate(f"({CHOOSE})('{value}')")
+        browser.wait(drawn)
+        assert browser.evaluate(shown) == runs
+    before = browser.evaluate(height)
+    browser.evaluate("document.querySelector('[data-channel=\"0-0\"]').click()")
+    browser.wait(f"{height} < {before - 200}", 10)
+    browser.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = false; })")
+    assert browser.print().startswith(b"%PDF")
+    assert browser.evaluate("[...document.querySelectorAll('details')].every((d) => d.open)")
     check_quiet(browser)
 
 
