@@ -108,53 +108,42 @@ def test_the_report_names_the_files_where_it_leaves_rows_out(estimate):
 
 
 PROBLEM = """
-[model]
-name = "rooms.py:room"
+model = "rooms.py:room"
+parameters = { k = 0.5, power = { value = 1.1, lower = 0.1 } }
 
-[parameters]
-k = {{ value = 0.5 }}
-{parameters}
-{experiments}
-"""
-
-EXPERIMENT = """
 [[experiments]]
-name = "room{e}"
 mode_sequence = ["on", "off"]
 transition_times = [3.0]
 t0 = 0.0
 tf = 6.0
-parameter_map = {{ power = "power_{e}" }}
-[[experiments.data]]
-file = "log.csv"
-time = "t"
-columns = ["T{e}"]
-sigma = 0.02
+data = { file = "log_*.csv", time = "t", columns = ["T"], sigma = 0.02 }
+
+[options]
+strategy = "local"
 """
 
 
 def test_the_command_writes_them_where_they_are_many(tmp_path):
+    """Twelve logs of one experiment."""
     rng = np.random.default_rng(0)
-    columns = [temperatures(2.0 + 0.3 * e, 1.0) + 0.02 * rng.standard_normal(24) for e in range(6)]
-    header = ",".join(["t", *(f"T{e}" for e in range(6))])
-    np.savetxt(tmp_path / "log.csv", np.column_stack([TIMES, *columns]), delimiter=",", header=header, comments="")
+    for e in range(12):
+        values = temperatures(2.0 + 0.1 * e, 1.0) + 0.02 * rng.standard_normal(24)
+        table = np.column_stack([TIMES, values])
+        np.savetxt(tmp_path / f"log_{e}.csv", table, delimiter=",", header="t,T", comments="")
     (tmp_path / "rooms.py").write_text(
         "import switchfit as sf\n"
         "room = sf.HybridSystem({'on': lambda t, x, p: p['power'] - p['k'] * x,\n"
         "                        'off': lambda t, x, p: -p['k'] * x}, [0.2], state_names=('T',))\n"
     )
-    parameters = "\n".join(f"power_{e} = {{ value = 1.0, lower = 0.1 }}" for e in range(6))
-    experiments = "".join(EXPERIMENT.format(e=e) for e in range(6))
-    (tmp_path / "problem.toml").write_text(PROBLEM.format(parameters=parameters, experiments=experiments))
+    (tmp_path / "problem.toml").write_text(PROBLEM)
     out = tmp_path / "out"
     done = CliRunner().invoke(cli.app, ["fit", str(tmp_path / "problem.toml"), "--out", str(out), "--no-figures"])
     assert done.exit_code == 0, done.output
     assert sorted(path.name for path in out.iterdir()) == ["estimate.json", "report.txt", "runs.csv", "unknowns.csv"]
     said = " ".join(done.stdout.split())
-    assert f"and 3 more experiments, all in {out / 'runs.csv'}" in said
+    assert f"and 9 more experiments, all in {out / 'runs.csv'}" in said
     assert f"more unknowns, all in {out / 'unknowns.csv'}" in said
-    assert len(read((out / "runs.csv").read_text())) == 6
-    assert len(read((out / "unknowns.csv").read_text())) == 13
+    assert [len(read((out / name).read_text())) for name in ("runs.csv", "unknowns.csv")] == [12, 14]
 
 
 def test_tables_of_many_fits_leave_transition_times_out_first(estimate):
