@@ -17,16 +17,10 @@ UNITS = {"x": "m", "y": "rad"}
 
 
 def pandas_table():
-    table = pd.DataFrame({"x": X, "y": Y}, index=pd.Index(TIMES, name="t"))
+    table = pd.DataFrame({"x": X, "y": Y}, index=pd.Index(TIMES, name="t"), dtype="Float64")
+    table["x"].attrs["units"] = "ignored: pandas hands out a new column every time"
     table.attrs["units"] = UNITS
     return table.index, table
-
-
-def pandas_columns_with_units():
-    table = pd.DataFrame({"t": TIMES, "x": X, "y": Y}, dtype="Float64")
-    table["x"].attrs["units"] = "ignored: pandas hands out a new column every time"
-    table.attrs["units"] = {**UNITS, "t": "s"}
-    return table["t"], table[["x", "y"]]
 
 
 def polars_table():
@@ -57,7 +51,7 @@ def log(tmp_path):
     return found.times, found[["x", "y"]]
 
 
-TABLES = [pandas_table, pandas_columns_with_units, polars_table, xarray_dataset, xarray_array, log]
+TABLES = [pandas_table, polars_table, xarray_dataset, xarray_array, log]
 
 
 @pytest.mark.parametrize("make", TABLES, ids=lambda make: make.__name__)
@@ -106,8 +100,7 @@ def test_names_and_units_that_are_not_given_for_each():
 def test_single_columns(column):
     data = sf.Measurements(TIMES, column)
     np.testing.assert_array_equal(data.values[:, 0], X)
-    assert data.names == ("x",)
-    assert data.units == (("m",) if isinstance(column, xr.DataArray) else None)
+    assert (data.names, data.units) == (("x",), ("m",) if isinstance(column, xr.DataArray) else None)
     assert sf.Input(TIMES, column).shape == ()
 
 
