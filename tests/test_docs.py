@@ -158,6 +158,7 @@ def test_the_documentation_is_short():
     assert max(map(len, readme)) <= 120
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_readme_is_that_of_the_fit():
     """Matplotlib writes each text of a figure as a comment into the SVG: the numbers are those of the fit."""
     script = runpy.run_path(str(ROOT / "docs" / "idea_figures.py"))

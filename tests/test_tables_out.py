@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from models import RAMP, decay
+from models import RAMP, heated_room, temperature
 from test_many_logs import folder, log_of, run  # noqa: F401  # a fixture
 from test_report import made, several, trajectory_of
 from test_save import CERTIFICATE, assert_same
@@ -409,16 +409,7 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
 TIMES = np.linspace(0.25, 6.0, 24)
 
 
-def heating(t, x, p):
-    return p["power"] - p["k"] * x
-
-
-ROOM = sf.HybridSystem({"on": heating, "off": decay}, [0.2], state_names=("T",), state_units=("K",))
-
-
-def temperatures(tau, power, k=0.5):
-    rising = power / k + (0.2 - power / k) * np.exp(-k * np.minimum(TIMES, tau))
-    return rising * np.exp(-k * np.maximum(TIMES - tau, 0.0))
+ROOM = heated_room()
 
 
 @pytest.fixture(scope="module")
@@ -427,7 +418,7 @@ def estimate():
     rng, runs, own = np.random.default_rng(0), [], {}
     for e in range(5):
         tau, power = 2.0 + 0.4 * e, 1.0 + 0.1 * e
-        values = temperatures(tau, power) + 0.02 * rng.standard_normal(24)
+        values = temperature(TIMES, tau, power, 0.5) + 0.02 * rng.standard_normal(24)
         values += 0.2 * np.sin(3 * TIMES) * (e == 3)
         guess = sf.Parameter(tau, fixed=True) if e == 2 else 3.0
         data = sf.Measurements(TIMES, values, sigma=0.02)
@@ -514,7 +505,7 @@ def test_the_command_writes_them_where_they_are_many(tmp_path):
     """Twelve logs of one experiment."""
     rng = np.random.default_rng(0)
     for e in range(12):
-        values = temperatures(2.0 + 0.1 * e, 1.0) + 0.02 * rng.standard_normal(24)
+        values = temperature(TIMES, 2.0 + 0.1 * e, 1.0, 0.5) + 0.02 * rng.standard_normal(24)
         table = np.column_stack([TIMES, values])
         np.savetxt(tmp_path / f"log_{e}.csv", table, delimiter=",", header="t,T", comments="")
     (tmp_path / "rooms.py").write_text(
