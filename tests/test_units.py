@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -76,29 +75,33 @@ def texts_of(figure):
     return "\n".join(text.get_text() for text in figure.findobj(Text))
 
 
-def messages(unit):
-    """What is said of a bad guess, min_duration, a delay, a theta, a reset map, collapsed modes."""
-    late, given = log(delay="late"), {"time_unit": unit}
-    delayed = sf.Problem(room(), run(30.0, late, **given), RATES | {"late": sf.Parameter(0.5, 0.0, 1.0)})
-    nowhere = sf.HybridSystem({"on": lambda t, x, p: p["heating"] * jnp.sqrt(20.0 - t), "off": off}, [15.0])
-    endless = sf.HybridSystem({"on": lambda t, x, p: p["heating"] * x**2, "off": off}, [15.0])
-    broken = room(reset_maps={("on", "off"): lambda t, x, p: x * np.nan})
-    calls = {
-        "min_duration": lambda: problem(unit, min_duration=50.0),
-        "delay": lambda: sf.Problem(room(), run(30.0, late, **given), RATES | {"late": 0.5}),
-        "theta": lambda: sf.evaluate(delayed, [30.0, 0.3, 0.05, 3.0]),
-    }
-    for name, system in (("nan", nowhere), ("blows up", endless), ("reset map", broken)):
-        calls[name] = partial(sf.simulate, sf.Problem(system, run(**given), RATES))
-    said = {}
-    for name, call in calls.items():
-        with pytest.raises(ValueError, match=r".") as caught:
-            call()
-        said[name] = str(caught.value)
-    for name, times, shortest in (("collapsed mode", (42.0, 44.0), 0.0), ("shortest mode", (30.0, 60.0), 10.0)):
-        three = run(times, modes=("on", "off", "on"), **given)
-        said[name] = str(sf.estimate(sf.Problem(room(), three, RATES, min_duration=shortest), strategy="local"))
-    return said
+def late_problem(bounds=()):
+    """A delay of the log, in minutes, with or without bounds."""
+    given = {"late": sf.Parameter(0.5, *bounds)}
+    return sf.Problem(room(), run(30.0, log(delay="late"), time_unit="min"), RATES | given)
+
+
+def simulate(on=on, **more):
+    system = sf.HybridSystem({"on": on, "off": off}, [15.0], **more)
+    return sf.simulate(sf.Problem(system, run(time_unit="min"), RATES))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: problem("min", min_duration=50.0), r"is 50\.0 min, but the guess gives mode 1 .* of run1 only 30 min"),
+        (late_problem, r"may lie in \[-inf, inf\] min, .*only from -3 to 1 min"),
+        (lambda: sf.evaluate(late_problem((0.0, 1.0)), [30.0, 0.3, 0.05, 3.0]), "are of moments from -2 to 114 min"),
+        (lambda: simulate(lambda t, x, p: p["heating"] * jnp.sqrt(20.0 - t)), r"at t = 2\S* min, x = "),
+        (lambda: simulate(lambda t, x, p: p["heating"] * x**2), r"beyond t = 0\.\S* min, where x = "),
+        (lambda: simulate(reset_maps={("on", "off"): lambda t, x, p: x * np.nan}), "at t = 30 min, x = "),
+    ],
+    ids=["min_duration", "delay", "theta", "nan", "blows up", "reset map"],
+)
+def test_messages_have_times_in_their_unit(call, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    assert not LONE_S.search(str(caught.value))
 
 
 FILE = """
@@ -143,7 +146,6 @@ class Said:
             patch.setattr(certificate, "measure_closing_gap", lambda *given: (0.0, 0.0))  # most of the time
             self.fit.save(path)
         self.path = path
-        self.messages = messages(UNIT)
 
     def save(self):
         content = json.loads(self.path.read_text(encoding="utf-8"))
@@ -177,14 +179,6 @@ TEXTS = {
     "figure of a search": (lambda s: texts_of(s.search.plot()), []),
     "prediction": (lambda s: s.fit.predict([5.0]).time_unit, [UNIT]),
     "simulation": (lambda s: sf.simulate(s.problem).time_unit, [UNIT]),
-    "min_duration": (lambda s: s.messages["min_duration"], ["min_duration is 50.0 {0} %", "of run1 only 30 {0} %."]),
-    "delay": (lambda s: s.messages["delay"], ["may lie in [-inf, inf] {0} %", "only from -3 to 1 {0} %"]),
-    "theta": (lambda s: s.messages["theta"], ["are of moments from -2 to 114 {0} %"]),
-    "nan": (lambda s: s.messages["nan"], ["at t = 2", " {0} %, x = "]),
-    "blows up": (lambda s: s.messages["blows up"], ["beyond t = 0.", " {0} %, where x = "]),
-    "reset map": (lambda s: s.messages["reset map"], ["at t = 30 {0} %, x = "]),
-    "collapsed mode": (lambda s: s.messages["collapsed mode"], []),
-    "shortest mode": (lambda s: s.messages["shortest mode"], []),
 }
 """What prints, draws, saves or raises a text, and parts of it: a time and its unit."""
 
