@@ -244,12 +244,16 @@ def test_the_inputs_are_there_to_run_it_again(toss_page):
 
 
 @pytest.mark.usefixtures("quick_certificates")
-def test_without_a_problem_file_the_data_are_hashed(heater, tmp_path):
+def test_without_a_problem_file_the_data_are_hashed_and_without_a_model_nothing_moves(heater, tmp_path):
     log = heater.problem.experiments[0].data[0]
     raw = np.column_stack([log.times, log.values]).astype("<f8").tobytes()
     assert hashlib.sha256(raw).hexdigest() in Reader(format_page(heater)).words
     with pytest.raises(TypeError, match="provenance must be the provenance of a problem file"):
         heater.save_report(tmp_path / "report.html", provenance="problem.toml")
+    heater.save(tmp_path / "fit.json")
+    text = format_page(sf.Estimate.load(tmp_path / "fit.json"))
+    assert payload_of(text)["sliders"] == []
+    assert "loaded without its model" in Reader(text).words
 
 
 def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_there(toss, heater):
@@ -342,14 +346,6 @@ def test_sliders_stop_at_bounds_and_at_what_can_be_seen(toss):
         curves = [(own.curve[f"d{place}_{k}"], own.curve[f"y{k}"]) for own in runs[0] for k in range(len(own.names))]
         moved = [reach * np.nanmax(np.abs(slope)) / (np.nanmax(y) - np.nanmin(y)) for slope, y in curves]
         assert max(moved) <= VISIBLE * (1 + 1e-6)
-
-
-@pytest.mark.usefixtures("quick_certificates")
-def test_what_was_loaded_without_its_model_has_no_sliders(toss, tmp_path):
-    toss.save(tmp_path / "toss.json")
-    text = format_page(sf.Estimate.load(tmp_path / "toss.json"))
-    assert payload_of(text)["sliders"] == []
-    assert "loaded without its model" in Reader(text).words
 
 
 def test_positions_in_a_plane_are_told_by_names_and_units():

@@ -285,19 +285,16 @@ def test_a_notebook_shows_a_short_table_and_a_small_figure(name, heater, starts,
 
 
 def test_one_panel_of_several(heater, models):
-    """With its legend; what is drawn is what the whole figure has there."""
-    fits = sf.estimate_many([heater.problem] * 3)
+    """What is drawn is what the whole figure has there."""
+    fits, found = sf.estimate_many([heater.problem] * 3), heater.validate(heater.problem)
     whole, alone = fits.plot().axes[1], fits.plot(unknown="k").axes[0]
     np.testing.assert_array_equal(alone.collections[1].get_offsets(), whole.collections[1].get_offsets())
     assert (alone.get_xlabel(), alone.get_ylabel()) == (whole.get_xlabel(), "run")
     assert [text.get_text() for text in alone.get_legend().get_texts()] == ["good"]
-    found = heater.validate(heater.problem)
-    (alone,), whole = found.plot(channel="thermometer").axes, found.plot()
-    labels = {text.get_text() for text in alone.get_legend().get_texts()}
-    bands = {"95 % prediction", "95 % confidence"}
-    assert {"measured", "predicted", *bands, "transition", "transition, 95 % interval"} == labels
-    assert labels | {"± sigma"} == {text.get_text() for text in whole.legends[0].get_texts()}
+    whole, alone = found.plot(), found.plot(channel="thermometer").axes[0]
     np.testing.assert_array_equal(alone.lines[1].get_data(), whole.axes[0].lines[1].get_data())
+    labels = {text.get_text() for text in whole.legends[0].get_texts()}
+    assert {"measured", "predicted", "95 % prediction", "95 % confidence", "± sigma"} < labels
     ax = models.plot(ax=Figure().subplots())
     assert [text.get_text() for text in ax.get_yticklabels()] == ["k estimated", "k known"]
     low, high = ax.get_ylim()

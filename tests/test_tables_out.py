@@ -327,31 +327,23 @@ def test_a_simulation_at_given_times_is_that_of_the_nodes(heater):
     np.testing.assert_allclose(path.states, heater.comparisons[0][0].fitted, rtol=1e-8)
 
 
-def test_a_simulation_up_to_a_free_tf():
-    data = sf.TerminalCost(lambda x, p: (x[0] - 3.0) ** 2)
-    end = sf.Parameter(1.7, lower=1.0, upper=5.0)
-    problem = sf.Problem(RAMP, sf.Experiment(data, ("up",), (), 0.0, end), {"v": sf.Parameter(2.0, fixed=True)})
+def test_a_simulation_up_to_a_free_tf_and_times_outside():
+    end, constant = sf.Parameter(1.7, lower=1.0, upper=5.0), {"v": sf.Parameter(2.0, fixed=True)}
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: (x[0] - 3.0) ** 2), ("up",), (), 0.0, end)
+    problem = sf.Problem(RAMP, run, constant)
     path = sf.simulate(problem, times=[0.0, 1.0, 1.7])
     np.testing.assert_allclose(path.states[:, 0], [0.0, 2.0, 3.4], rtol=1e-9)
-    with pytest.raises(ValueError, match=r"times must lie inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"):
-        sf.simulate(problem, times=[2.0])
-    with pytest.raises(ValueError, match="times='samples' needs data with samples, and experiment 0 has none"):
-        sf.simulate(problem, times="samples")
-
-
-@pytest.mark.parametrize(
-    ("times", "message"),
-    [
-        ([1.0, 1.0], "times must increase strictly; got 1.0 after 1.0"),
-        ([-1.0], r"times must lie inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
-        ([], r"times must be finite numbers of shape \(K,\), or 'samples'; got shape \(0,\)"),
-        ([np.nan], "times must be finite numbers"),
-        ("sample", "times must be 'samples'; got 'sample'|times must be .*samples"),
-    ],
-)
-def test_times_that_cannot_be_simulated(times, message):
-    with pytest.raises(ValueError, match=message):
-        sf.simulate(heater_problem(), times=times)
+    for given, times, message in (
+        (problem, [2.0], r"times must lie inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"),
+        (problem, "samples", "times='samples' needs data with samples, and experiment 0 has none"),
+        (heater_problem(), [-1.0], r"times must lie inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
+        (heater_problem(), [1.0, 1.0], "times must increase strictly; got 1.0 after 1.0"),
+        (heater_problem(), [], r"times must be finite numbers of shape \(K,\), or 'samples'; got shape \(0,\)"),
+        (heater_problem(), [np.nan], "times must be finite numbers"),
+        (heater_problem(), "sample", "times must be 'samples'; got 'sample'|times must be .*samples"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sf.simulate(given, times=times)
 
 
 # --- command line -----------------------------------------------------------------------------------------------------

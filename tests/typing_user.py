@@ -9,7 +9,6 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import switchfit as sf
@@ -72,8 +71,6 @@ def use(problem: sf.Problem, folder: Path) -> list[float]:
     estimate: sf.Estimate = sf.estimate(problem, start=[4.0, 2.0, 0.1], max_iterations=100)
     figure: Figure = estimate.plot()
     residuals: Figure = estimate.plot_residuals()
-    axes: list[Axes] = figure.axes + residuals.axes
-    del axes
     power: float = estimate.parameters["power"]
     tau: float = float(estimate.transition_times[0][0])
     interval: tuple[float, float] = estimate.profile("power").interval()
@@ -86,5 +83,5 @@ def use(problem: sf.Problem, folder: Path) -> list[float]:
     many = sf.estimate_many([problem, problem])
     passed: bool = sf.check_derivatives(problem, [4.1, 2.0, 0.1]).passed
     names: tuple[str, ...] = problem.theta_names
-    del level, names, passed, bands, many
+    del figure, residuals, level, names, passed, bands, many
     return [power, tau, *interval, J, float(moved.states[-1, 0])]
