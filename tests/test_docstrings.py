@@ -55,8 +55,12 @@ def exists(name):
 
 @pytest.mark.parametrize("name", PUBLIC)
 def test_there_are_examples_and_references(name):
+    """And of models and readers every parameter is described; test_contracts.py looks at the others."""
     assert ">>>" in section(PUBLIC[name], "Examples"), f"{name} has no Examples section"
     assert section(PUBLIC[name], "See Also"), f"{name} has no See Also section"
+    if name.startswith("models.") or name == "load_problem":
+        described = re.findall(r"\w+", " ".join(re.findall(r"^[\w, ]+", section(PUBLIC[name], "Parameters"), re.M)))
+        assert set(inspect.signature(PUBLIC[name]).parameters) <= set(described)
 
 
 @pytest.mark.parametrize("name", [name for name, item in PUBLIC.items() if section(item, "Examples")])

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from typer.testing import CliRunner
 
 from switchfit import cli
@@ -61,40 +60,36 @@ def words_of(line):
     return NUMBER.sub("#", line).split()
 
 
-def run(command, folder):
-    """Run a line of the shell with this environment's commands; return what it prints.
+def run(command):
+    """Run a line of the shell; return what it prints.
 
     After the first one, commands of switchfit run in this process; test_cli_pipe.py has them in processes of their own.
     """
     name, *arguments = shlex.split(command)
     if name == "switchfit" and arguments != ["--version"]:
         return CliRunner(env={"COLUMNS": "100"}).invoke(cli.app, arguments).output
-    places = [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
-    sources = [str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]
-    kept = os.environ | {"PATH": os.pathsep.join(places), "PYTHONPATH": os.pathsep.join(filter(None, sources))}
-    kept |= {"LC_ALL": "C.UTF-8"}
-    done = subprocess.run(
-        ["sh", "-c", command], cwd=folder, env=kept, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    done = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return done.stdout
 
 
 def test_the_commands_print_what_the_page_shows(tmp_path, monkeypatch):
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
-    folder, commands = tmp_path, 0
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "src"), prepend=os.pathsep)
+    monkeypatch.setenv("LC_ALL", "C.UTF-8")
+    monkeypatch.chdir(tmp_path)
+    commands = 0
     for kind, line, text in read_steps(PAGE.read_text(encoding="utf-8")):
         if kind == "file":
-            (folder / line).write_text(text, encoding="utf-8")
+            Path(line).write_text(text, encoding="utf-8")
         elif line.startswith("cd "):
-            folder = folder / shlex.split(line)[1]
+            monkeypatch.chdir(shlex.split(line)[1])
         else:
-            monkeypatch.chdir(folder)
-            printed = run(line, folder)
-            if not follows(printed.splitlines(), text.splitlines()):
-                pytest.fail(f"$ {line}\n{printed}\nThe page has:\n{text}")
+            printed = run(line)
+            assert follows(printed.splitlines(), text.splitlines()), f"$ {line}\n{printed}\nThe page has:\n{text}"
             commands += 1
     assert commands > 8
-    assert "<html" in (folder / "room" / "out" / "report.html").read_text(encoding="utf-8")
+    assert "<html" in (tmp_path / "room" / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_log_is_what_its_script_writes(tmp_path):

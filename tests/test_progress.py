@@ -4,6 +4,7 @@ import io
 import sys
 import threading
 import time
+import types
 
 import pytest
 from test_strategy import FAR, thermostat
@@ -11,7 +12,6 @@ from test_strategy import FAR, thermostat
 import switchfit as sf
 from switchfit.runtime import progress
 from switchfit.runtime.progress import show_detail, show_line, show_progress
-from switchfit.strategy.choice import _write_to
 
 
 class Terminal(io.StringIO):
@@ -48,6 +48,10 @@ def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
         line.write("other")
         assert wait_for("other   ", terminal)
     assert terminal.getvalue().endswith("\x1b[2K")  # the line is erased
+    with show_progress(lambda done, total: done, "runs") as report:
+        assert report(3, 4) == 3
+        assert wait_for("runs, 3/4, 0 s left", terminal)
+        assert "━" in terminal.getvalue()
     for thread in set(threading.enumerate()) - before:
         thread.join(5.0)
         assert not thread.is_alive()
@@ -72,44 +76,23 @@ def test_calls_inside_another_one_and_other_threads_show_nothing(monkeypatch):
         assert text not in terminal.getvalue()
 
 
-def test_nothing_without_a_terminal(monkeypatch):
-    stream = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr(progress, "DELAY", 0.001)
+@pytest.mark.parametrize("where", ["no terminal", "closed", "no stderr", "ends at once"])
+def test_nothing_is_shown(monkeypatch, where):
+    """Programs without a console have None in the place of stderr; a daemon may have closed it."""
+    stream = Terminal() if where == "ends at once" else io.StringIO()
+    monkeypatch.setattr(sys, "stderr", None if where == "no stderr" else stream)
+    if where == "closed":
+        stream.close()
+    if where != "ends at once":
+        monkeypatch.setattr(progress, "DELAY", 0.001)
     with show_line("begins"):
         show_detail("more")
         time.sleep(0.1)
-    assert stream.getvalue() == ""
-    show_detail("nowhere")
-
-
-@pytest.mark.parametrize("closed", [True, False])
-def test_without_a_stderr_nothing_is_shown(monkeypatch, closed):
-    """Programs without a console have None in its place; a daemon may have closed it."""
-    stream = io.StringIO()
-    stream.close()
-    monkeypatch.setattr(sys, "stderr", stream if closed else None)
-    with show_line("begins"):
-        show_detail("more")
     with show_progress(None, "runs") as report:
         assert not report(1, 2)
-
-
-def test_a_bar_is_drawn_where_it_is_known_how_much_there_is_to_do(monkeypatch):
-    terminal = open_terminal(monkeypatch)
-    with show_progress(lambda done, total: done, "runs") as report:
-        assert report(3, 4) == 3
-        assert wait_for("runs, 3/4, 0 s left", terminal)
-        assert "━" in terminal.getvalue()
-
-
-def test_what_ends_at_once_shows_nothing(monkeypatch):
-    stream = Terminal()
-    monkeypatch.setattr(sys, "stderr", stream)
-    with show_line("begins"):
-        pass
     time.sleep(progress.DELAY + 0.3)
-    assert stream.getvalue() == ""
+    assert where == "closed" or stream.getvalue() == ""
+    show_detail("nowhere")
 
 
 def test_strategies_are_shown(monkeypatch):
@@ -123,9 +106,36 @@ def test_strategies_are_shown(monkeypatch):
     assert stopped.iterations == 2
 
 
-def test_a_fit_writes_to_a_line_that_is_shown_alone():
-    line = progress.Line("fit")
-    assert _write_to(line, "local", None) is None
-    line.start()
-    assert _write_to(line, "local", None) is not None
-    line.end()
+def test_a_notebook_shows_what_a_long_call_is_doing(monkeypatch, capfd):
+    """A line that says what is done, and a bar; erased at the end."""
+    ipython, module, shown = types.ModuleType("IPython"), types.ModuleType("IPython.display"), []
+    ipython.get_ipython = lambda: types.SimpleNamespace(kernel=1)
+    module.HTML = str
+    module.display = lambda html, display_id: (shown.append(html), types.SimpleNamespace(update=shown.append))[1]
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "IPython.display", module)
+    monkeypatch.setattr(progress, "DELAY", 0.0)
+    monkeypatch.setattr(progress, "REDRAW", 0.001)
+
+    def wait_for(text):
+        end = time.monotonic() + 5.0
+        while not (found := any(text in html for html in shown)) and time.monotonic() < end:
+            time.sleep(0.005)
+        return found
+
+    with progress.show_line("looks for <modes>") as line:
+        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s")
+        line.write("many starts", 3.0)
+        progress.show_detail("start 3 of at most 127", 2.0)
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127")
+    assert shown[-1] == ""
+    count = len(shown)
+    time.sleep(0.1)
+    assert len(shown) == count, "drawn after its end"
+    with progress.show_progress(lambda done, total: done, "Profile of <k>") as report:
+        assert report(1, 4) == 1
+        assert wait_for('<progress value="1" max="4"></progress> Profile of &lt;k&gt;, 1/4, 0 s left')
+    assert shown[-1] == ""
+    assert capfd.readouterr() == ("", "")
+    ipython.get_ipython = lambda: None
+    assert not progress.is_notebook()

@@ -1,5 +1,8 @@
 """Tables of pandas, polars and xarray, and logs, wherever arrays are taken: numbers, names and units arrive."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pandas as pd
 import polars as pl
@@ -14,16 +17,10 @@ UNITS = {"x": "m", "y": "rad"}
 
 
 def pandas_table():
-    table = pd.DataFrame({"x": X, "y": Y}, index=pd.Index(TIMES, name="t"))
+    table = pd.DataFrame({"x": X, "y": Y}, index=pd.Index(TIMES, name="t"), dtype="Float64")
+    table["x"].attrs["units"] = "ignored: pandas hands out a new column every time"
     table.attrs["units"] = UNITS
     return table.index, table
-
-
-def pandas_columns_with_units():
-    table = pd.DataFrame({"t": TIMES, "x": X, "y": Y}, dtype="Float64")
-    table["x"].attrs["units"] = "ignored: pandas hands out a new column every time"
-    table.attrs["units"] = {**UNITS, "t": "s"}
-    return table["t"], table[["x", "y"]]
 
 
 def polars_table():
@@ -54,53 +51,45 @@ def log(tmp_path):
     return found.times, found[["x", "y"]]
 
 
-TABLES = [pandas_table, pandas_columns_with_units, polars_table, xarray_dataset, xarray_array, log]
+TABLES = [pandas_table, polars_table, xarray_dataset, xarray_array, log]
 
 
-@pytest.fixture(params=TABLES, ids=lambda make: make.__name__)
-def table(request, tmp_path):
-    times, values = request.param(tmp_path) if request.param is log else request.param()
-    return times, values, ("", "") if request.param is polars_table else ("m", "rad")
-
-
-def test_measurements(table):
-    times, values, units = table
+@pytest.mark.parametrize("make", TABLES, ids=lambda make: make.__name__)
+def test_numbers_names_and_units_arrive(make, tmp_path):
+    times, values = make(tmp_path) if make is log else make()
+    units, array = (None if make is polars_table else ("m", "rad")), np.stack([X, Y], axis=1)
     data = sf.Measurements(times, values, sigma=0.1)
     np.testing.assert_array_equal(data.times, TIMES)
-    np.testing.assert_array_equal(data.values, np.stack([X, Y], axis=1))
-    assert data.names == ("x", "y")
-    assert data.units == (units if any(units) else None)
-    renamed = sf.Measurements(times, values, names=("a", "b"), units=("km", "deg"))
-    assert (renamed.names, renamed.units) == (("a", "b"), ("km", "deg"))
-    weighted = sf.Measurements(times, values, sigma=0.5 + np.abs(np.asarray(data.values)))
-    assert weighted.sigma.shape == (5, 2)
-
-
-def test_reference(table):
-    times, values, units = table
+    np.testing.assert_array_equal(data.values, array)
+    assert (data.names, data.units) == (("x", "y"), units)
+    renamed = sf.Measurements(times, values, names=("a", "b"), units=("km", "deg"), sigma=0.5 + np.abs(array))
+    assert (renamed.names, renamed.units, renamed.sigma.shape) == (("a", "b"), ("km", "deg"), (5, 2))
     reference = sf.ReferenceSignal.from_samples(times, values)
-    np.testing.assert_allclose(reference.signal(TIMES), np.stack([X, Y], axis=1), atol=1e-14)
-    assert reference.names == ("x", "y")
-    assert reference.units == (units if any(units) else None)
-
-
-def test_input(table, request):
-    times, values, units = table
+    np.testing.assert_allclose(reference.signal(TIMES), array, atol=1e-14)
+    assert (reference.names, reference.units) == (("x", "y"), units)
     inputs = sf.Input(times, values, kind="linear")
-    assert inputs.units == (units if any(units) else None)
+    assert inputs.units == units
     if inputs.names:
         assert inputs.names == ("x", "y")
         np.testing.assert_array_equal(inputs.values["y"], Y)
     else:  # an array of xarray is an array
-        np.testing.assert_array_equal(inputs.values, np.stack([X, Y], axis=1))
+        np.testing.assert_array_equal(inputs.values, array)
     np.testing.assert_array_equal(inputs.signal(0.0, 2.0)(TIMES)[:, 1], Y)
 
 
-def test_units_follow_their_names():
+def test_names_and_units_that_are_not_given_for_each():
+    """Units follow their names; what is no name is none."""
     table = pd.DataFrame({"b": X, "a": Y})
     table.attrs["units"] = {"a": "m", "b": "rad"}
     inputs = sf.Input(TIMES, table)
     assert dict(zip(inputs.names, inputs.units, strict=True)) == {"a": "m", "b": "rad"}
+    twice = pd.DataFrame(np.stack([X, Y], axis=1), columns=["x", "x"])
+    for values in (pd.DataFrame({0: X, 1: Y}), pd.Series(X), pl.Series(X), twice):
+        assert sf.Measurements(TIMES, values).names is None
+    with pytest.raises(ValueError, match=r"units must have one entry for each of the 1 channels; got \('m', 's'\)"):
+        sf.Measurements(TIMES, X, units=("m", "s"))
+    with pytest.raises(TypeError, match="each of units must be a string; got 3"):
+        sf.Input(TIMES, X, units=[3])
 
 
 @pytest.mark.parametrize(
@@ -111,8 +100,7 @@ def test_units_follow_their_names():
 def test_single_columns(column):
     data = sf.Measurements(TIMES, column)
     np.testing.assert_array_equal(data.values[:, 0], X)
-    assert data.names == ("x",)
-    assert data.units == (("m",) if isinstance(column, xr.DataArray) else None)
+    assert (data.names, data.units) == (("x",), ("m",) if isinstance(column, xr.DataArray) else None)
     assert sf.Input(TIMES, column).shape == ()
 
 
@@ -132,14 +120,6 @@ def test_missing_values(values):
         sf.Input(TIMES, values)
 
 
-def test_names_that_cannot_be_names():
-    assert sf.Measurements(TIMES, pd.DataFrame({0: X, 1: Y})).names is None
-    assert sf.Measurements(TIMES, pd.Series(X)).names is None
-    assert sf.Measurements(TIMES, pl.Series(X)).names is None
-    twice = pd.DataFrame(np.stack([X, Y], axis=1), columns=["x", "x"])
-    assert sf.Measurements(TIMES, twice).names is None
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -155,30 +135,16 @@ def test_what_is_no_number(values, message):
         sf.Measurements(TIMES, values)
 
 
-def test_units_that_do_not_fit():
-    with pytest.raises(ValueError, match=r"units must have one entry for each of the 1 channels; got \('m', 's'\)"):
-        sf.Measurements(TIMES, X, units=("m", "s"))
-    with pytest.raises(TypeError, match="each of units must be a string; got 3"):
-        sf.Input(TIMES, X, units=[3])
-
-
-def test_there_and_back(tmp_path):
-    """A log as a DataFrame, and the same measurements from both."""
+def test_a_log_as_a_table(tmp_path):
+    """The same measurements from both; of the libraries none is imported for it."""
     times, channels = log(tmp_path)
     table = channels.to_pandas()
     assert (table.index.name, list(table.columns), table.attrs["units"]) == ("t", ["x", "y"], UNITS)
     one, other = sf.Measurements(times, channels), sf.Measurements(table.index, table)
     np.testing.assert_array_equal(one.values, other.values)
     assert (one.names, one.units) == (other.names, other.units)
-
-
-def test_none_of_the_libraries_is_imported(tmp_path):
-    import subprocess
-    import sys
-
     code = (
-        "import sys, switchfit as sf; open('a.csv', 'w').write('t,x\\n0,1\\n1,2\\n'); log = sf.read_log('a.csv');"
-        "sf.Measurements(log.times, log[['x']]);"
+        "import sys, switchfit as sf; log = sf.read_log('a.csv'); sf.Measurements(log.times, log[['x']]);"
         "print([name for name in ('pandas', 'polars', 'xarray', 'pyarrow', 'h5py', 'rosbags') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)

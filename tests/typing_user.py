@@ -1,6 +1,6 @@
 """What a user writes, for mypy: lists wherever sequences are taken, numbers of all kinds, figures, plain attributes.
 
-`tests/test_typing.py` runs mypy over this file, and the file itself.
+`make check` runs mypy over this file, `tests/test_typing.py` runs it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import switchfit as sf
@@ -58,13 +57,20 @@ def make_problem() -> sf.Problem:
     return sf.Problem(system, [run], {"power": 2, "unused": sf.Parameter([1, 2], lower=[0, 0], fixed=True)})
 
 
+def misuse() -> None:
+    """What mypy must refuse: a comment that is not needed is an error too, so that types cannot become Any."""
+    sf.Experiment([], 5, [])  # type: ignore[arg-type]
+    sf.HybridSystem({}, [0.0], state_names=3)  # type: ignore[arg-type]
+    figure: int = sf.Estimate.load("x").plot()  # type: ignore[assignment]
+    sf.Input([0.0], [0.0], kind="step")  # type: ignore[arg-type]
+    del figure
+
+
 def use(problem: sf.Problem, folder: Path) -> list[float]:
     """What is done with results."""
     estimate: sf.Estimate = sf.estimate(problem, start=[4.0, 2.0, 0.1], max_iterations=100)
     figure: Figure = estimate.plot()
     residuals: Figure = estimate.plot_residuals()
-    axes: list[Axes] = figure.axes + residuals.axes
-    del axes
     power: float = estimate.parameters["power"]
     tau: float = float(estimate.transition_times[0][0])
     interval: tuple[float, float] = estimate.profile("power").interval()
@@ -77,5 +83,5 @@ def use(problem: sf.Problem, folder: Path) -> list[float]:
     many = sf.estimate_many([problem, problem])
     passed: bool = sf.check_derivatives(problem, [4.1, 2.0, 0.1]).passed
     names: tuple[str, ...] = problem.theta_names
-    del level, names, passed, bands, many
+    del figure, residuals, level, names, passed, bands, many
     return [power, tau, *interval, J, float(moved.states[-1, 0])]

@@ -285,6 +285,7 @@ class Improver:
 
     @staticmethod
     def place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
+        """Return the schedules with another one for a run."""
         return [*best.schedules[:e], schedule, *best.schedules[e + 1 :]]
 
     def simulate(self, best: Fitted, list_moves: ListMoves) -> list[Move]:

@@ -391,27 +391,23 @@ def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
 
 
 @draw_figure.register(Multistart)
-def draw_multistart(study: Multistart, *, what: str = "waterfall", ax: Axes | None = None) -> Axes | Figure:
-    """Draw the waterfall of many starts, or where they ended.
+def plot_starts(study: Multistart, *, what: str = "waterfall", ax: Axes | None = None) -> Axes | Figure:
+    """Draw many starts: the final cost of each above the best, ascending, or a line over all unknowns for each.
+
+    Starts that ended together share a colour. Where they ended, each unknown has its own scale, between the lowest and
+    the highest of its ends, which stand at the sides.
 
     Parameters
     ----------
     study : Multistart
     what : {"waterfall", "parameters"}
+        For parameters, of more than 30 unknowns, transition times are left out first.
     ax : matplotlib.axes.Axes, optional
     """
-    return plot_parameters(study, ax=ax) if what == "parameters" else plot_waterfall(study, ax=ax)
-
-
-def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw the final cost of every start, ascending, above the best; starts that ended together share a colour.
-
-    Parameters
-    ----------
-    study : Multistart
-    ax : matplotlib.axes.Axes, optional
-    """
-    return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
+    if what == "waterfall":
+        return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
+    shown = select_unknowns(study, DRAWN_PLACES)
+    return style.draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
 
 
 def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
@@ -442,21 +438,6 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
 
 def _choose_colour(k: int) -> str:
     return GROUP_COLOURS[min(k, len(GROUP_COLOURS) - 1)]
-
-
-def plot_parameters(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw where every start ended: a line over all unknowns for each, those of one minimum in one colour.
-
-    Each unknown has its own scale, between the lowest and the highest of its ends, which stand at the sides.
-
-    Parameters
-    ----------
-    study : Multistart
-        Of more than 30 unknowns, transition times are left out first.
-    ax : matplotlib.axes.Axes, optional
-    """
-    shown = select_unknowns(study, DRAWN_PLACES)
-    return style.draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
 
 
 def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:

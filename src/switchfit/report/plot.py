@@ -178,8 +178,7 @@ def plot_comparison(
     draw_measured(comparison, comparison.times, measured, ax)
     _mark_outliers(comparison, measured, channel, ax)
     times, curve = break_at_transitions(comparison.curve_times, replace_infinities(comparison.curve[:, channel]))
-    with style.draw_within(ax, curve):
-        ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
+    ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
     ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
     return _label_time_axis(ax, trajectory)
 
@@ -505,8 +504,7 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
     """
     if np.isfinite(band).any():
         times, low, high = break_at_transitions(times, *band.T)
-        with style.draw_within(ax, band):
-            ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
+        ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
     return ax
 
 

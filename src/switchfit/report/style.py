@@ -10,13 +10,11 @@ matplotlib is imported where a figure is made: it takes longer to load than half
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
-from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import shorten
 from switchfit.report.formats import Timed, label_time, label_unknown
 from switchfit.runtime.presentation import Axes, Figure, join_first
@@ -249,27 +247,3 @@ def turn_off_formulas(drawn: Drawn) -> Drawn:
         if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
             text.set_parse_math(False)
     return drawn
-
-
-@contextmanager
-def draw_within(ax: Axes, values: FloatArray) -> Iterator[None]:
-    """Draw a curve or a band over measured values so that limits of a logarithmic axis follow what was measured.
-
-    The limits include the values. A positive end more than a decade below the lowest positive value drawn before counts
-    as 0: on a linear axis nothing changes, and a logarithmic one shows no decades without data.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-    values : array
-        Those of the curve or band; NaN where it breaks.
-    """
-    before = ax.dataLim.frozen()
-    yield
-    after, known = ax.dataLim, values[np.isfinite(values)]
-    if known.size and not np.isfinite(before.minposy):  # nothing was measured
-        return
-    ax.dataLim = before
-    if known.size:
-        low = 0.0 if 0 < known.min() < before.minposy / 10 else float(known.min())
-        ax.update_datalim([(after.x0, low), (after.x1, float(known.max()))])
