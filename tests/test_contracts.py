@@ -9,7 +9,7 @@ import subprocess
 import sys
 import weakref
 from collections import OrderedDict
-from enum import Enum, EnumType
+from enum import EnumType
 
 import jax
 import jax.numpy as jnp
@@ -88,26 +88,21 @@ def test_nothing_is_traced_as_tau_and_p_move(compiled, method):
     assert len(set(costs)) == len(thetas)
 
 
-def test_nothing_is_traced_for_other_data_of_the_same_shape(compiled):
-    other = oscillator(tau=1.0, seed=1, start=[0.9, 0.1])
-    assert other.structures == compiled.structures
+@pytest.mark.parametrize(
+    ("change", "call"),
+    [
+        ({"tau": 1.0, "seed": 1, "start": [0.9, 0.1]}, sf.evaluate),
+        ({"samples": 11}, sf.evaluate),  # of the same padded length as the mesh of 9
+        ({"tau": 1.2, "seed": 2}, sf.estimate),
+    ],
+    ids=["other data", "samples of the same padded length", "second fit"],
+)
+def test_nothing_is_traced_for_another_problem_of_the_same_size(compiled, change, call):
+    other = oscillator(**change)
     assert cells_of(other) == cells_of(compiled)
-    assert traces_of(lambda: sf.evaluate(other)) == 0
+    assert evaluator_of(other) is evaluator_of(other), "its mesh is made once"
+    assert traces_of(lambda: call(other)) == 0
     assert sf.evaluate(other).cost != sf.evaluate(compiled).cost
-
-
-def test_nothing_is_traced_for_another_number_of_samples_of_the_same_padded_length(compiled):
-    other = oscillator(samples=11)
-    assert pad_length(11) == pad_length(9)
-    assert cells_of(other) == cells_of(compiled)
-    assert traces_of(lambda: sf.evaluate(other)) == 0
-    assert sf.evaluate(other).cost == pytest.approx(11 / 9 * sf.evaluate(compiled).cost, rel=0.5)
-
-
-def test_nothing_is_traced_in_a_second_fit(compiled):
-    other = oscillator(tau=1.2, seed=2)
-    assert cells_of(other) == cells_of(compiled)
-    assert traces_of(lambda: sf.estimate(other)) == 0
 
 
 PROGRAMS = (derivatives, simulate_rows, call_model)
@@ -146,10 +141,6 @@ def test_another_number_of_transitions_compiles_one_program_another_number_of_sa
 
 
 ROOM = sf.HybridSystem({"on": charge, "off": decay_at_k}, [0.3])
-
-
-def test_the_mesh_is_made_once(compiled):
-    assert evaluator_of(compiled) is evaluator_of(compiled)
 
 
 # float64 whatever the user has set
@@ -207,16 +198,9 @@ def test_the_setting_is_as_before_after_exceptions(x64):
         sf.evaluate(sf.Problem(blowing_up, decay().experiments[0], {"k": 1.0}))
 
 
-class StopError(Exception):
-    """Raised by a callback."""
-
-
 def test_an_exception_of_the_callback_is_passed_on(compiled, x64):
-    def callback(record):
-        raise StopError
-
-    with pytest.raises(StopError):
-        sf.estimate(compiled, callback=callback)
+    with pytest.raises(ZeroDivisionError):
+        sf.estimate(compiled, callback=lambda record: 1 / 0)
 
 
 def test_arrays_of_single_precision_are_accepted(x64):
@@ -275,29 +259,27 @@ HEAVY = (
 )
 
 
-@pytest.fixture(scope="module")
-def imported():
-    """What the import changes of JAX's configuration, the modules that are there then, and XLA_FLAGS."""
-    program = """
+IMPORT = """
 import json, os, sys, jax
 before = dict(jax.config.values)
 from switchfit import *
 import switchfit.report
 changed = [k for k, v in jax.config.values.items() if before.get(k, v) != v]
-print(json.dumps([changed, list(sys.modules), os.environ.get("XLA_FLAGS")]))
+missing = set(switchfit.__all__) - set(globals())
+print(json.dumps([changed, list(missing), list(sys.modules), os.environ.get("XLA_FLAGS")]))
 """
+
+
+def test_import_has_no_side_effects():
+    """Neither on JAX's configuration, nor by loading what only some calls need; XLA's flags alone are set."""
     env = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, env=env)
+    done = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-def test_import_has_no_side_effects(imported):
-    """Neither on JAX's configuration, nor by loading what only some calls need."""
-    changed, modules, _ = imported
+    changed, missing, modules, flags = json.loads(done.stdout)
     assert not changed
-    assert "switchfit" in modules
+    assert not missing
     assert not set(HEAVY) & set(modules)
+    assert flags == SMALL_LOOPS
 
 
 @pytest.mark.parametrize(
@@ -312,10 +294,6 @@ def test_the_flags_for_xla_are_added_to_those_of_the_user(given, expected, monke
     monkeypatch.setenv("XLA_FLAGS", given)
     compile_small_loops_whole()
     assert os.environ["XLA_FLAGS"] == expected
-
-
-def test_the_flags_for_xla_are_set_by_the_import(imported):
-    assert imported[2] == SMALL_LOOPS
 
 
 # Names, and sums over experiments
@@ -359,10 +337,6 @@ def test_theta_in_its_order():
     assert problem.initial_theta[0] == 0.6
 
 
-def test_one_experiment_needs_no_prefix():
-    assert oscillator().theta_names == ("tau_1", "k", "damping")
-
-
 def test_experiments_with_shared_parameters_add_up(compiled):
     """J and the derivatives in the parameters are sums, those in transition times each run's own."""
     singles = [oscillator(tau=1.1), oscillator(tau=0.8, samples=11, seed=3)]
@@ -383,7 +357,7 @@ def test_experiments_with_shared_parameters_add_up(compiled):
 
 # Documentation
 
-PUBLIC = [getattr(sf, name) for name in sf.__all__]
+PUBLIC = [getattr(sf, name) for name in sf.__all__ if not isinstance(getattr(sf, name), EnumType)]
 
 
 def sections(thing):
@@ -399,17 +373,7 @@ def sections(thing):
     return found
 
 
-@pytest.mark.parametrize("thing", PUBLIC, ids=sf.__all__)
-def test_everything_public_says_what_it_is(thing):
-    own = thing.__doc__
-    assert own
-    assert not own.startswith(f"{thing.__name__}("), "a docstring made by dataclass"
-    assert own.strip().splitlines()[0].rstrip(".") != ""
-
-
-@pytest.mark.parametrize(
-    "thing", [thing for thing in PUBLIC if not isinstance(thing, EnumType)], ids=lambda thing: thing.__name__
-)
+@pytest.mark.parametrize("thing", PUBLIC, ids=lambda thing: thing.__name__)
 def test_docstrings_name_the_parameters_of_the_signature(thing):
     documented = sections(thing)
     given = [
@@ -427,28 +391,6 @@ def test_docstrings_name_the_parameters_of_the_signature(thing):
         assert documented["Attributes"] == given
         return
     assert documented["Parameters"] == given
-
-
-METHODS = [
-    (kind, name, method)
-    for kind in PUBLIC
-    if inspect.isclass(kind) and not issubclass(kind, Enum)
-    for name, method in inspect.getmembers(kind)
-    if not name.startswith("_")
-    and (inspect.isfunction(method) or inspect.ismethod(method))
-    and method.__module__.startswith("switchfit")
-]
-
-
-@pytest.mark.parametrize(("kind", "name", "method"), METHODS, ids=lambda m: m if isinstance(m, str) else "")
-def test_methods_are_documented(kind, name, method):
-    assert method.__doc__, f"{kind.__name__}.{name} has no docstring"
-    documented = sections(method)["Parameters"]
-    given = [parameter for parameter in inspect.signature(method).parameters if parameter not in ("self", "cls")]
-    if documented:
-        assert documented == given
-    else:
-        assert len(given) <= 3, f"{kind.__name__}.{name} takes {given}: name them in the docstring"
 
 
 def test_a_problem_that_is_no_longer_used_is_freed(compiled):
