@@ -45,13 +45,6 @@ print("\\nheavy:", *sorted({HEAVY!r} & set(sys.modules)))
     return "\n".join(printed), set(last.removeprefix("heavy:").split())
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["--version"], ["fit", "--help"], ["examples"]], ids=lambda words: " ".join(words)
-)
-def test_commands_without_numbers_import_no_numerical_library(arguments):
-    assert run_command(arguments)[1] == set()
-
-
 MISTAKES = {
     "key": ("unit =", "unitt =", "unknown key 'parameters.k.unitt'; did you mean 'unit'?"),
     "TOML": ("[parameters]", "[parameters", "is not valid TOML"),
@@ -90,38 +83,26 @@ def test_a_mistake_in_a_problem_file_is_named_before_jax_is_imported(tmp_path, c
     assert heavy <= ({"numpy"} if mistake == "column" else set())
 
 
+COMPLETION = {"_SWITCHFIT_COMPLETE": "complete_bash", "COMP_WORDS": "switchfit fit --he", "COMP_CWORD": "2"}
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "variables", "message"),
     [
-        (["fitt", "problem.toml"], "No such command 'fitt'"),
-        (["fit", "--strategi", "auto"], "No such option: --strategi"),
-        (["fit", "nothing.toml"], "There is no problem file nothing.toml"),
-        (["compare", "nothing.json", "other.json"], "There is no saved estimate nothing.json"),
+        (["--help"], {}, "Usage: switchfit"),
+        (["--version"], {}, "switchfit"),
+        (["fit", "--help"], {}, "Usage: switchfit fit"),
+        (["examples"], {}, "heaters"),
+        ([], COMPLETION, "--help"),
+        (["fitt", "problem.toml"], {}, "No such command 'fitt'"),
+        (["fit", "--strategi", "auto"], {}, "No such option: --strategi"),
+        (["fit", "nothing.toml"], {}, "There is no problem file nothing.toml"),
+        (["compare", "nothing.json", "other.json"], {}, "There is no saved estimate nothing.json"),
     ],
 )
-def test_a_mistake_in_a_command_is_named_before_numpy_is_imported(arguments, message):
-    printed, heavy = run_command(arguments)
+def test_what_needs_no_numbers_imports_no_numerical_library(arguments, variables, message):
+    printed, heavy = run_command(arguments, **variables)
     assert message in printed
-    assert heavy == set()
-
-
-def test_a_command_imports_no_other():
-    """Nor is it built: that takes a tenth of the time until a mistake in a problem file is named."""
-    code = """
-import atexit, sys
-sys.argv = ["switchfit", "fit", "--help"]
-atexit.register(lambda: print(*sys.modules))
-from switchfit.cli import main
-main()
-"""
-    modules = {name for name in run_python(code).split() if name.startswith("switchfit.cli")}
-    assert modules == {"switchfit.cli", "switchfit.cli.fitting", "switchfit.cli.terminal"}
-
-
-@pytest.mark.parametrize("words", ["switchfit examples t", "switchfit fit --he"])
-def test_completion_imports_no_numerical_library(words):
-    place = str(len(words.split(" ")) - 1)
-    _, heavy = run_command([], _SWITCHFIT_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=place)
     assert heavy == set()
 
 
