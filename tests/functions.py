@@ -19,7 +19,6 @@ Function = Callable[[Any], Any]
 
 TABLE_T = np.array([-2.0, -0.5, 0.0, 0.7, 1.1, 3.0])
 TABLE_Y = np.array([1.0, 0.3, -0.2, 0.5, 0.9, -1.0])
-AWAY = lax.RoundingMethod.AWAY_FROM_ZERO
 A = np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [-0.1, 0.2, 3.0]])
 
 
@@ -42,11 +41,6 @@ def saturated(v):
 saturated.defvjp(lambda v: (jnp.arctan(v), v), lambda v, g: (g / (1.0 + v * v),))
 
 
-@jax.jit
-def inner(x):
-    return jnp.sin(x) * x[0]
-
-
 @jax.checkpoint
 def remade(x):
     return jnp.exp(jnp.sin(x))
@@ -54,7 +48,6 @@ def remade(x):
 
 ARITHMETIC: dict[str, Function] = {
     "divide by itself": lambda x: x / (x[0] - x[0]),
-    "power -2": lambda x: x**-2,
     "power 0": lambda x: x**0 + x,
     "power of a negative": lambda x: x ** x[1],
     "mod": lambda x: x % 0.4,
@@ -74,7 +67,6 @@ ELEMENTARY: dict[str, Function] = {
     "arccosh": lambda x: jnp.arccosh(1 + x),
     "arctan2": lambda x: jnp.arctan2(x, x[::-1]),
     "hypot": lambda x: jnp.hypot(x, 2 * x[0]),
-    "rsqrt": lax.rsqrt,
     "angle": lambda x: jnp.unwrap(2 * x),
     "guarded log": lambda x: jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), 0.0),
     "unguarded sqrt": lambda x: jnp.where(x > 0, jnp.sqrt(x), 0.0),
@@ -93,7 +85,6 @@ ROUNDING: dict[str, Function] = {
 
 DECISIONS: dict[str, Function] = {
     "where of booleans": lambda x: jnp.where(jnp.where(x > 0.7, x > 1, x < 0.3), x, 2 * x),
-    "comparison of booleans": lambda x: jnp.where((x > 0.7) == (x[::-1] > 0.7), x, -x),
     "booleans less or equal": lambda x: jnp.where((x > 0.7) <= (x < 1), x, -x),
     "booleans greater": lambda x: jnp.where((x > 0.7) > (x < 1), x, -x),
     "max of booleans": lambda x: jnp.where(jnp.maximum(x > 0.7, x < 0.3), x, -x),
@@ -104,7 +95,6 @@ DECISIONS: dict[str, Function] = {
     "mean of booleans": lambda x: jnp.mean(x > 0.5) * x,
     "product of booleans": lambda x: jnp.prod(x > 0.5) * x,
     "plus or minus one": lambda x: jnp.where(x > 0.7, 1, -1) * x,
-    "integers compared": lambda x: jnp.where(jnp.sum(x > 0.5) >= 2, x, -x),
     "integer division": lambda x: (jnp.where(x > 0.7, 7, 5) // 2) * x,
     "bits": lambda x: (jnp.where(x > 0.7, 7, 5) & 6) * x,
     "shift": lambda x: (jnp.where(x > 0.7, 7, 5) << 2) * x,
@@ -114,11 +104,7 @@ DECISIONS: dict[str, Function] = {
     "select_n": lambda x: lax.select_n((x > 0.5).astype(jnp.int32) + (x > 1), x, x**2, x**3),
     "isfinite": lambda x: jnp.where(jnp.isfinite(1 / x), x, 0.0),
     "cond of several": lambda x: sum(lax.cond(x[0] > 0.8, lambda v: (v, v**2), lambda v: (v**3, 1.0 * v), x)),
-    "integers of all kinds": lambda x: (
-        ((3 * x).astype(int) // 2 + (5 * x).astype(int) % 3 - (7 * x).astype(int) ** 2 + abs((-3 * x).astype(int))) * x
-    ),
     "division of integers by zero": lambda x: lax.div((30 * x).astype(int), (3 * x).astype(int)) * x,
-    "remainder of integers by zero": lambda x: lax.rem((30 * x).astype(int), (3 * x).astype(int)) * x,
     "integers have no negative zero": lambda x: jnp.arctan2(((0.4 * x).astype(int) * -3).astype(float), -1.0) * x,
     "integers of NaN": lambda x: jnp.where(x > 0.5, x, jnp.nan).astype(int) * x,
     "hysteresis": lambda x: lax.scan(lambda s, v: ((s & (v > 0.3)) | (v > 0.9),) * 2, x[0] > 0.5, x)[1] * x,
@@ -154,7 +140,6 @@ PLACES: dict[str, Function] = {
     "at add twice": lambda x: x.at[jnp.array([2, 0, 2])].add(x),
     "at multiply": lambda x: x.at[1].multiply(x[0]),
     "at max": lambda x: x.at[1].max(0.7),
-    "at get with a fill": lambda x: x.at[jnp.array([0, 5])].get(mode="fill", fill_value=0.0),
     "index out of range": lambda x: x[jnp.array([0, 7])],
     "dynamic_slice of a matrix by the state": lambda x: lax.dynamic_slice(
         jnp.outer(x, x), (jnp.argmax(x), jnp.argmin(x)), (2, 1)
@@ -163,18 +148,12 @@ PLACES: dict[str, Function] = {
         jnp.outer(x, x), 3 * jnp.outer(x, x)[:2, :2], (jnp.argmax(x), jnp.sum(x > 1))
     ),
     "take wrapped": lambda x: jnp.take(x, (3 * x).astype(int), mode="wrap"),
-    "take_along_axis by the state": lambda x: jnp.take_along_axis(
-        jnp.outer(x, jnp.sin(x)), jnp.argsort(jnp.outer(x, x), axis=1), axis=1
-    ),
     "at get with NaN by the state": lambda x: x.at[(3 * x).astype(int)].get(mode="fill"),
     "at set by the state": lambda x: x.at[(3 * x[0]).astype(int)].set(9 * x[1]),
     "at min by the state": lambda x: x.at[(2 * x).astype(int)].min(9 * x[1]),
     "at set dropped": lambda x: x.at[(3 * x).astype(int)].set(7.0, mode="drop"),
     "at set clipped": lambda x: x.at[(3 * x[:1]).astype(int)].set(x[1:2], mode="clip"),
-    "column added by the state": lambda x: jnp.outer(x, x).at[:, jnp.argmax(x)].add(x**3),
-    "count of places": lambda x: jnp.bincount((3 * jnp.abs(x)).astype(int), length=4) * x[0],
     "tile": lambda x: jnp.tile(x, 2),
-    "pad": lambda x: jnp.pad(x, (1, 2), constant_values=3.0),
     "negative pad": lambda x: lax.pad(x, 0.0, [(-1, 1, 0)]),
     "split": lambda x: jnp.concatenate(jnp.split(x, 3)[::-1]),
     "optimization_barrier": lambda x: sum(lax.optimization_barrier((x, 2 * x, x**2))),
@@ -213,7 +192,6 @@ TABLES: dict[str, Function] = {
         for side in ("left", "right")
     },
     "interp with ends": lambda x: jnp.interp(3 * x, TABLE_T, TABLE_Y, left=-7.0, right=9.0),
-    "interp of a period": lambda x: jnp.interp(9 * x, TABLE_T, TABLE_Y, period=1.5),
     "interp of NaN": lambda x: jnp.interp(jnp.where(x > 0.5, x, jnp.nan), TABLE_T, TABLE_Y),
     "interp of states": lambda x: jnp.interp(x[0], np.array([-1.0, 0.5, 1.0]), x * x),
     "searchsorted of NaN": lambda x: jnp.searchsorted(LEVELS, jnp.where(x > 0.5, x, jnp.nan), side="right") * x,
@@ -280,10 +258,8 @@ ORDER: dict[str, Function] = {
     **{f"sort {n}": lambda x, n=n: jnp.sort(some(n)(x)) for n in (2, 5, 8, 16, 17)},
     **{f"argsort {n}": lambda x, n=n: some(n)(x)[jnp.argsort(some(n)(x))] * jnp.argsort(-some(n)(x)) for n in (2, 8)},
     "sort with NaN": lambda x: jnp.sort(jnp.where(x > 0.5, x, jnp.nan)),
-    "sort of integers": lambda x: jnp.sort((3 * x).astype(int)) * x,
     "sort of pairs": lambda x: lax.sort((jnp.floor(2 * x), x * np.arange(3.0)))[1],
     "lexsort": lambda x: x[jnp.lexsort((x, jnp.floor(x)))],
-    "sort by two keys": lambda x: lax.sort((jnp.floor(x), -x, x * np.arange(3.0)), num_keys=2)[2],
     "quantile by the state": lambda x: jnp.quantile(some(6)(x), jax.nn.sigmoid(x[0])),
     "nanmedian": lambda x: jnp.nanmedian(jnp.where(x > 0.5, x, jnp.nan)),
     "top_k 4": lambda x: lax.top_k(some(6)(x), 4)[0] * lax.top_k(some(6)(x), 4)[1],
@@ -293,7 +269,6 @@ ORDER: dict[str, Function] = {
 LOOPS: dict[str, Function] = {
     "scan of nothing": lambda x: lax.scan(lambda c, a: (c * a, c), x, x[:0])[0],
     "scan of length 0": lambda x: lax.scan(lambda c, _: (c * 2, c), x, None, length=0)[0],
-    "scan with a counter": lambda x: lax.scan(lambda c, a: ((c[0] + 1, c[1] * a + c[0]), c[1]), (0, x[0]), x)[1],
     "while": lambda x: lax.while_loop(lambda y: y[0] < 9.0, lambda y: 2 * y + 1, x),
     "checkpoint": remade,
     "custom_jvp": friction,
@@ -301,7 +276,6 @@ LOOPS: dict[str, Function] = {
     "debug print": lambda x: (jax.debug.print("{}", x[0]), x)[1],
     "callback": lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((3,), np.float64), x),
     "random by the state": lambda x: x * jax.random.normal(jax.random.key(jnp.sum(x > 0.5)), (3,)),
-    "single precision": lambda x: x.astype(jnp.float32).astype(float) * x,
 }
 
 SPECIAL: dict[str, Function] = {
@@ -371,7 +345,6 @@ FALLS_BACK = {
     "loops: debug print": "calls jax.lax.debug_print",
     "loops: callback": "cannot be traced with its derivatives: ValueError",
     "loops: random by the state": "does integer arithmetic (random_seed) with what depends on the state",
-    "loops: single precision": "converts what depends on the state to float32",
     "special: erfinv": "calls jax.lax.erf_inv",
     "special: gammaln": "calls jax.lax.lgamma",
     "special: betainc": "calls jax.lax.regularized_incomplete_beta",
@@ -396,7 +369,6 @@ ZERO_TIMES_INFINITY = (
     "elementary: log",
     "elementary: log10",
     "elementary: log2",
-    "elementary: rsqrt",
     "elementary: sqrt",
     "elementary: unguarded sqrt",
     "matrices: solve of a singular matrix",

@@ -229,17 +229,14 @@ def test_a_copy_keeps_its_origin():
 
 
 def test_signals_and_inputs():
+    """A cut-off is in cycles per time unit: in Hz, this one would need ten million points."""
     numbers = np.arange(24.0)
-    dates, values = np.datetime64("2020-03-28", "h") + numbers.astype(int), np.sin(numbers)
-    given = sf.ReferenceSignal.from_samples(dates, values, lowpass_hz=0.1)
-    run = sf.Experiment(given, ("on",), (), time_unit="h", inputs=sf.Input(dates, {"u": values}, kind="cubic"))
-    expected = sf.ReferenceSignal.from_samples(numbers, values, lowpass_hz=0.1)
+    dates, values = np.datetime64("2020-03-01") + numbers.astype(int), np.sin(numbers)
+    given = sf.ReferenceSignal.from_samples(dates, values, lowpass_hz=0.45)
+    run = sf.Experiment(given, ("on",), (), time_unit="d", inputs=sf.Input(dates, {"u": values}, kind="cubic"))
+    expected = sf.ReferenceSignal.from_samples(numbers, values, lowpass_hz=0.45)
     np.testing.assert_array_equal(run.data[0].signal.knots, expected.signal.knots)
     np.testing.assert_array_equal(run.data[0].signal.coefficients, expected.signal.coefficients)
-    # A cut-off is in cycles per time unit: in Hz, this one would need ten million points.
-    days = np.datetime64("2020-03-01") + np.arange(30)
-    slow = sf.ReferenceSignal.from_samples(days, np.sin(np.arange(30.0)), lowpass_hz=0.45)
-    assert sf.Experiment(slow, ("on",), (), time_unit="d").data[0].signal.knots[-1] == 29.0
     np.testing.assert_array_equal(run.inputs.times, numbers)
 
 
@@ -272,17 +269,9 @@ def test_signals_and_inputs():
         (lambda: sf.Parameter(DAYS), ValueError, "Parameter value must be one date"),
         (lambda: sf.Parameter("2020-03-29", lower=3.0), ValueError, "Parameter lower is a number, and its value a"),
         (lambda: sf.Parameter("2020-03-29", prior=sf.Normal(3.0, 1.0)), ValueError, "prior: its mean is a number, and"),
-        (
-            lambda: sf.Parameter("2020-03-29", lower="2020-03-30"),
-            ValueError,
-            "2020-03-29T00:00:00 lies outside its bounds .'2020-03-30', inf",
-        ),
+        (lambda: sf.Parameter("2020-03-29", lower="2020-03-30"), ValueError, "outside its bounds .'2020-03-30', inf"),
         (lambda: run_of(DAYS, initial_state=[DATED]), ValueError, "must be a number; got the"),
-        (
-            lambda: sf.Problem(ROOM, run_of(DAYS), {"k": DATED}),
-            ValueError,
-            "'k' must be a number; got the date 2020",
-        ),
+        (lambda: sf.Problem(ROOM, run_of(DAYS), {"k": DATED}), ValueError, "'k' must be a number; got the date 20"),
         (lambda: from_epoch([1e30]), ValueError, "numbers since 1970 in s must be finite, and lie between"),
         (lambda: from_epoch([1.0], "weeks"), ValueError, "unit must be one of ns, us"),
         (lambda: from_epoch(["2020"]), ValueError, "numbers since 1970 must be"),
@@ -318,22 +307,16 @@ def fits():
     return sf.estimate(room(dated=True)), sf.estimate(room(dated=False))
 
 
-def test_the_numbers_are_those_of_a_fit_to_numbers(fits):
+def test_the_numbers_are_those_of_a_fit_to_numbers_and_the_transition_is_a_date(fits):
     dated, plain = fits
     assert dated.theta_names == plain.theta_names == ("tau_1", "k")
     np.testing.assert_array_equal(dated.theta, plain.theta)
     np.testing.assert_array_equal(dated.covariance, plain.covariance)
-    np.testing.assert_array_equal(dated.trajectory.times, plain.trajectory.times)
     assert (plain.transition_dates, plain.trajectory.dates) == ((None,), None)
-
-
-def test_transition_times_as_dates(fits):
-    dated, _ = fits
     ((date,),) = dated.transition_dates
     moment = START.astimezone(dt.UTC) + dt.timedelta(days=float(dated.transition_times[0][0]))
     assert abs(date - moment) <= dt.timedelta(microseconds=1)
-    assert date.tzinfo == BERLIN
-    assert date.utcoffset() == dt.timedelta(hours=2), "summer time by then"
+    assert (date.tzinfo, date.utcoffset()) == (BERLIN, dt.timedelta(hours=2)), "summer time by then"
     assert dated.trajectory.dates[0] == START
 
 
@@ -342,11 +325,9 @@ def test_the_report_shows_dates(fits):
     text = str(dated)
     assert "on -> off, 2020-03-20 to 2020-04-08 13:00" in text
     assert re.search(r"times +d since 2020-03-20, Europe/Berlin", text)
-    (line,) = (line for line in text.splitlines() if line.strip().startswith("tau_1 "))
-    shown = re.search(r"tau_1 +(2020-03-\d\d \d\d:\d\d) +± (\S+) +d +2020-03-28 +t = (\S+), on -> off", line)
-    date = dated.transition_dates[0][0]
-    assert abs(dt.datetime.fromisoformat(shown[1]).replace(tzinfo=BERLIN) - date) <= dt.timedelta(seconds=30)
-    assert float(shown[3]) == pytest.approx(dated.theta[0], abs=0.01)
+    (shown,) = re.findall(r"tau_1 +(2020-03-\d\d \d\d:\d\d) +± \S+ +d +2020-03-28 +t = \S+, on -> off", text)
+    off = dt.datetime.fromisoformat(shown).replace(tzinfo=BERLIN) - dated.transition_dates[0][0]
+    assert abs(off) <= dt.timedelta(seconds=30)
     assert "2020" not in str(plain)
 
 
@@ -406,9 +387,7 @@ def test_predictions_and_simulations_at_dates(fits):
     np.testing.assert_array_equal(path.states, sf.simulate(plain.problem, dated.theta, times=numbers).states)
     for result in (found, path):
         assert [str(date) for date in result.dates] == ["2020-03-21 00:00:00+01:00", "2020-03-29 12:00:00+02:00"]
-    with pytest.raises(
-        ValueError, match=r"not lie before t0 = 2020-03-20 00:00:00\+01:00, .*; got 2019-01-01 00:00:00"
-    ):
+    with pytest.raises(ValueError, match=r"not lie before t0 = 2020-03-20 00:00:00\+01:00, .*; got 2019-01-01"):
         dated.predict(["2019-01-01"])
     with pytest.raises(ValueError, match=r"times are dates .*, but the times of the experiment are numbers"):
         plain.predict(["2020-03-21"])
@@ -559,7 +538,6 @@ def test_a_time_beyond_all_calendars_is_a_number():
     ("cells", "zone", "first"),
     [
         (["2020-03-28T00:00:00.000001", "2020-03-28T12:00"], "", "2020-03-28T00:00:00.000001"),
-        (["28.03.2020 00:00", "28.03.2020 12:00"], "", "2020-03-28T00:00:00"),
         (["2020-03-28T00:00Z", "2020-03-28T12:00Z"], "UTC", "2020-03-28T00:00:00+00:00"),
         (["2020-03-28T00:00+02:00", "2020-03-28T12:00+02:00"], "+02:00", "2020-03-28T00:00:00+02:00"),
         (["2020-03-28T00:00+01:00", "2020-03-28T13:00+02:00"], "UTC", "2020-03-27T23:00:00+00:00"),
@@ -573,15 +551,6 @@ def test_a_log_hands_over_its_dates(cells, zone, first, tmp_path):
     assert (found.dates.instants[1] - found.dates.instants[0]) / NANOSECONDS["h"] == pytest.approx(12.0)
     run = sf.Experiment(sf.Measurements(found.dates, found[["x"]]), ("on",), (), time_unit="h")
     np.testing.assert_allclose(run.data[0].times, found.times, atol=1e-9)
-
-
-def test_columns_of_dates_of_parquet(tmp_path):
-    for zone in (None, "Europe/Berlin"):
-        table = pd.DataFrame({"time": pd.DatetimeIndex(DAYS, tz=zone), "x": VALUES})
-        table.to_parquet(tmp_path / "a.parquet")
-        found = sf.read_log(tmp_path / "a.parquet")
-        assert found.time_zone == (zone or "")
-        assert repr(found.dates[0]) == ("2020-03-28T00:00:00+01:00" if zone else "2020-03-28T00:00:00")
 
 
 FILE = """

@@ -31,7 +31,6 @@ def problem_of(f, observe=None, **settings):
 # What a function reads has changed: a way to read g, and a way to change it
 
 GLOBAL = {"g": 1.0}
-PLAIN = 1.0
 
 
 class Body:
@@ -41,14 +40,11 @@ class Body:
     def f(self, t, x, p):
         return -self.g * p["a"] * x
 
-    def __call__(self, t, x, p):
-        return -self.g * p["a"] * x
-
 
 def list_ways():
     """Return for each way a vector field that reads g = 1, and a function that makes it 2."""
-    GLOBAL["g"] = globals()["PLAIN"] = 1.0
-    body, called = Body(), Body()
+    GLOBAL["g"] = 1.0
+    body = Body()
     array = np.array([1.0])
     kept, module = type("Kept", (), {"g": 1.0}), types.ModuleType("constants")
     module.g = 1.0
@@ -98,14 +94,12 @@ def list_ways():
 
     return {
         "global dict": (lambda t, x, p: -GLOBAL["g"] * p["a"] * x, put(GLOBAL, "g")),
-        "global number": (lambda t, x, p: -PLAIN * p["a"] * x, put(globals(), "PLAIN")),
         "global lookup": (lambda t, x, p: -globals()["GLOBAL"]["g"] * p["a"] * x, put(GLOBAL, "g")),
         "closure": (closure, change_number),
         "array in place": (lambda t, x, p: -array * p["a"] * x, put(array)),
         "default": (default, lambda: setattr(default, "__defaults__", (2.0,))),
         "attribute of the function": (attribute, set_g(attribute)),
         "bound method": (body.f, set_g(body)),
-        "callable object": (called, set_g(called)),
         "attribute of a class": (lambda t, x, p: -kept.g * p["a"] * x, set_g(kept)),
         "module": (lambda t, x, p: -module.g * p["a"] * x, set_g(module)),
         "partial": (functools.partial(partial, bound), put(bound)),
@@ -165,15 +159,14 @@ def test_every_kind_of_function_is_seen_anew(place):
     )
     times = np.linspace(0.0, 1.0, 9)
     seen = (lambda t, x, p: scaled(x)) if place in ("observe", "reference") else None
-    data = [sf.Measurements(times, np.exp(-times), observe=seen if place == "observe" else None, sigma=0.1)]
-    if place == "running":
-        data = [sf.RunningCost(lambda t, x, p: scaled(x[0] ** 2))]
-    if place == "reference":
-        data = [sf.ReferenceSignal.from_samples(times, np.exp(-times), observe=seen)]
-    if place == "terminal":
-        data.append(sf.TerminalCost(lambda x, p: scaled(x[0] ** 2)))
-    if place == "constraint":
-        data.append(sf.TerminalConstraint(lambda x, p: scaled(x[0]) - 0.5))
+    values, square = np.exp(-times), lambda x: scaled(x[0] ** 2)
+    data = [
+        sf.Measurements(times, values, observe=seen if place == "observe" else None, sigma=0.1),
+        *([sf.RunningCost(lambda t, x, p: square(x))] if place == "running" else []),
+        *([sf.ReferenceSignal.from_samples(times, values, observe=seen)] if place == "reference" else []),
+        *([sf.TerminalCost(lambda x, p: square(x))] if place == "terminal" else []),
+        *([sf.TerminalConstraint(lambda x, p: scaled(x[0]) - 0.5)] if place == "constraint" else []),
+    ]
 
     def structures():
         run = sf.Experiment(data, ("a", "b"), (0.4,), 0.0, 1.0)

@@ -11,10 +11,9 @@ import dis
 import itertools
 import traceback
 import warnings
-from collections.abc import Callable
 from decimal import Decimal
 from fractions import Fraction
-from functools import cache, partial
+from functools import cache, partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -87,84 +86,26 @@ class Hostile:
     __array__ = __float__ = __index__ = __iter__ = __repr__ = fail
 
 
-def endless_list():
-    found: list[Any] = []
-    found.append(found)
-    return found
+ENDLESS: list[Any] = []
+ENDLESS.append(ENDLESS)
+DEEP = reduce(lambda inner, _: [inner], range(200), 1.0)
+MASKED = np.ma.array(VALUES, mask=VALUES > 0.9)
 
 
-def deep(depth=200):
-    found: Any = 1.0
-    for _ in range(depth):
-        found = [found]
-    return found
-
-
-BAD: dict[str, Callable[[], Any]] = {
-    "None": lambda: None,
-    "True": lambda: True,
-    "0": lambda: 0,
-    "-1": lambda: -1,
-    "10**400": lambda: 10**400,
-    "10**6000": lambda: 10**6000,
-    "2.5": lambda: 2.5,
-    "nan": lambda: float("nan"),
-    "inf": lambda: float("inf"),
-    "1e308": lambda: 1e308,
-    "-1e308": lambda: -1e308,
-    "5e-324": lambda: 5e-324,
-    "1j": lambda: 1j,
-    "empty text": lambda: "",
-    "1.0 as text": lambda: "1.0",
-    "long text": lambda: "word " * 100_000,
-    "bytes": lambda: b"1.0",
-    "[]": lambda: [],
-    "{}": lambda: {},
-    "a set of text": lambda: {"fall", "rise"},
-    "a dict": lambda: {"a": 1.0},
-    "a dict of numbers": lambda: {0: 1.0, 1: 2.0},
-    "a generator": lambda: (value for value in (1.0, 2.0)),
-    "an endless iterator": itertools.count,
-    "a range": lambda: range(3),
-    "a function without arguments": lambda: lambda: None,
-    "a function that returns text": lambda: lambda *given: "x",
-    "a class": lambda: int,
-    "an object": object,
-    "hostile": Hostile,
-    "a date": lambda: np.datetime64("2020-01-01"),
-    "a timedelta": lambda: datetime.timedelta(seconds=1),
-    "dates": lambda: np.array(["2020-01-01", "2020-01-02"], dtype="datetime64[us]"),
-    "masked": lambda: np.ma.masked,
-    "masked values": lambda: np.ma.array(VALUES, mask=VALUES > 0.9),
-    "a masked entry": lambda: [1.0, np.ma.masked],
-    "an array of objects": lambda: np.array([1.0, None], dtype=object),
-    "an array of text": lambda: np.array(["fall", "rise"]),
-    "text among numbers": lambda: ["1.0", 2.0],
-    "an array without dimensions": lambda: np.array(1.0),
-    "three dimensions": lambda: np.zeros((2, 3, 4)),
-    "complex numbers": lambda: np.array([1.0, 2.0j]),
-    "truth values": lambda: np.array([True, False]),
-    "a structured array": lambda: np.zeros(2, dtype=[("a", float)]),
-    "float32 in a list": lambda: [np.float32(0.1), 0.2],
-    "bfloat16": lambda: jnp.array([0.1, 0.2], dtype=jnp.bfloat16),
-    "longdouble": lambda: np.longdouble("1e4000"),
-    "ragged": lambda: [[1.0], [2.0, 3.0]],
-    "nested names": lambda: [["fall"], "rise"],
-    "the same name twice": lambda: ("fall", "fall"),
-    "an empty name": lambda: ("", "rise"),
-    "a list of itself": endless_list,
-    "200 deep": deep,
-    "[None]": lambda: [None],
-    "[nan]": lambda: [float("nan")],
-    "a large array": lambda: np.linspace(0.0, 1.0, 100_000),
-    "a signalling Decimal": lambda: Decimal("sNaN"),
-    "a large Fraction": lambda: Fraction(10**400, 3),
-    "np.str_": lambda: np.str_("x"),
-    "a parameter of three": lambda: sf.Parameter([0.1, 0.2, 0.3]),
-    "measurements": measurements,
-    "a problem": problem,
-    "a list of problems": lambda: [problem(), problem()],
-}
+TEXTS = ["", "1.0", "word " * 100_000, b"1.0", np.str_("x")]
+NUMBERS = [0, -1, 10**400, 10**6000, 2.5, np.nan, np.inf, 1e308, -1e308, 5e-324, 1j, np.longdouble("1e4000")]
+NUMBERS += [True, Decimal("sNaN"), Fraction(10**400, 3), np.ma.masked, sf.Parameter([0.1, 0.2, 0.3])]
+DATES = [np.datetime64("2020-01-01"), datetime.timedelta(seconds=1), np.array(["2020", "2021"], "datetime64[us]")]
+ARRAYS = [np.array(1.0), np.zeros((2, 3, 4)), np.array([1.0, 2.0j]), np.array([True, False]), MASKED]
+ARRAYS += [np.array([1.0, None], object), np.array(["fall", "rise"]), np.zeros(2, [("a", float)])]
+ARRAYS += [jnp.array([0.1, 0.2], jnp.bfloat16), np.linspace(0.0, 1.0, 100_000)]
+LISTS = [[], [None], [np.nan], [1.0, np.ma.masked], ["1.0", 2.0], [np.float32(0.1), 0.2], [[1.0], [2.0, 3.0]]]
+LISTS += [[["fall"], "rise"], ("fall", "fall"), ("", "rise"), range(3), ENDLESS, DEEP, {0.1: 0, 0.2: 0}.keys()]
+TABLES = [{}, {"a": 1.0}, {0: 1.0, 1: 2.0}, {"fall", "rise"}]
+OBJECTS = [None, int, object(), Hostile(), lambda: None, lambda *given: "x", itertools.count()]
+OWN = [measurements(), problem(), [problem(), problem()]]
+BAD = [*TEXTS, *NUMBERS, *DATES, *ARRAYS, *LISTS, *TABLES, *OBJECTS, *OWN]
+"""What somebody may hand over by mistake."""
 
 WORDS = {
     "estimates": ("compare needs", "estimates must be"),
@@ -439,13 +380,13 @@ def complaint(call, given, argument):
 
 
 def calls_of(doors):
-    """All ways to put one bad value into one argument: (door, argument, place, bad value)."""
+    """All ways to put one bad value into one argument: (door, argument, place, number of the bad value)."""
     return [
         (name, argument, place, bad)
         for name, (_, valid) in doors.items()
         for argument, value in valid.items()
         for place in places_in(value)
-        for bad in BAD
+        for bad in range(len(BAD))
     ]
 
 
@@ -474,11 +415,11 @@ def put(bad, place, value):
 def complaints(doors, calls):
     """What is wrong with the ends of all these calls."""
     found = []
-    for name, argument, place, bad in calls:
+    for name, argument, place, k in calls:
         call, valid = doors[name]
-        wrong = complaint(call, valid | {argument: put(BAD[bad](), place, valid[argument])}, argument)
+        wrong = complaint(call, valid | {argument: put(BAD[k], place, valid[argument])}, argument)
         if wrong is not None:
-            found.append(f"{name}({argument}: {bad} as {place}) {wrong}")
+            found.append(f"{name}({argument}: number {k}, a {type(BAD[k]).__name__}, as {place}) {wrong}")
     return found
 
 

@@ -86,22 +86,6 @@ def test_a_fit_and_all_that_follows(tmp_path):
     assert again.structures == named.structures
 
 
-@pytest.mark.slow
-def test_many_fits_and_studies():
-    batch = [
-        problem_of(system, values, data=VALUES + 0.01 * k)
-        for k in range(2)
-        for system, values in ((BY_NAME, NAMED), (BY_POSITION, np.stack([LEFT, RIGHT], axis=1)))
-    ]
-    fits = sf.estimate_many(batch)
-    np.testing.assert_array_equal(fits.theta[::2], fits.theta[1::2])
-    assert abs(fits.theta[0] - fits.theta[2]).max() > 1e-4
-    named, plain = both()
-    theta = sf.estimate(plain).theta
-    studies = [sf.monte_carlo(problem, theta=theta, runs=3, seed=1) for problem in (named, plain)]
-    np.testing.assert_array_equal(studies[0].theta, studies[1].theta)
-
-
 def test_the_order_of_the_names_does_not_count_and_other_names_are_another_function():
     one = problem_of(BY_NAME, {"left": LEFT, "right": RIGHT})
     other = problem_of(BY_NAME, {"right": RIGHT, "left": LEFT})

@@ -202,19 +202,14 @@ def test_with_a_free_final_time():
     np.testing.assert_array_equal(fit.trajectory.jump_times, [0.0, 1.0])
 
 
-def concentration_after(time):
-    """Just after a dose, at the true parameters."""
-    given = DOSES[time >= DOSES]
-    return (AMOUNT / TRUE["V"] * np.exp(-TRUE["k"] * (time - given))).sum()
-
-
 def test_names_of_guards_count_transitions_alone():
-    system = dataclasses.replace(CHANGING, guards={("slow", "fast"): lambda t, x, p: x[0] - 6.0})
-    tau = 8.0 + np.log(concentration_after(8.0) / 6.0) / TRUE["k"]
-    run = sf.Experiment(make_log(simulate_changing(tau)), ["slow", "fast"], [12.0], t0=0.0, jumps=sf.Jump(DOSES, dose))
+    level = AMOUNT / TRUE["V"] * np.exp(-TRUE["k"] * np.array([12.0, 4.0])).sum()  # at 12 h, after two doses
+    system = dataclasses.replace(CHANGING, guards={("slow", "fast"): lambda t, x, p: x[0] - level})
+    log = make_log(simulate_changing(12.0))
+    run = sf.Experiment(log, ["slow", "fast"], [11.0], t0=0.0, jumps=sf.Jump(DOSES, dose))
     problem = sf.Problem(system, run, GUESS)
     assert problem.constraint_names == ("guard of tau_1 (slow -> fast)",)
-    np.testing.assert_allclose(sf.estimate(problem).theta, [tau, 0.13, 11.0], rtol=1e-6)
+    np.testing.assert_allclose(sf.estimate(problem).theta, [12.0, 0.13, 11.0], rtol=1e-6)
 
 
 # --- maps, several jumps ----------------------------------------------------------------------------------------------
@@ -376,13 +371,10 @@ def test_problem_file_with_dates(folder, values):
         ('"model.py:dose"', '"model.py:doze"', "jumps\\[1\\].map .*defines no 'doze'"),
         ('"model.py:dose"', '"dose"', "jumps\\[1\\]: map must name a function of a Python file"),
         ("amount = 100.0", "size = 100.0", "jumps\\[2\\].map .*amount"),
-        ("time = 24", "time = 48", "A Jump must lie in \\[t0, tf\\)"),
-        ("[0.0, 8.0, 16.0]", "[8.0, 0.0]", "jumps\\[1\\]: The times of a Jump must increase strictly"),
         ("time = 24", "tim = 24", "tim"),
         ("time = 24", "time = 'noon'", "jumps\\[2\\].time.* must be a number or a date such as 2024-05-01"),
         ("time = 24", "time = [24.0, 2024-05-01]", "jumps\\[2\\]: Jump time must be numbers or dates, not both"),
         ("time = 24", "time = 2024-05-01", "times of Jump is a date, but the Measurements has numbers for times"),
-        ("time = 24", "time = []", "jumps\\[2\\]: Jump time must be a finite number or several"),
     ],
 )
 def test_problem_file_with_a_wrong_jump(folder, old, new, message):
@@ -391,8 +383,7 @@ def test_problem_file_with_a_wrong_jump(folder, old, new, message):
         load_problem(folder / "problem.toml")
 
 
-@pytest.mark.slow
-def test_report_and_figure_show_the_jumps(values, tmp_path):
+def test_figure_page_and_file_have_the_jumps(values, tmp_path):
     fit = sf.estimate(make_problem(values))
     line = next(line for line in fit.plot().axes[0].lines if line.get_label() == "fitted")
     times, curve = line.get_data()
@@ -400,26 +391,17 @@ def test_report_and_figure_show_the_jumps(values, tmp_path):
     np.testing.assert_array_equal(times[edges], DOSES)  # vertical, without a gap
     np.testing.assert_allclose(curve[edges + 1] - curve[edges], AMOUNT / fit.parameters["V"])
     fit.save(tmp_path / "fit.json")
-    loaded = sf.Estimate.load(tmp_path / "fit.json")
-    np.testing.assert_array_equal(loaded.trajectory.jump_times, DOSES)
-
-
-def test_the_page_has_curves_that_sliders_can_move(values):
-    """Divided at the jumps, with derivatives: those of the nodes, not of a trajectory without them."""
-    fit = sf.estimate(make_problem(values))
+    np.testing.assert_array_equal(sf.Estimate.load(tmp_path / "fit.json").trajectory.jump_times, DOSES)
+    # The curves of the page are divided at the jumps; their derivatives have no jump's size.
     (curves, *_) = collect_curves(fit, 0, [0, 1], 2000)
-    times = curves.curve["t"]
+    times, step = curves.curve["t"], 0.1 * fit.standard_errors[0]
     breaks = np.flatnonzero(np.isnan(times))
-    np.testing.assert_array_equal(times[breaks - 1], DOSES)
-    np.testing.assert_array_equal(times[breaks + 1], DOSES)
-    assert {"d0_0", "d1_0"} <= set(curves.curve)
-    assert set(curves.curve["mode"]) == {"eliminate", ""}  # "" at the gaps
-    step = 0.1 * fit.standard_errors[0]
+    np.testing.assert_array_equal([times[breaks - 1], times[breaks + 1]], [DOSES, DOSES])
     path = sf.simulate(fit.problem, fit.theta + np.array([step, 0.0]))
     there = np.isfinite(times) & ~np.isin(times, DOSES)
     exact = np.interp(times[there], path.times, path.states[:, 0])
     linear = (curves.curve["y0"] + step * curves.curve["d0_0"])[there]
-    assert np.abs(exact - linear).max() < 1e-3 * np.ptp(exact)  # and no jump's size
+    assert np.abs(exact - linear).max() < 1e-3 * np.ptp(exact)
 
 
 def test_prediction_and_profile_know_the_jumps(values):
