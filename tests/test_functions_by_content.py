@@ -62,10 +62,13 @@ def list_ways():
     def default(t, x, p, g=1.0):
         return -g * p["a"] * x
 
-    def attribute(t, x, p):
-        return -attribute.g * p["a"] * x
+    def holder():
+        """Something is kept with it."""
 
-    attribute.g = 1.0
+    def attribute(t, x, p):
+        return -holder.g * p["a"] * x
+
+    holder.g = 1.0
 
     def partial(gains, t, x, p):
         return -gains[0] * p["a"] * x
@@ -98,7 +101,7 @@ def list_ways():
         "closure": (closure, change_number),
         "array in place": (lambda t, x, p: -array * p["a"] * x, put(array)),
         "default": (default, lambda: setattr(default, "__defaults__", (2.0,))),
-        "attribute of the function": (attribute, set_g(attribute)),
+        "attribute of a function": (attribute, set_g(holder)),
         "bound method": (body.f, set_g(body)),
         "attribute of a class": (lambda t, x, p: -kept.g * p["a"] * x, set_g(kept)),
         "module": (lambda t, x, p: -module.g * p["a"] * x, set_g(module)),

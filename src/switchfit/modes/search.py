@@ -144,7 +144,7 @@ def find_modes(
     width : int
         Hypotheses that the beam keeps.
     grid : float, optional
-        Distance of the times at which switches are looked for.
+        Distance of the times at which switches are looked for; at least a millionth of the longest experiment.
     starts : (S, M) array_like, optional
         Values of the free parameters and initial states to begin with, in the order of theta. If left out, the guess,
         and the guess changed by a standard deviation of its prior or by a factor of 0.7 and 1.4, until the data are
