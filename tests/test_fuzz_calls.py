@@ -8,6 +8,7 @@ for seconds is left out: a call that gets as far has been accepted.
 
 import datetime
 import dis
+import inspect
 import itertools
 import traceback
 import warnings
@@ -46,10 +47,6 @@ def reset(t, x, p):
 
 def final(x, p):
     return x[0] ** 2
-
-
-def stop(done, total):
-    return False
 
 
 TIMES = np.linspace(0.0, 1.0, 7)
@@ -199,7 +196,6 @@ def of(name, method):
     return lambda **given: getattr(made(name), method)(**given)
 
 
-LONG = {"seed": 0, "tolerance": 1e-7, "max_iterations": 20, "client": None, "folder": None, "callback": stop}
 WITH_A_LEVEL = {
     "fit": ["quantile", "confidence_intervals"],
     "many": ["confidence_intervals"],
@@ -212,119 +208,101 @@ WITH_A_LEVEL = {
 """What is made, and its methods that take a level."""
 STUDIES = ("many", "study", "starts", "bootstrap")
 
-START = {"start": [0.45, 1.1]}
-THETA = {"theta": [0.45, 1.1]}
-PROBLEM = {"problem": GOOD}
-SUCCESSIONS = {"successions": {"fall": ("rise",), "rise": ()}}
+START = [0.45, 1.1]
+SUCCESSIONS = {"fall": ("rise",), "rise": ()}
+
+
+def door(call, target=None, **given):
+    """A call, and arguments with which it succeeds: those given, and the defaults of all others that there are."""
+    parameters = inspect.signature(target or call).parameters.values()
+    return call, {each.name: each.default for each in parameters if each.default is not each.empty} | given
 
 
 def list_doors():
-    """All doors by name: a call, and arguments with which it succeeds; made when a test runs: some need a fit."""
+    """All doors by name; made when a test runs: some need a fit."""
     fit = made("fit")
     fit.save("saved.json")
     Path("log.csv").write_text("t,x,yaw\n0,1,0\n1,2,3\n2,3,-3\n")
+    maps = {"reset_maps": {("fall", "rise"): reset}, "guards": {("fall", "rise"): low}}
     return {
-        "HybridSystem": (
+        "HybridSystem": door(
             lambda **given: used(problem(of=sf.HybridSystem(**given))),
-            {**SYSTEM, "reset_maps": {("fall", "rise"): reset}, "guards": {("fall", "rise"): low}}
-            | {"state_names": ("a", "b"), "state_units": ("m", "m")},
+            sf.HybridSystem,
+            **(SYSTEM | maps | {"state_names": ("a", "b"), "state_units": ("m", "m")}),
         ),
-        "Experiment": (
+        "Experiment": door(
             lambda **given: used(problem(sf.Experiment(**given))),
-            {"data": [measurements()], **RUN, "inputs": None, "initial_state": [1.0, 0.5], "name": "drive"}
-            | {"parameter_map": {"k": "k"}, "jumps": [sf.Jump(0.7, reset)]},
+            sf.Experiment,
+            **(RUN | {"data": [measurements()], "initial_state": [1.0, 0.5], "name": "drive"}),
+            parameter_map={"k": "k"},
+            jumps=[sf.Jump(0.7, reset)],
         ),
-        "Jump": (
-            lambda **given: used(problem(experiment(jumps=[sf.Jump(**given)]))),
-            {"time": [0.2, 0.7], "map": reset},
-        ),
-        "Problem": (
+        "Jump": door(lambda **given: used(problem(experiment(jumps=[sf.Jump(**given)]))), time=[0.2, 0.7], map=reset),
+        "Problem": door(
             lambda **given: used(sf.Problem(**given)),
-            {"system": system(), "experiments": [experiment()], "parameters": PARAMETERS}
-            | {"min_duration": 0.0, "solver": "explicit", "rtol": 1e-6, "atol": 1e-8},
+            sf.Problem,
+            system=system(),
+            experiments=[experiment()],
+            parameters=PARAMETERS,
         ),
-        "Parameter": (
+        "Parameter": door(
             lambda **given: used(problem(parameters={"k": sf.Parameter(**given)})),
-            {"value": 1.0, "lower": 0.1, "upper": 5.0, "unit": "1/s", "fixed": False}
-            | {"prior": sf.Normal(1.0, 0.5), "scale": "linear"},
+            sf.Parameter,
+            **{"value": 1.0, "lower": 0.1, "upper": 5.0, "prior": sf.Normal(1.0, 0.5)},
         ),
-        "Normal": (partial(build_prior, sf.Normal), {"mean": 1.0, "sd": 0.5}),
-        "LogNormal": (partial(build_prior, sf.LogNormal), {"median": 1.0, "log_sd": 0.5}),
-        "Measurements": (
+        "Normal": door(partial(build_prior, sf.Normal), sf.Normal, mean=1.0, sd=0.5),
+        "LogNormal": door(partial(build_prior, sf.LogNormal), sf.LogNormal, median=1.0, log_sd=0.5),
+        "Measurements": door(
             partial(build_data, sf.Measurements),
-            {**DATA, "observe": None, "names": ("a", "b"), "loss": "huber", "loss_scale": 2.0}
-            | {"delay": 0.0, "units": ("m", "rad")},
+            sf.Measurements,
+            **(DATA | {"names": ("a", "b"), "loss": "huber", "loss_scale": 2.0, "units": ("m", "rad")}),
         ),
-        "ReferenceSignal": (
+        "ReferenceSignal": door(
             partial(build_data, sf.ReferenceSignal.from_samples),
-            {"times": TIMES, "values": VALUES, "observe": None, "lowpass_hz": 2.0}
-            | {"weights": [1.0, 2.0], "names": None, "units": None},
+            sf.ReferenceSignal.from_samples,
+            **{"times": TIMES, "values": VALUES, "lowpass_hz": 2.0, "weights": [1.0, 2.0]},
         ),
-        "RunningCost": (partial(build_data, sf.RunningCost), {"ell": low}),
-        "TransitionCost": (partial(build_data, sf.TransitionCost), {"mu": low, "before": None, "after": None}),
-        "TerminalCost": (partial(build_data, sf.TerminalCost), {"phi": final}),
-        "TerminalConstraint": (partial(build_data, sf.TerminalConstraint, measurements()), {"psi": final}),
-        "Input": (build_input, {"times": TIMES, "values": TIMES, "kind": "linear", "units": ("m",)}),
-        "from_epoch": (sf.from_epoch, {"numbers": [1.6e9, 1.7e9], "unit": "s"}),
-        "read_log": (
-            sf.read_log,
-            {"path": "log.csv", "columns": ["x", "yaw"], "time": "t", "time_unit": "ms", "topic": None}
-            | {"origin": None, "range_error": None, "repair": ("sort", "unwrap:yaw")},
+        "RunningCost": door(partial(build_data, sf.RunningCost), ell=low),
+        "TransitionCost": door(partial(build_data, sf.TransitionCost), sf.TransitionCost, mu=low),
+        "TerminalCost": door(partial(build_data, sf.TerminalCost), phi=final),
+        "TerminalConstraint": door(partial(build_data, sf.TerminalConstraint, measurements()), psi=final),
+        "Input": door(build_input, sf.Input, times=TIMES, values=TIMES, kind="linear", units=("m",)),
+        "from_epoch": door(sf.from_epoch, numbers=[1.6e9, 1.7e9]),
+        "read_log": door(sf.read_log, path="log.csv", columns=["x", "yaw"], time="t", repair=("sort", "unwrap:yaw")),
+        "estimate": door(sf.estimate, problem=GOOD, start=START),
+        "estimate_many": door(sf.estimate_many, problems=[GOOD]),
+        "evaluate": door(sf.evaluate, problem=GOOD, theta=START),
+        "find_modes": door(
+            find_quietly, sf.find_modes, problem=GOOD, successions=SUCCESSIONS, max_switches=1, starts=[[1.1]], seed=0
         ),
-        "estimate": (
-            sf.estimate,
-            {**PROBLEM, **START, "hessian": "exact", "tolerance": 1e-7, "max_iterations": 20, "callback": lambda r: 0},
-        ),
-        "estimate_many": (
-            sf.estimate_many,
-            {"problems": [GOOD]} | {key: value for key, value in LONG.items() if key != "seed"},
-        ),
-        "evaluate": (sf.evaluate, {**PROBLEM, **THETA, "method": "auto"}),
-        "find_modes": (
-            find_quietly,
-            {**PROBLEM, **SUCCESSIONS, "library": ("fall", "rise"), "first": "fall", "last": "rise", "seed": 0}
-            | {"min_duration": 0.0, "max_switches": 1, "criterion": "bic", "method": "beam", "width": 4}
-            | {"grid": 0.25, "starts": [[1.1]]},
-        ),
-        "OnlineEstimator": (
+        "OnlineEstimator": door(
             sf.OnlineEstimator,
-            {"problem": ONLINE, **SUCCESSIONS, "window": 1.0, "threshold": 12.0, "min_duration": {"fall": 0.0}}
-            | {"max_switches": 2, "renews": {"rise": "k"}, "drift": {"k": 0.1}, "budget": 1.0}
-            | {"capacity": 16, "width": 4},
+            **{"problem": ONLINE, "successions": SUCCESSIONS, "window": 1.0, "min_duration": {"fall": 0.0}},
+            **{"max_switches": 2, "renews": {"rise": "k"}, "drift": {"k": 0.1}},
         ),
-        "OnlineEstimator.update": (
-            lambda **given: sf.OnlineEstimator(ONLINE).update(**given),
-            {"t": 0.5, "y": [0.1, 0.2]},
-        ),
-        "replay": (sf.replay, {"problem": ONLINE}),
-        "calibrate": (
-            lambda **given: sf.calibrate(sf.OnlineEstimator(ONLINE), **({"false_alarms": 0.1} | given)),
-            {"false_alarms": 0.1},
-        ),
-        "insertion": (sf.insertion, {**PROBLEM, **THETA}),
-        "Insertion.minima": (of("rates", "minima"), {"count": 2}),
-        "evaluate_on_guards": (sf.evaluate_on_guards, {"problem": GUARDED, **THETA}),
-        "simulate": (sf.simulate, {**PROBLEM, **THETA, "experiment": 0}),
-        "check_derivatives": (sf.check_derivatives, {**PROBLEM, **THETA, "seed": 0}),
-        "identifiability": (sf.identifiability, {"subject": GOOD}),
-        "design": (
-            sf.design,
-            {**PROBLEM, **THETA, "free": {}, "names": {"k": 1.0}, "criterion": "A", "samples": 3, "experiment": 0}
-            | {"sensors": 1, "budget": None, "starts": 1, "seed": 0},
-        ),
-        "Design.save": (of("plan", "save"), {"path": "design.json"}),
-        "monte_carlo": (sf.monte_carlo, {**PROBLEM, **START, **THETA, **LONG, "runs": 2, "noise": [0.1, 0.1]}),
-        "multistart": (sf.multistart, {**PROBLEM, **LONG, "starts": [[0.4, 1.0]]}),
-        "bootstrap": (sf.bootstrap, {"estimate": fit, "runs": 2, "resample": "blocks", "block": 2} | LONG),
-        "predict": (sf.predict, {"estimate": fit, "times": TIMES, "experiment": 0}),
-        "Estimate.validate": (of("fit", "validate"), {"other": GOOD, "refit": ()}),
-        "compare": (sf.compare, {"estimates": [fit, fit], "names": ["one", "two"]}),
-        "log_posterior": (sf.log_posterior, PROBLEM),
-        "profile": (sf.profile, {"estimate": fit, "name": "k", "level": 0.9, "callback": lambda k, n: k > 1}),
-        "Estimate.plot": (of("fit", "plot"), {"bands": False, "level": 0.9}),
-        "Estimate.save": (of("fit", "save"), {"path": "fit.json"}),
-        "Estimate.load": (sf.Estimate.load, {"path": "saved.json", "problem": GOOD}),
-        "Estimate.covariance_from": (of("fit", "covariance_from"), {"hessian": "exact"}),
+        "OnlineEstimator.update": door(sf.OnlineEstimator(ONLINE).update, t=0.5, y=[0.1, 0.2]),
+        "replay": door(sf.replay, problem=ONLINE),
+        "calibrate": door(lambda **given: sf.calibrate(sf.OnlineEstimator(ONLINE), **given), false_alarms=0.1),
+        "insertion": door(sf.insertion, problem=GOOD, theta=START),
+        "Insertion.minima": door(made("rates").minima),
+        "evaluate_on_guards": door(sf.evaluate_on_guards, problem=GUARDED, theta=START),
+        "simulate": door(sf.simulate, problem=GOOD, theta=START),
+        "check_derivatives": door(sf.check_derivatives, problem=GOOD, theta=START),
+        "identifiability": door(sf.identifiability, subject=GOOD),
+        "design": door(sf.design, problem=GOOD, theta=START, free={}, names={"k": 1.0}, criterion="A", samples=3),
+        "Design.save": door(made("plan").save, path="design.json"),
+        "monte_carlo": door(sf.monte_carlo, problem=GOOD, start=START, theta=START, runs=2, noise=[0.1, 0.1]),
+        "multistart": door(sf.multistart, problem=GOOD, starts=[[0.4, 1.0]]),
+        "bootstrap": door(sf.bootstrap, estimate=fit, runs=2, resample="blocks", block=2),
+        "predict": door(sf.predict, estimate=fit, times=TIMES),
+        "Estimate.validate": door(fit.validate, other=GOOD),
+        "compare": door(sf.compare, estimates=[fit, fit], names=["one", "two"]),
+        "log_posterior": door(sf.log_posterior, problem=GOOD),
+        "profile": door(sf.profile, estimate=fit, name="k", callback=lambda done, total: done > 1),
+        "Estimate.plot": door(fit.plot, bands=False),
+        "Estimate.save": door(fit.save, path="fit.json"),
+        "Estimate.load": door(sf.Estimate.load, path="saved.json", problem=GOOD),
+        "Estimate.covariance_from": door(fit.covariance_from, hessian="exact"),
         **{
             f"{name}.{method}": (of(name, method), {"level": 0.9})
             for name, methods in WITH_A_LEVEL.items()
@@ -372,7 +350,7 @@ def complaint(call, given, argument):
         words = WORDS.get(argument, (argument,))
         if not any(word in message for word in words):
             return f"names none of {words}: {message[:300]}"
-        if not message.endswith("."):
+        if not message.endswith((".", ".)")):
             return f"is no sentence: {message[:300]}"
         if len(message) > LONGEST:
             return f"is {len(message)} characters long: {message[:300]}"
