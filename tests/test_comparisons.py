@@ -25,9 +25,7 @@ FOUND = {
     "branch": lambda t, x, p: jax.lax.cond(t < p["a"], lambda y: y * p["b"], lambda y: y, x),
     "in a branch": lambda t, x, p: jax.lax.cond(t < 0.5, lambda y: y * (t > p["a"]), lambda y: y, x) * p["b"],
     "in a loop": lambda t, x, p: jax.lax.fori_loop(0, 3, lambda k, y: y * jnp.where(t < p["a"], p["b"], 1.0), x),
-    "loop": lambda t, x, p: jax.lax.while_loop(lambda y: y[0] < p["a"], lambda y: (y[0] + 1.0, y[1] * p["b"]), (t, x))[
-        1
-    ],
+    "loop": lambda t, x, p: p["b"] * jax.lax.while_loop(lambda y: y < p["a"], lambda y: y + 1.0, t) * x,
     "jitted": lambda t, x, p: jax.jit(lambda a: jnp.where(t < a, x, -x))(p["a"]) * p["b"],
     "heaviside": lambda t, x, p: jnp.heaviside(t - p["a"], 0.5) * p["b"] * x,
     "search": lambda t, x, p: jnp.searchsorted(jnp.stack([0.0 * t, p["a"]]), t) * p["b"] * x,

@@ -35,6 +35,12 @@ INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
 """Transition times that are not nodes."""
 
 
+def beside(away: float) -> np.ndarray:
+    """A mode that begins just before a node, and ends just behind another one: its rows have hardly any length."""
+    begin, end = NODES[[5, 14]]
+    return np.array([min(begin - away, np.nextafter(begin, 0.0)), max(end + away, np.nextafter(end, 9.0))])
+
+
 def assert_same(found: Derivatives, expected: Derivatives, relative: float) -> None:
     """Equal gradients and Hessians, relative to their largest entries."""
     assert found.cost == pytest.approx(expected.cost, rel=relative)
@@ -66,21 +72,20 @@ def test_derivatives_in_closed_form() -> None:
     np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)
 
 
+SPECIAL = {
+    "resets": [NODES[[5, 9, 14]], NODES[[4, 4, 13]], NODES[[4, 4, 4]], np.array([0.413, 0.413, 1.287])],
+    "mixed": [NODES[[9, 14]], *(beside(away) for away in (0.0, 1e-12, 1e-9, 1e-6))],
+    "stiff": [NODES[[9, 14]]],
+}
+"""Transition times on nodes that are samples too, on one another, and as close to nodes as numbers can be."""
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("name", ["resets", "mixed", pytest.param("stiff", marks=pytest.mark.slow)])
-def test_agree_where_transitions_are_nodes_and_samples(name: str, side: int) -> None:
+def test_agree_at_special_places(name: str, side: int) -> None:
     this = case(name)
-    tau = NODES[[5, 9, 14][-this.N :]]
-    assert_all_same(this, this.arguments(), tau, P0, side)
-
-
-@pytest.mark.parametrize("away", [0.0, 1e-12, 1e-9, 1e-6])
-def test_agree_where_a_stiff_mode_has_rows_of_hardly_any_length(away: float) -> None:
-    """It begins just before a node, and ends just behind another one; 0 is as near as numbers can be."""
-    this = case("mixed")
-    begin, end = NODES[[5, 14]]
-    tau = np.array([min(begin - away, np.nextafter(begin, 0.0)), max(end + away, np.nextafter(end, 9.0))])
-    assert_all_same(this, this.arguments(), tau, P0)
+    for tau in SPECIAL[name]:
+        assert_all_same(this, this.arguments(), tau, P0, side)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -93,12 +98,6 @@ def test_side_is_the_limit_from_that_side(side: int) -> None:
     np.testing.assert_allclose(at.gradient, beside.gradient, atol=1e-6)
     np.testing.assert_allclose(at.hessian, beside.hessian, atol=1e-4)
     assert np.abs(at.gradient - other.gradient).max() > 0.1
-
-
-@pytest.mark.parametrize("tau", [NODES[[4, 4, 13]], NODES[[4, 4, 4]], np.array([0.413, 0.413, 1.287])])
-def test_agree_where_transitions_coincide(tau: np.ndarray) -> None:
-    this = case("resets")
-    assert_all_same(this, this.arguments(), tau, P0)
 
 
 @settings(max_examples=10, deadline=None)

@@ -17,7 +17,7 @@ import pytest
 import switchfit as sf
 from switchfit import models
 from switchfit.problem import functions
-from switchfit.problem.functions import Call, trace_function
+from switchfit.problem.functions import Call, trace_function, use_float64
 
 SAMPLES = sf.Measurements([0.5, 1.0], [math.exp(-0.5), math.exp(-1.0)], sigma=0.1)
 
@@ -31,7 +31,6 @@ def problem_of(f, observe=None, **settings):
 # What a function reads has changed: a way to read g, and a way to change it
 
 GLOBAL = {"g": 1.0}
-PLAIN = 1.0
 
 
 class Body:
@@ -41,19 +40,16 @@ class Body:
     def f(self, t, x, p):
         return -self.g * p["a"] * x
 
-    def __call__(self, t, x, p):
-        return -self.g * p["a"] * x
-
 
 def list_ways():
     """Return for each way a vector field that reads g = 1, and a function that makes it 2."""
-    GLOBAL["g"] = globals()["PLAIN"] = 1.0
-    body, called = Body(), Body()
-    array, scalar = np.array([1.0]), np.array(1.0)
+    GLOBAL["g"] = 1.0
+    body = Body()
+    array = np.array([1.0])
     kept, module = type("Kept", (), {"g": 1.0}), types.ModuleType("constants")
     module.g = 1.0
-    bound, told, known, mapped, inside, named = ([1.0] for _ in range(6))
-    jitted, vmapped = jax.jit(lambda x: known[0] * x), jax.vmap(lambda x: mapped[0] * x)
+    bound, told, known, inside, named = ([1.0] for _ in range(5))
+    jitted = jax.jit(lambda x: known[0] * x)
     number = 1.0
 
     def closure(t, x, p):
@@ -66,10 +62,13 @@ def list_ways():
     def default(t, x, p, g=1.0):
         return -g * p["a"] * x
 
-    def attribute(t, x, p):
-        return -attribute.g * p["a"] * x
+    def holder():
+        """Something is kept with it."""
 
-    attribute.g = 1.0
+    def attribute(t, x, p):
+        return -holder.g * p["a"] * x
+
+    holder.g = 1.0
 
     def partial(gains, t, x, p):
         return -gains[0] * p["a"] * x
@@ -98,21 +97,17 @@ def list_ways():
 
     return {
         "global dict": (lambda t, x, p: -GLOBAL["g"] * p["a"] * x, put(GLOBAL, "g")),
-        "global number": (lambda t, x, p: -PLAIN * p["a"] * x, put(globals(), "PLAIN")),
         "global lookup": (lambda t, x, p: -globals()["GLOBAL"]["g"] * p["a"] * x, put(GLOBAL, "g")),
         "closure": (closure, change_number),
         "array in place": (lambda t, x, p: -array * p["a"] * x, put(array)),
-        "array without axes": (lambda t, x, p: -scalar * p["a"] * x, put(scalar, ())),
         "default": (default, lambda: setattr(default, "__defaults__", (2.0,))),
-        "attribute of the function": (attribute, set_g(attribute)),
+        "attribute of a function": (attribute, set_g(holder)),
         "bound method": (body.f, set_g(body)),
-        "callable object": (called, set_g(called)),
         "attribute of a class": (lambda t, x, p: -kept.g * p["a"] * x, set_g(kept)),
         "module": (lambda t, x, p: -module.g * p["a"] * x, set_g(module)),
         "partial": (functools.partial(partial, bound), put(bound)),
         "helper": (lambda t, x, p: -middle(p["a"] * x), put(told)),
         "jitted helper": (lambda t, x, p: -jitted(p["a"] * x), put(known)),
-        "mapped helper": (lambda t, x, p: -vmapped(p["a"] * x), put(mapped)),
         "inner function": (nested, put(inside)),
         "name of a library": (wrapped, put(named)),
     }
@@ -121,17 +116,23 @@ def list_ways():
 WAYS = tuple(list_ways())
 
 
+def rate_of(problem):
+    """The vector field of a problem at x = 1, as its engines evaluate it."""
+    with use_float64():
+        return float(problem.structures[0].modes[0](0.0, np.ones(1), {"a": 0.8})[0])
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_a_problem_keeps_its_functions_as_they_were_when_it_was_built(way):
     f, change = list_ways()[way]
-    before = sf.evaluate(problem_of(f)).cost
+    assert rate_of(problem_of(f)) == -0.8
     old = problem_of(f)
     change()
-    assert sf.evaluate(old).cost == before
-    assert sf.evaluate(problem_of(f)).cost != pytest.approx(before, rel=1e-3)
+    assert rate_of(old) == -0.8
+    assert rate_of(problem_of(f)) == -1.6
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (3, 1)])
+@pytest.mark.parametrize("shape", [(), (3, 1)])
 def test_constants_are_copied_when_a_problem_is_built(shape):
     """Nothing has been compiled for this number when the array that held it changes."""
     g = np.full(shape, 1.37)
@@ -161,30 +162,26 @@ def test_every_kind_of_function_is_seen_anew(place):
     )
     times = np.linspace(0.0, 1.0, 9)
     seen = (lambda t, x, p: scaled(x)) if place in ("observe", "reference") else None
-    data = [sf.Measurements(times, np.exp(-times), observe=seen if place == "observe" else None, sigma=0.1)]
-    if place == "running":
-        data = [sf.RunningCost(lambda t, x, p: scaled(x[0] ** 2))]
-    if place == "reference":
-        data = [sf.ReferenceSignal.from_samples(times, np.exp(-times), observe=seen)]
-    if place == "terminal":
-        data.append(sf.TerminalCost(lambda x, p: scaled(x[0] ** 2)))
-    if place == "constraint":
-        data.append(sf.TerminalConstraint(lambda x, p: scaled(x[0]) - 0.5))
+    values, square = np.exp(-times), lambda x: scaled(x[0] ** 2)
+    data = [
+        sf.Measurements(times, values, observe=seen if place == "observe" else None, sigma=0.1),
+        *([sf.RunningCost(lambda t, x, p: square(x))] if place == "running" else []),
+        *([sf.ReferenceSignal.from_samples(times, values, observe=seen)] if place == "reference" else []),
+        *([sf.TerminalCost(lambda x, p: square(x))] if place == "terminal" else []),
+        *([sf.TerminalConstraint(lambda x, p: scaled(x[0]) - 0.5)] if place == "constraint" else []),
+    ]
 
-    def figures():
-        problem = sf.Problem(system, sf.Experiment(data, ("a", "b"), (0.4,), 0.0, 1.0), {"a": 0.8})
-        if place in ("guard", "constraint"):
-            return sf.estimate(problem).theta
-        return sf.evaluate(problem).gradient
+    def structures():
+        run = sf.Experiment(data, ("a", "b"), (0.4,), 0.0, 1.0)
+        return sf.Problem(system, run, {"a": 0.8}).structures
 
     OTHER["g"] = 1.0
-    before = figures()
+    before = structures()
     OTHER["g"] = 1.1
-    after = figures()
+    after = structures()
     OTHER["g"] = 1.0
-    again = figures()
-    assert not np.allclose(before, after, rtol=1e-3)
-    np.testing.assert_array_equal(before, again)
+    assert before != after
+    assert before == structures()
 
 
 def test_a_rule_for_derivatives_that_has_changed_is_another_function():
@@ -205,8 +202,6 @@ def test_a_rule_for_derivatives_that_has_changed_is_another_function():
 
 # The opposite: equal functions are one
 
-TRACED = []
-
 
 def test_functions_made_anew_share_their_programs():
     def made(number):
@@ -221,53 +216,45 @@ def test_functions_made_anew_share_their_programs():
 
 
 def test_runs_with_functions_of_their_own_are_one_program():
+    runs = [problem_of(lambda t, x, p: x, observe=lambda t, x, p: x[:1]).experiments[0] for _ in range(3)]
     system = sf.HybridSystem({"fall": lambda t, x, p: -p["a"] * x}, [1.0])
-    runs = [
-        sf.Experiment(
-            sf.Measurements([0.5, 1.0], [0.6, 0.4], observe=lambda t, x, p: x[:1], sigma=0.1), ("fall",), (), 0.0, 1.0
-        )
-        for _ in range(10)
-    ]
-    problem = sf.Problem(system, runs, {"a": 1.0})
-    assert problem.alike == (tuple(range(10)),)
+    assert sf.Problem(system, runs, {"a": 1.0}).alike == ((0, 1, 2),)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda x, p: x - p["a"],
-        lambda x, p: p["a"] - x,
-        lambda x, p: x - p["b"],
-        lambda x, p: x + p["a"],
-        lambda x, p: x - p["a"] * 1.0000000000000002,
-        lambda x, p: jnp.sin(x) - p["a"],
-        lambda x, p: x[::-1] - p["a"],
-        lambda x, p: jnp.roll(x, 1) - p["a"],
-        lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x - p["a"], x),
-        lambda x, p: jax.lax.fori_loop(0, 3, lambda k, x: x - p["a"], x),
-        lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x + p["a"], x),
-        lambda x, p: jnp.where(x > 0.0, x, p["a"]),
-        lambda x, p: jnp.where(x >= 0.0, x, p["a"]),
-        lambda x, p: jax.nn.relu(x) - p["a"],
-        lambda x, p: jax.nn.silu(x) - p["a"],
-        lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[:, None], x) - p["a"],
-        lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[None, :], x) - p["a"],
-    ],
+CHANGES = (
+    lambda x, p: x - p["a"],
+    lambda x, p: p["a"] - x,
+    lambda x, p: x - p["b"],
+    lambda x, p: x + p["a"],
+    lambda x, p: x - p["a"] * 1.0000000000000002,
+    lambda x, p: jnp.sin(x) - p["a"],
+    lambda x, p: x[::-1] - p["a"],
+    lambda x, p: jnp.roll(x, 1) - p["a"],
+    lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x - p["a"], x),
+    lambda x, p: jax.lax.fori_loop(0, 3, lambda k, x: x - p["a"], x),
+    lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x + p["a"], x),
+    lambda x, p: jnp.where(x > 0.0, x, p["a"]),
+    lambda x, p: jnp.where(x >= 0.0, x, p["a"]),
+    lambda x, p: jax.nn.relu(x) - p["a"],
+    lambda x, p: jax.nn.silu(x) - p["a"],
+    lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[:, None], x) - p["a"],
+    lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[None, :], x) - p["a"],
 )
-def test_other_functions_are_other(change):
-    call = Call(change, ((2,), None), (2,), "f", "f(x, p)")
-    own = trace_function(call, {"a": (), "b": ()})
-    assert trace_function(call._replace(function=lambda x, p: change(x, p)), {"a": (), "b": ()}) == own
-    for other in TRACED:
-        assert own != other
-        assert own.digest != other.digest
-    TRACED.append(own)
+
+
+def test_other_functions_are_other():
+    def trace(function):
+        return trace_function(Call(function, ((2,), None), (2,), "f", "f(x, p)"), {"a": (), "b": ()})
+
+    traced = [trace(change) for change in CHANGES]
+    assert len(set(traced)) == len({one.digest for one in traced}) == len(CHANGES)
+    for change, own in zip(CHANGES, traced, strict=True):
+        assert trace(lambda x, p, change=change: change(x, p)) == own
 
 
 @pytest.mark.parametrize(
     "read",
     [lambda p: p.pop("a"), lambda p: p.setdefault("a", 2.0), lambda p: p.popitem()[1], lambda p: p.copy()["a"]],
-    ids=["pop", "setdefault", "popitem", "copy"],
 )
 def test_a_function_may_read_its_parameters_by_any_method_of_a_dict(read):
     found = sf.evaluate(problem_of(lambda t, x, p: -read(p) * x))
@@ -303,15 +290,6 @@ def test_helpers_of_built_in_models_are_compared_by_identity(monkeypatch):
     assert first is not None
     assert first == equal != other
     assert len(read) <= 3
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_what_is_read_is_told_by_content_or_not_at_all(way):
-    f, change = list_ways()[way]
-    before = functions.read_contents(f)
-    change()
-    after = functions.read_contents(f)
-    assert after is None or before != after
 
 
 def test_values_of_different_types_are_different():

@@ -40,64 +40,39 @@ def by_default(t, x, p, k=K):
     return k * x
 
 
-def by_closure():
-    drag = jnp.array([0.5, 0.3])
-    return lambda t, x, p: -drag[1] * x
+def scaled(t, x, p):
+    return K * x
 
 
-def by_half():
-    drag = jnp.array([0.3], jnp.bfloat16)
-    return lambda t, x, p: -drag * x
-
-
-def by_loop():
-    drag = jnp.array(0.3)
-    return lambda t, x, p: jax.lax.fori_loop(0, 2, lambda k, y: y - drag * x, x)
-
-
-def by_arithmetic():
-    return lambda t, x, p: -(EXACT[0] / EXACT[1] / 10.0) * x
+DRAG, HALF = jnp.array([0.5, 0.3]), jnp.array([0.3], jnp.bfloat16)
+ENDING = [sf.RunningCost(lambda t, x, p: x[0]), sf.TerminalConstraint(lambda x, p: x[0] - K)]
+WITH_LINE = r"a constant of mode 'on' \(test_precision.py:\d+\) must be in double precision: "
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("given", "said"),
     [
-        (
-            lambda: {"mode": lambda t, x, p: -K * p["a"] * x},
-            r"a constant of mode 'on' \(test_precision.py:\d+\) must be in double precision: 0.1 became 0.1000000014",
-        ),
-        (
-            lambda: {"mode": by_closure()},
-            r"a constant of mode 'on' \(test_precision.py:\d+\) must .*: 0.3 became 0.3000000119",
-        ),
-        (lambda: {"mode": by_half()}, r"a constant of mode 'on' \(test_precision.py:\d+\) must .*\(bfloat16\)"),
-        (lambda: {"mode": by_loop()}, "a constant of mode 'on'"),
-        (lambda: {"mode": by_arithmetic()}, r"a constant of mode 'on' \(test_precision.py:\d+\).*0.025 became"),
-        (lambda: {"mode": Body()}, "a constant of mode 'on'"),
-        (lambda: {"mode": by_default}, "a constant of mode 'on'"),
-        (lambda: {"mode": lambda t, x, p: -jnp.float32(0.3) * x}, "a constant of mode 'on'.*0.3 became"),
-        (lambda: {"reset": lambda t, x, p: K * x}, r"a constant of reset map \('on', 'off'\)"),
-        (lambda: {"guard": lambda t, x, p: x[0] - K}, r"a constant of guard \('on', 'off'\)"),
-        (lambda: {"initial_state": lambda p: jnp.ones(1) * K}, "a constant of initial_state"),
-        (lambda: {"data": sf.RunningCost(lambda t, x, p: K * x[0])}, "a constant of RunningCost"),
-        (lambda: {"data": sf.TerminalCost(lambda x, p: K * x[0])}, "a constant of TerminalCost"),
-        (
-            lambda: {"data": [sf.RunningCost(lambda t, x, p: x[0]), sf.TerminalConstraint(lambda x, p: x[0] - K)]},
-            "a constant of TerminalConstraint",
-        ),
-        (
-            lambda: {"data": sf.Measurements(TIMES, TIMES, observe=lambda t, x, p: K * x, sigma=1.0)},
-            "a constant of observe",
-        ),
-        (
-            lambda: {"data": sf.ReferenceSignal.from_samples(TIMES, TIMES, observe=lambda t, x, p: K * x)},
-            "a constant of observe",
-        ),
+        ({"mode": lambda t, x, p: -K * p["a"] * x}, WITH_LINE + "0.1 became 0.1000000014"),
+        ({"mode": lambda t, x, p: -DRAG[1] * x}, WITH_LINE + "0.3 became 0.3000000119"),
+        ({"mode": lambda t, x, p: -HALF * x}, WITH_LINE + r".*\(bfloat16\)"),
+        ({"mode": lambda t, x, p: jax.lax.fori_loop(0, 2, lambda k, y: y - DRAG[1] * x, x)}, "a constant of mode 'on'"),
+        ({"mode": lambda t, x, p: -(EXACT[0] / EXACT[1] / 10.0) * x}, WITH_LINE + "0.025 became"),
+        ({"mode": Body()}, "a constant of mode 'on'"),
+        ({"mode": by_default}, "a constant of mode 'on'"),
+        ({"mode": lambda t, x, p: -jnp.float32(0.3) * x}, "a constant of mode 'on'.*0.3 became"),
+        ({"reset": scaled}, r"a constant of reset map \('on', 'off'\)"),
+        ({"guard": lambda t, x, p: x[0] - K}, r"a constant of guard \('on', 'off'\)"),
+        ({"initial_state": lambda p: jnp.ones(1) * K}, "a constant of initial_state"),
+        ({"data": sf.RunningCost(lambda t, x, p: K * x[0])}, "a constant of RunningCost"),
+        ({"data": sf.TerminalCost(lambda x, p: K * x[0])}, "a constant of TerminalCost"),
+        ({"data": ENDING}, "a constant of TerminalConstraint"),
+        ({"data": sf.Measurements(TIMES, TIMES, observe=scaled, sigma=1.0)}, "a constant of observe"),
+        ({"data": sf.ReferenceSignal.from_samples(TIMES, TIMES, observe=scaled)}, "a constant of observe"),
     ],
 )
-def test_a_constant_in_single_precision_is_refused_with_its_line(make, said):
+def test_a_constant_in_single_precision_is_refused_with_its_line(given, said):
     with pytest.raises(ValueError, match=said) as caught:
-        problem_of(**make())
+        problem_of(**given)
     assert "write" in str(caught.value), "what to write instead"
 
 
@@ -137,9 +112,7 @@ def test_a_model_file_is_run_in_double_precision(tmp_path):
         "def model(gain=0.3):\n    gain = jnp.array(gain)\n"
         "    return sf.HybridSystem({'on': lambda t, x, p: -K * gain * p['a'] * x}, jnp.array([0.1]))\n"
     )
-    system = load_object("model.py:model", tmp_path, "system")
-    assert system is not None
-    built = call(system, "system")
+    built = call(load_object("model.py:model", tmp_path, "system"), "system")
     assert built.initial_state.tolist() == [0.1]
     log = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
     sf.Problem(built, sf.Experiment(log, ("on",), (), 0.0, 1.0), {"a": 0.8})

@@ -64,7 +64,7 @@ FREE = {"q": sf.Parameter(0.5, lower=0.1, upper=0.9)}
     [
         make_problem({"k": sf.Parameter(0.7), **FREE}, modes={"b": lambda t, x, p: relax(t, x, p) + 0 * p["q"]}),
         make_problem(FREE, [sf.Measurements(TIMES, np.ones((31, 1)), sigma="q")]),
-        make_problem(FREE, [sf.Measurements(TIMES + 0.0, np.ones(31), sigma=0.1, observe=observe)]),
+        make_problem(FREE, [sf.Measurements(TIMES, np.ones(31), sigma=0.1, observe=observe)]),
         make_problem(FREE, [sf.Measurements([1.0, 2.0], [1.0, 1.0], sigma=0.1, delay="q")]),
         make_problem(FREE, [sf.RunningCost(at)]),
         make_problem(FREE, [sf.TerminalCost(at_end)]),
@@ -79,9 +79,7 @@ FREE = {"q": sf.Parameter(0.5, lower=0.1, upper=0.9)}
         make_problem({"q": sf.Parameter(0.5, fixed=True)}),
         make_problem({"q": 0.7}, parameter_map={"k": "q"}),
     ],
-    ids=["mode", "sigma", "observe", "delay", "running", "terminal", "constraint", "transition cost", "initial state",
-         "own initial state", "reset map", "guard", "jump", "prior", "fixed", "map"],
-)  # fmt: skip
+)
 def test_each_kind_of_function_reads(problem):
     found = find_unread(problem)
     assert "q" not in found.unread + found.absent
@@ -107,35 +105,25 @@ def test_a_parameter_of_another_run_is_read():
 
 @pytest.mark.usefixtures("quick_certificates")
 def test_the_report_says_what_nothing_reads(tmp_path):
-    problem = make_problem({"q": [1.0, 1.5], "w": 2.0}, modes={"c": lift})
-    fit = sf.estimate(problem)
+    fit = sf.estimate(make_problem({"q": [1.0, 1.5], "w": 2.0}, modes={"c": lift}))
     assert fit.status is sf.Status.SINGULAR
-    assert fit.unread == ("q[0]", "q[1]")
-    assert fit.absent == ("w",)
-    assert str(fit.verdict).startswith("Doubtful: converged; ")
+    assert (fit.unread, fit.absent) == (("q[0]", "q[1]"), ("w",))
     assert str(fit.verdict).endswith(
-        "; no function of the model reads q; w acts only in modes or at transitions that do not occur: remove "
-        "q from parameters, or use it in the model, or fix w, or fit a log in which it acts."
+        "; no function of the model reads q; w acts only in modes or at transitions that do not occur: remove q from "
+        "parameters, or use it in the model, or fix w, or fit a log in which it acts."
     )
-    assert fit.message.startswith("Converged (optimality ")
-    assert "but no function of the model reads q: remove q from parameters, or use it in the model; w acts" in (
-        fit.message
-    )
+    assert "but no function of the model reads q: remove q from parameters" in fit.message
     assert [issue.kind for issue in find_issues(fit)] == ["not read", "acts elsewhere"], "not: hardly determined"
-    report = fit.report(full=True)
-    rows = {line.split()[0]: line for line in report.splitlines() if line.split()[:1] in (["q[0]"], ["w"], ["k"])}
+    rows = {line.split()[0]: line for line in fit.report(full=True).splitlines() if line.strip()}
     assert rows["q[0]"].endswith("NOT READ")
     assert rows["w"].endswith("MODE DOES NOT OCCUR")
-    assert "No function of the model reads q" in report
     known = sf.estimate(make_problem({}))
     np.testing.assert_allclose(fit.standard_errors[:3], known.standard_errors, rtol=1e-6)
     said = " ".join(str(fit.identifiability).split())
     assert "No function of the model reads q: remove q from parameters" in said
     assert "does not depend on" not in said
     fit.save(tmp_path / "fit.json")
-    loaded = sf.Estimate.load(tmp_path / "fit.json")
-    assert (loaded.unread, loaded.absent) == (fit.unread, fit.absent)
-    assert str(loaded.verdict) == str(fit.verdict)
+    assert str(sf.Estimate.load(tmp_path / "fit.json").verdict) == str(fit.verdict)
 
 
 def test_an_entry_of_an_array_that_is_not_read_has_no_effect():

@@ -47,6 +47,9 @@ from switchfit.runtime.progress import show_detail, show_line
 from switchfit.strategy.library import Library
 from switchfit.uncertainty.residuals import measure_quality
 
+MOST_PLACES = 1_000_000
+"""Number of places on the grid of the longest experiment, at most."""
+
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
 Selection and Multimodel Inference, 2002, section 2.5)."""
@@ -141,7 +144,7 @@ def find_modes(
     width : int
         Hypotheses that the beam keeps.
     grid : float, optional
-        Distance of the times at which switches are looked for.
+        Distance of the times at which switches are looked for; at least a millionth of the longest experiment.
     starts : (S, M) array_like, optional
         Values of the free parameters and initial states to begin with, in the order of theta. If left out, the guess,
         and the guess changed by a standard deviation of its prior or by a factor of 0.7 and 1.4, until the data are
@@ -202,7 +205,7 @@ def find_modes(
     check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
     method, width = as_choice(method, "method", METHODS), _check_width(width, modes)
-    grid = None if grid is None else as_positive(grid, "grid")
+    grid = None if grid is None else _check_grid(grid, problem)
     given = None if starts is None else _check_starts(problem, starts)
     settings = Settings(modes, chooser, base, method, width, grid, given, as_seed(seed), callback)
     if not modes.possible_switches:
@@ -223,6 +226,13 @@ def _check_experiments(problem: Problem) -> None:
                     f"transition time {i} of {name} is fixed, or has bounds, a prior or a logarithmic scale, but "
                     "find_modes looks for the number of transitions as well: give transition times as numbers."
                 )
+
+
+def _check_grid(grid: Any, problem: Problem) -> float:
+    length, least = as_positive(grid, "grid"), max(run.end - run.t0 for run in problem.experiments) / MOST_PLACES
+    if length < least:
+        raise ValueError(f"grid must be at least {least:g}, a millionth of the longest experiment; got {length:g}.")
+    return length
 
 
 def _check_width(width: Any, library: Library) -> int:
