@@ -53,7 +53,7 @@ TESTS = {
     "io": ["io", "saved_problem", "init", "tables_out", "result_tables", "files", "log_times"],
     "io/logs": ["logs", "log_formats", "units", "real_logs", "gps_drive", "dates", "log_times"],
     "io/problem_file": ["io", "files", "dates", "saved_problem", "log_times", "bad_input", "cli_modes"],
-    "models": ["models", "vehicles", "vehicle_mechanics"],
+    "models": ["vehicles", "vehicle_mechanics"],
     "modes": ["modes", "schedule", "pulses", "insertion", "sharing"],
     "online": ["online", "online_cli"],
     "optimize": ["sqp", "qp", "equalities", "arrow", "batch", "strategy", "runs"],
