@@ -3,6 +3,7 @@
 import json
 import types
 from pathlib import Path
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -37,14 +38,9 @@ def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastes
     assert exact <= 8
     assert steepest > block > 3 * exact
     assert found["fits"]["exact"]["sufficient"]
-
-
-@pytest.mark.slow
-def test_closed_form_of_the_lti_example_at_its_truth():
-    """J and DJ vanish, and D²J is positive definite: had a term of Van Loan's been lost, J would not vanish."""
+    # J and DJ vanish at the truth, where D²J is positive definite: had a term of Van Loan's been lost, J would not.
     cost, gradient, hessian = lti.exact(np.array(lti.TRUTH))
-    assert abs(cost) < 1e-12
-    assert np.max(np.abs(gradient)) < 1e-12
+    assert max(abs(cost), *np.abs(gradient)) < 1e-12
     assert np.linalg.eigvalsh(hessian)[0] > 0.1
 
 
@@ -116,9 +112,6 @@ def test_drawing_shows_all_wheels(tmp_path):
     found = drawing.compute(True, tmp_path, lambda text: None)
     (ax,) = drawing.draw(found)["fig2-vehicle"].axes
     assert {f"$F_{n}$ = {force:g} N" for n, force in enumerate(found["forces"], 1)} <= {t.get_text() for t in ax.texts}
-    ahead = np.deg2rad(drawing.HEADING)  # the body is turned, then put where the axes say
-    expected = ax.transData.transform((np.cos(ahead), np.sin(ahead)))
-    np.testing.assert_allclose(ax.patches[0].get_data_transform().transform((1.0, 0.0)), expected)
 
 
 @pytest.mark.slow
@@ -170,63 +163,51 @@ def test_a_longer_horizon_is_more_accurate_but_does_not_always_widen_the_region_
     assert min(arrived) > 0.2
 
 
-def part_that(title, computes):
-    return types.SimpleNamespace(
-        TITLE=title,
-        compute=computes,
-        draw=lambda found: {},
-        rows=lambda found: [Row(title, "1 | 2", str(found["value"]))],
-    )
+def parts_that_find(monkeypatch, **computes):
+    """Put parts that find what the given functions return in place of the paper's."""
+
+    def build(name, compute):
+        return types.SimpleNamespace(
+            TITLE=f"part {name}",
+            compute=lambda quick, folder, say: compute(),
+            draw=lambda found: {},
+            rows=lambda found: [Row(name, "1 | 2", str(found["value"]))],
+        )
+
+    parts = {name: build(name, compute) for name, compute in computes.items()}
+    monkeypatch.setattr("switchfit.paper.PARTS", parts)
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    calls = []
-
-    def interrupted(quick, folder, say):
-        calls.append("second")
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return {"value": 2}
-
-    def first(quick, folder, say):
-        calls.append("first")
-        return {"value": 1}
-
-    parts = {"lti": part_that("one", first), "noise": part_that("two", interrupted)}
-    monkeypatch.setattr("switchfit.paper.PARTS", parts)
+    first, second = Mock(return_value={"value": 1}), Mock(side_effect=[KeyboardInterrupt, {"value": 2}])
+    parts_that_find(monkeypatch, lti=first, noise=second)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, quick=True)
     said = []
     results = run(tmp_path, quick=True, say=said.append)
-    assert calls == ["first", "second", "second"]
-    assert said == ["[1/2] one: done before the interruption"]
+    assert (first.call_count, second.call_count) == (1, 2)
+    assert said == ["[1/2] part lti: done before the interruption"]
     assert [entry["found"]["value"] for entry in results.values()] == [1, 2]
     assert json.loads((tmp_path / "results.json").read_text()) == results
     assert (tmp_path / "table.md").read_text() == table(results)
-    assert "| one | 1 \\| 2 | 1 |" in table(results)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["results.json", "table.md"]
+    assert "| lti | 1 \\| 2 | 1 |" in table(results)
     # A complete run begins anew; one part alone leaves the others as they were.
     run(tmp_path, quick=False, only="lti")
-    assert calls[3:] == ["first"]
+    assert (first.call_count, second.call_count) == (2, 2)
     again = json.loads((tmp_path / "results.json").read_text())
     assert [entry["quick"] for entry in again.values()] == [False, True]
 
 
 def test_damaged_results_are_named_when_one_part_is_run(tmp_path, monkeypatch):
-    monkeypatch.setattr("switchfit.paper.PARTS", {"lti": part_that("one", lambda quick, folder, say: {"value": 1})})
+    parts_that_find(monkeypatch, lti=lambda: {"value": 1})
     (tmp_path / "results.json").write_text('{"noise": ')
     with pytest.raises(ValueError, match=r"results\.json is damaged \(.*\): remove it, and run all parts again"):
         run(tmp_path, quick=True, only="lti")
 
 
 def test_interrupted_study_is_not_taken_for_a_result(tmp_path, monkeypatch):
-    class Stopped:
-        requested = 5
-
-        def __len__(self):
-            return 3
-
-    monkeypatch.setattr(noise, "monte_carlo", lambda *args, **kwargs: Stopped())
+    stopped = MagicMock(requested=5, __len__=lambda study: 3)
+    monkeypatch.setattr(noise, "monte_carlo", lambda *args, **kwargs: stopped)
     with pytest.raises(KeyboardInterrupt):
         noise.compute(True, tmp_path, lambda text: None)
 
@@ -241,12 +222,3 @@ def test_command_writes_figures_and_table_and_names_the_parts(tmp_path):
     wrong = runner.invoke(app, ["paper", "--only", "fig7", "--out", str(tmp_path)])
     assert wrong.exit_code == 2
     assert f"there is no part 'fig7'; the parts are {', '.join(PARTS)}" in wrong.output
-
-
-def test_ends_that_agree_are_counted_together():
-    far, near = ([5.0, 9.0, 0.7], 1.0), ([5.0, 9.0, 0.7 + 1e-9], 1.0)
-    ends = []
-    for theta, cost in (far, (None, None), near, (None, None)):
-        status = types.SimpleNamespace(successful=theta is not None)
-        starts._count(ends, types.SimpleNamespace(status=status, theta=np.array(theta), cost=cost) if theta else None)
-    assert [(end["cost"], end["count"]) for end in ends] == [(1.0, 2), (None, 2)]
