@@ -43,6 +43,13 @@ def test_fishing_from_published_times():
     np.testing.assert_allclose(found.transition_times[0], expected, rtol=0, atol=1e-6)
 
 
+def test_fishing_from_equal_spacing():
+    """A clean KKT point below 1.35: published solvers end with collapsed modes at 1.3463 or higher."""
+    found = sf.estimate(fishing())
+    assert found.optimality < 1e-7
+    assert found.cost < 1.35
+
+
 def test_collapsed_modes_are_named():
     """Fishing all of the time between the second and the third switch: two modes too many, which must vanish."""
     times = (2.4, 4.1, 4.5, 4.6, 8.0, 8.5, 9.0, 10.0)
