@@ -41,7 +41,6 @@ TESTS = {
         "many_logs",
         "verdict_many",
         "starts",
-        "batch_guards",
     ],
     "cli": ["cli", "cli_modes", "cli_comparison", "cli_design", "online_cli", "init", "cli_pipe", "interrupt"],
     "discretization": ["mesh", "implicit", "random_systems", "stiffness", "protocol"],

@@ -15,8 +15,10 @@ from models import decay
 from scipy.optimize import nnls
 
 import switchfit as sf
+from benchmarks.starts.bounces import FALL, ball_on_guards
 from switchfit.batch import program, starts
 from switchfit.batch import simulated as module
+from switchfit.batch import study as again
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.program import CHUNK, Batch, Limits, Varying, _minimize_fits
 from switchfit.estimation.local_fit import fit_locally
@@ -38,10 +40,6 @@ TRUTH = np.array([2.1, 0.8])
 
 def heating(t, x, p):
     return 1.0 - p["k"] * x
-
-
-def root(t, x, p):
-    return jnp.sqrt(1.0 + x)
 
 
 ROOM = sf.HybridSystem({"on": heating, "off": decay}, [0.2])
@@ -276,17 +274,6 @@ def test_fits_that_do_not_converge_are_listed():
     assert "not converged" in str(study)
     assert "Fewer than two" in str(study)
     assert study.plot().axes[0].get_title() == "Fewer than two fits converged: no statistics."
-
-
-def test_a_model_that_is_not_finite_somewhere_does_not_stop_the_others():
-    system = sf.HybridSystem({"a": root, "b": decay}, [0.5])
-    run = sf.Experiment(sf.Measurements(TIMES, np.ones(24), sigma=0.1), ("a", "b"), (2.0,), 0.0, 6.0)
-    problem = sf.Problem(system, run, {"k": sf.Parameter(0.5, lower=-1e4, upper=5.0)})
-    study = sf.multistart(problem, [[2.0, 0.5], [2.0, -9e3], [2.5, 0.3]])
-    assert study.success.tolist() == [True, False, True]
-    assert study.failures[0][0] == 1
-    assert "not finite" in study.failures[0][1]
-    assert study.clusters[1] == -1
 
 
 def test_the_intervals_cover_the_truth():
@@ -771,3 +758,74 @@ def test_the_truth_of_a_study_lies_on_its_guard_however_coarse_the_mesh_of_the_g
     problem = sf.Problem(system, run, {"k": sf.Parameter(1.0, lower=0.1)})
     study = sf.monte_carlo(problem, 1, theta=[0.5, 9.0])
     assert study.truth[0] == pytest.approx(np.log(100) / 9, abs=1e-7)
+
+
+# Guards: far starts end where near ones do
+
+
+COLLAPSE = [10, 13]
+"""Starts from which the guards pull transitions together, so that a direct fit loses modes."""
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A ball with eight bounces; their times are known to 30 ms, and restitution, height and speed roughly."""
+    return ball_on_guards(16)
+
+
+def test_all_starts_near_the_truth_find_the_restitution(case):
+    found = sf.multistart(case.problem, case.starts)
+    assert found.success.all()
+    assert found.clusters.tolist() == [0] * 16
+    assert found.verdict.level == "good"
+    assert "the lowest J was found from 15 of 15 other starts" in str(found.verdict)
+    assert found.best.parameters["e"] == pytest.approx(FALL[0], abs=4 * found.best.standard_errors[8])
+
+
+def test_without_the_second_attempt_they_do_not(case, monkeypatch):
+    """What the test above is about: a direct fit from some of the starts loses modes."""
+    monkeypatch.setattr(again, "_is_doubted", lambda *given: False)
+    found = sf.multistart(case.problem, case.starts[COLLAPSE])
+    assert (found.collapsed > 0).all()
+
+
+def test_a_study_from_a_far_start_finds_the_truth(case):
+    best = sf.estimate(case.problem, strategy="local", start=case.starts[0])
+    study = sf.monte_carlo(case.problem, 6, theta=best.theta, start=case.starts[COLLAPSE[0]])
+    assert study.verdict.level == "good"
+    np.testing.assert_allclose(study.theta[:, 8], best.theta[8], atol=0.002)
+
+
+# --- starts that cannot be integrated ---------------------------------------------------------------------------------
+
+
+def grow(t, x, p):
+    """x' = a x², not finite where a < 0."""
+    return jnp.sqrt(p["a"]) ** 2 * x**2
+
+
+def growing(guess):
+    """A state that grows without bound within the horizon unless it is stopped in time."""
+    system = sf.HybridSystem({"grow": grow, "rest": lambda t, x, p: -x}, [1.0])
+    times = np.linspace(0.1, 3.0, 30)
+    values = np.where(times < 1.0, 1 / (1 - 0.5 * np.minimum(times, 1.0)), 2.0 * np.exp(-(times - 1.0)))
+    data = sf.Measurements(times, values + np.random.default_rng(0).normal(0, 0.01, 30), sigma=0.01)
+    run = sf.Experiment(data, ("grow", "rest"), guess[:1], 0.0, 3.0)
+    return sf.Problem(system, run, {"a": sf.Parameter(guess[1], lower=-1.0, upper=4.0)})
+
+
+@pytest.mark.parametrize("guess", [pytest.param((2.0, 2.0), marks=pytest.mark.slow), (0.9, 0.6)])
+def test_a_start_that_cannot_be_integrated_is_a_bad_start(guess):
+    """Whether or not it is the problem's own guess."""
+    found = sf.multistart(growing(guess), [[2.0, 2.0], [0.9, 0.6], [1.1, 0.4], [0.9, -0.5]])
+    assert found.success.tolist() == [False, True, True, False]
+    assert found.clusters[[0, 3]].tolist() == [-1, -1]
+    assert [run for run, _ in found.failures] == [0, 3]
+    assert "not finite" in found.failures[1][1]
+    np.testing.assert_allclose(found.best.theta, [1.0, 0.5], atol=0.02)
+    assert found.verdict.level == "good"
+
+
+def test_no_start_that_can_be_integrated_is_an_error():
+    with pytest.raises(ValueError, match=r"cannot be integrated|grows without bound"):
+        sf.multistart(growing((2.0, 2.0)), [[2.0, 2.0], [2.5, 3.0]])
