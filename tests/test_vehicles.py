@@ -10,8 +10,6 @@ import scipy.integrate
 
 import switchfit as sf
 from benchmarks import vehicle_coverage
-from switchfit.discretization.mesh import Mesh, build_arguments
-from switchfit.engine.native.templates import Order, Sizes, Templates
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import (
     BUILT_IN,
@@ -31,7 +29,6 @@ from switchfit.models.magic_formula import (
     lateral_force,
     longitudinal_force,
 )
-from switchfit.problem.functions import use_float64
 
 MASS, LENGTH, WIDTH, GRAVITY = 80.0, 0.25, 0.23, 9.81
 
@@ -264,22 +261,6 @@ def test_derivatives_of_the_curve_in_closed_form_are_those_of_its_operations():
                 np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("settings", [{}, {"aligning": True}])
-def test_tyres_run_in_machine_code(settings):
-    """With all sixteen coefficients of the forces unknown; with those of the moment, where they are fixed."""
-    free = dict(MAGIC_FORMULA) if not settings else {name: MAGIC_FORMULA[name] for name in ("a_x2", "a_y2", "a_x4")}
-    held = {name: sf.Parameter(value, fixed=True) for name, value in {**MAGIC_FORMULA, **ALIGNING_MOMENT}.items()}
-    run = vehicle_coverage.CASES["magic_formula"]().problem.experiments[0]
-    used = held if settings else MAGIC_FORMULA
-    problem = sf.Problem(magic_formula(**settings), run, {name: (held | free)[name] for name in used})
-    structure, arguments = (
-        problem.structures[0],
-        build_arguments(problem, 0, Mesh.from_times(np.linspace(0.0, 3.0, 61))),
-    )
-    with use_float64():
-        Templates(structure, Sizes.of(structure, arguments), Order.HESSIAN).stage(0)  # raises if it is too long
-
-
 def turn_on_tyres(x, treads, **settings):
     drive = magic_formula(wheel_radius=0.2, **settings).modes["drive"]
     p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
@@ -372,21 +353,19 @@ def test_what_is_wrong_is_said(make, arguments, message):
 
 
 @pytest.mark.parametrize(
-    ("system", "mode", "channels", "message"),
+    ("system", "channels", "message"),
     [
-        (skid_steer(forces_from_input=True), "slip", 3, r"must have 4 channels, F1, F2, F3, F4 \(N\); it has 3"),
-        (bicycle(), "grip", 1, r"must have 2 channels, delta \(rad\), F_x \(N\); it has 1"),
-        (lugre(), "forward", 2, r"must have one channel, force or position; it has 2"),
+        (skid_steer(forces_from_input=True), 3, r"must have 4 channels, F1, F2, F3, F4 \(N\); it has 3"),
+        (bicycle(), 1, r"must have 2 channels, delta \(rad\), F_x \(N\); it has 1"),
+        (lugre(), 2, r"must have one channel, force or position; it has 2"),
     ],
 )
-def test_an_input_with_other_channels_is_refused(system, mode, channels, message):
+def test_an_input_with_other_channels_is_refused(system, channels, message):
     """JAX takes the last channel for those that are missing: three forces would be four."""
-    data = sf.Measurements([0.5], np.zeros((1, 1)), observe=lambda t, x, p: x[:1])
-    values = np.ones(2) if channels == 1 else np.ones((2, channels))
-    run = sf.Experiment(data, (mode,), (), 0.0, 1.0, inputs=sf.Input([0.0, 1.0], values))
-    needed = (*BRISTLES, "m", "I_z", "a", "b", "C_f", "C_r", "mu")
-    with pytest.raises(ValueError, match=rf"mode '{mode}'.*{message}"):
-        sf.evaluate(sf.Problem(system, run, dict.fromkeys(needed, 1.0)))
+    field = list(system.modes.values())[-1]
+    p = dict.fromkeys((*BRISTLES, "m", "I_z", "a", "b", "C_f", "C_r", "mu"), 1.0)
+    with pytest.raises(ValueError, match=message):
+        evaluate(field, np.ones(len(system.state_names)), p, np.ones(channels) if channels > 1 else np.array(1.0))
 
 
 # --- derivatives, and intervals that hold the truth -------------------------------------------------------------------
@@ -409,6 +388,8 @@ SLOW_TO_CHECK = (
 def test_derivatives_of_each_model_are_right(name):
     """In machine code, without the paper's equations, which take JAX seconds to compile: the study does that."""
     case = vehicle_coverage.CASES[name]()
+    engine = Evaluator(case.problem, case.theta).engines[0].engine.name
+    assert engine == ("jax" if name in vehicle_coverage.SLOW else "native")
     check = sf.check_derivatives(vehicle_coverage.draw_log(case), paper=False)
     assert check.passed, check
     assert np.isfinite(check.observed_orders[0])
