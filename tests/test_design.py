@@ -7,7 +7,7 @@ from itertools import combinations, product
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import STILL, charge, curve, decay, first_state
+from models import STILL, charge, decay, first_state
 
 import switchfit as sf
 from switchfit.experiment_design.criterion import (
@@ -152,10 +152,6 @@ def test_what_cannot_be_determined_is_named():
     assert moved.undetermined == ()
     assert np.isinf(moved.criterion_before)
     assert np.isfinite(moved.criterion_after)
-    product_only = curve(
-        lambda t, x, p: jnp.stack([p["a"] * p["b"] * t]), TIMES, TIMES, {"a": 1.0, "b": 2.0}, tf=4.0, sigma=1.0
-    )
-    assert sf.design(product_only).undetermined == ("a", "b")
 
 
 def test_a_transition_at_a_sample_counts_half_from_each_side():
@@ -166,13 +162,10 @@ def test_a_transition_at_a_sample_counts_half_from_each_side():
 
 
 def test_standard_errors_beyond_the_next_transition_are_doubtful():
-    certain = sf.design(heater_problem(), samples=4)
-    assert certain.doubtful == ()
-    assert "far from linear" not in str(certain)
-    late = planned([4.0, 5.0], sigma=3.0, names=("thermometer",))
+    assert sf.design(heater_problem(), samples=4).doubtful == ()
     problem = heater_problem()
-    problem = replace(problem, experiments=replace(problem.experiments[0], data=late))
-    plan = sf.design(problem, names="k")
+    late = planned([4.0, 5.0], sigma=3.0, names=("thermometer",))
+    plan = sf.design(replace(problem, experiments=replace(problem.experiments[0], data=late)), names="k")
     assert plan.standard_errors[0] > 2.0
     assert plan.doubtful == ("tau_1", "k")
     assert "The standard error of tau_1, k is larger than the distance to a bound" in " ".join(str(plan).split())
@@ -248,9 +241,7 @@ def test_sensors_by_number_and_by_cost():
     }
     costs = {"value": 1.0, "slope": 1.5, "fine": 2.5}
     for settings, most, price in (
-        ({"sensors": 1}, 1, dict.fromkeys(each, 1)),
         ({"sensors": 2}, 2, dict.fromkeys(each, 1)),
-        ({"sensors": costs, "budget": 2.5}, 2.5, costs),
         ({"sensors": costs, "budget": 3.5}, 3.5, costs),
     ):
         plan = sf.design(problem, **settings)

@@ -13,13 +13,6 @@ import numpy as np
 import pytest
 
 from switchfit.models import bicycle, differential_drive, rolling_body, skid_steer
-from switchfit.models.magic_formula import (
-    ALIGNING_MOMENT,
-    MAGIC_FORMULA,
-    compute_aligning_moment,
-    lateral_force,
-    longitudinal_force,
-)
 from switchfit.models.skid_steer import STUCK
 
 G = 9.81
@@ -294,34 +287,3 @@ def test_a_vehicle_that_drives_when_the_command_comes_goes_on_as_it_drove(first)
     waits, moves = (evaluate(system.modes[name], x, p, u) for name in ("wait", first))
     np.testing.assert_array_equal(waits, [*moves[:3], 0.0, 0.0])
     assert abs(waits[2] - evaluate(system.modes[other], x, p, u)[2]) > 0.5
-
-
-# --- tyres ------------------------------------------------------------------------------------------------------------
-
-
-FACTORS = {
-    longitudinal_force: (1.65, (-21.3, 1144), lambda F: (49.6 * F**2 + 226 * F) / np.exp(0.069 * F)),
-    lateral_force: (1.30, (-22.1, 1011), lambda F: 1078 * np.sin(1.82 * np.arctan(0.208 * F))),
-    compute_aligning_moment: (2.40, (-2.72, -2.28), lambda F: (-1.86 * F**2 - 2.73 * F) / np.exp(0.110 * F)),
-}
-"""Of each force: C, the polynomial of D without a constant, and BCD as a function of the load."""
-
-
-@pytest.mark.parametrize("force", FACTORS)
-def test_what_the_factors_of_the_magic_formula_mean(force):
-    """D is the extreme value, BCD the slope at zero, and D sin(C pi / 2) the limit at large slip where E < 1."""
-    shape, polynomial, slope = FACTORS[force]
-    p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
-    slips = np.linspace(0.0, 60.0, 60001)
-
-    @jax.jit
-    def evaluate_at(load):
-        values = jax.vmap(lambda slip: force(slip, load, p))(jnp.asarray(slips))
-        return values, jax.grad(force)(0.0, load, p), force(1e9, load, p)
-
-    for load in (2.0, 4.0, 6.0):
-        values, stiffness, limit = map(np.asarray, evaluate_at(load))
-        peak = np.polyval([*polynomial, 0.0], load)
-        assert values[np.argmax(np.abs(values))] == pytest.approx(peak, rel=1e-6)
-        assert float(stiffness) == pytest.approx(slope(load), rel=1e-12)
-        assert float(limit) == pytest.approx(peak * np.sin(shape * np.pi / 2), rel=1e-6)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from models import decay
+from test_batch import ROOM, TIMES, TRUTH
 
 import switchfit as sf
 from switchfit.batch.program import CHUNK
@@ -14,16 +14,6 @@ from switchfit.batch.verdict import FAR_AWAY, _count_collapsed, measure_distance
 from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
-
-TIMES = np.linspace(0.25, 6.0, 24)
-TRUTH = np.array([2.1, 0.8])
-
-
-def heating(t, x, p):
-    return 1.0 - p["k"] * x
-
-
-ROOM = sf.HybridSystem({"on": heating, "off": decay}, [0.2])
 
 
 def temperatures(tau=2.1, k=0.8):
@@ -50,12 +40,8 @@ def kinds(result):
 # --- fits of logs -----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def good():
-    return sf.estimate_many([room(seed=seed) for seed in range(12)])
-
-
-def test_good_fits_are_good(good):
+def test_good_fits_are_good():
+    good = sf.estimate_many([room(seed=seed) for seed in range(12)])
     assert good.verdict.level == "good"
     assert good.levels.tolist() == ["good"] * 12
     worst = int(np.argmin(good.explained))
@@ -101,10 +87,8 @@ def test_the_share_of_a_reference_is_that_of_a_single_fit():
 
 def test_a_cost_without_data_has_no_share():
     cost = sf.RunningCost(lambda t, x, p: (x[0] - 0.8) ** 2)
-    problem = sf.Problem(
-        ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": sf.Parameter(0.8, fixed=True)}
-    )
-    many = sf.estimate_many([problem])
+    k = sf.Parameter(0.8, fixed=True)
+    many = sf.estimate_many([sf.Problem(ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": k})])
     assert np.isnan(many.explained).all()
     assert str(many.verdict) == "Good: the only fit is good."
 
