@@ -7,7 +7,7 @@ from itertools import combinations, product
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import STILL, charge, decay, first_state
+from models import STILL, charge, curve, decay, first_state
 
 import switchfit as sf
 from switchfit.experiment_design.criterion import (
@@ -152,6 +152,8 @@ def test_what_cannot_be_determined_is_named():
     assert moved.undetermined == ()
     assert np.isinf(moved.criterion_before)
     assert np.isfinite(moved.criterion_after)
+    of_product, guess = (lambda t, x, p: jnp.stack([p["a"] * p["b"] * t])), {"a": 1.0, "b": 2.0}
+    assert sf.design(curve(of_product, TIMES, TIMES, guess, tf=4.0, sigma=1.0)).undetermined == ("a", "b")
 
 
 def test_a_transition_at_a_sample_counts_half_from_each_side():
