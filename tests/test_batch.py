@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay
+from models import climb, decay, rest
 from scipy.optimize import nnls
 
 import switchfit as sf
@@ -678,6 +678,19 @@ def test_models_with_the_same_machine_code_share_an_operation(name):
 
 
 # Budgets, and fits that crawl
+
+
+@pytest.mark.slow
+def test_a_fit_that_crawls_towards_a_kink_is_handed_over():
+    """Ramps between samples that are few and noisy: most fits end where a transition meets a sample."""
+    system = sf.HybridSystem({"rest": rest, "up": climb, "down": lambda t, x, p: 0.0 * x - 1.0}, [0.0])
+    data = sf.Measurements(np.linspace(0.5, 6.0, 12), np.zeros(12), sigma=0.4)
+    run = sf.Experiment(data, ("rest", "up", "rest", "down"), (1.3, 2.6, 4.3), 0.0, 6.0)
+    problem = sf.Problem(system, run, {"v": sf.Parameter(1.0, lower=0.1, upper=4.0)})
+    study = sf.monte_carlo(problem, 150, theta=[1.1, 2.8, 4.6, 1.2], start=problem.initial_theta, seed=1)
+    assert study.failures == []
+    assert np.sum(study.status == "CONVERGED_AT_KINK") > 40
+    assert study.evaluations.max() < 200
 
 
 def test_a_fit_that_is_finished_has_half_the_budget_left(finished):
