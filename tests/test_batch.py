@@ -438,6 +438,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
     partial = sf.monte_carlo(room(), 4 * CHUNK, **settings, callback=lambda done, total: seen.append(done) or True)
     assert len(partial) < 4 * CHUNK
     assert "STOPPED" in str(partial)
+    assert partial.verdict.reasons[-1].kind == "stopped"
     assert seen == [CHUNK]
     kept = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
     whole = sf.monte_carlo(room(), 4 * CHUNK, **settings, callback=lambda done, total: seen.append(done))
