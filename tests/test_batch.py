@@ -351,18 +351,16 @@ def test_multistart_finds_both_minima_and_estimates_the_lower_one():
     knots = np.hstack([np.zeros((24, 1)), study.start, np.full((24, 1), 10.0)])
     assert np.all(np.diff(knots) >= 0.2 - 1e-12)
     assert len(np.unique(study.start[:, 0])) == 24
-    ends = [study.theta[study.clusters == k].mean(0) for k in range(2)]
-    np.testing.assert_allclose(ends[0], [2.0, 3.0], atol=0.1)
-    np.testing.assert_allclose(ends[1], [7.0, 7.8], atol=0.1)
-    for k in range(2):
-        assert np.ptp(study.cost[study.clusters == k]) < 1e-6 * study.cost[study.clusters == k][0]
+    for k, end in enumerate(([2.0, 3.0], [7.0, 7.8])):
+        found = study.clusters == k
+        np.testing.assert_allclose(study.theta[found].mean(0), end, atol=0.1)
+        assert np.ptp(study.cost[found]) < 1e-6 * study.cost[found][0]
     assert study.best.status.successful
     assert study.best.verdict.level == "bad"  # of two pulses one is explained
-    np.testing.assert_allclose(study.best.theta, ends[0], atol=1e-4)
+    np.testing.assert_allclose(study.best.theta, study.theta[study.clusters == 0].mean(0), atol=1e-4)
     assert study.best.cost == pytest.approx(np.nanmin(study.cost), rel=1e-6)
     assert "minima:" in str(study)
-    figure = study.plot()
-    assert "cost above the best" in figure.axes[0].get_ylabel()
+    assert "cost above the best" in study.plot().axes[0].get_ylabel()
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from models import RAMP, STILL, curve
 
 import switchfit as sf
 from switchfit.batch.program import CHUNK, Limits
-from switchfit.batch.resampling import StudyOfRuns, _Draw
+from switchfit.batch.resampling import StudyOfRuns
 
 TIMES = np.linspace(0.1, 4.0, 40)
 
@@ -145,9 +145,6 @@ def test_missing_values_stay_missing_and_channels_stay_together():
     study = sf.bootstrap(fit, 300)
     assert study.samples.tolist() == [78] * 300
     assert np.corrcoef(study.theta.T)[0, 1] < -0.9
-    draw = _Draw(fit, fit.problem, "residuals", None)
-    clean = np.zeros((40, 2))
-    assert np.isfinite(draw(np.random.default_rng(0), clean, fit.problem.experiments[0].data[0])).all()
 
 
 def test_seeds_and_folders(tmp_path):

@@ -144,12 +144,9 @@ def test_a_short_mode_is_one_of_its_horizon_wherever_the_clock_begins():
 
 @pytest.fixture(scope="module")
 def study():
-    return sf.monte_carlo(room(), 200, theta=TRUTH)
-
-
-def test_a_study_whose_fits_agree_is_good(study):
-    assert study.verdict.level == "good"
-    assert str(study).startswith("Good: all 200 fits converged, in one minimum.\n")
+    found = sf.monte_carlo(room(), 200, theta=TRUTH)
+    assert str(found).startswith("Good: all 200 fits converged, in one minimum.\n")
+    return found
 
 
 def test_a_study_with_more_noise_than_sigma_says_so():
@@ -167,7 +164,6 @@ def test_an_end_in_another_minimum_is_found(study):
     assert np.flatnonzero(measure_distances(away, every) > FAR_AWAY).tolist() == [17]
     assert away.verdict.level == "doubtful"
     assert "1 of 200 fits ended in another minimum, fit 17 farthest off" in str(away.verdict)
-    assert not np.any(measure_distances(study, every) > FAR_AWAY)
 
 
 @pytest.mark.parametrize(("failed", "level"), [(2, "good"), (3, "doubtful"), (99, "doubtful"), (100, "bad")])
