@@ -71,8 +71,6 @@ def test_magic_formula_reference_gives_values_like_the_paper(tmp_path, monkeypat
     found = found_by(magic, tmp_path)
     (slow,) = found["ramps"]
     assert abs(slow["theta"]["tau_2"] - magic.PAPER["tau_2"]) < 0.3  # later by the wheels' own delay
-    assert magic.rank(found["forces"]["static"]) == 6  # D, BCD and E of two directions
-    assert magic.rank(found["forces"]["transfer"]) == 16
     literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
     for fit in (literal, reset):
         assert fit["sufficient"]
