@@ -24,11 +24,6 @@ def measured(tau, seed, times=TIMES):
     return (clean + SIGMA * np.random.default_rng(seed).standard_normal(len(times)))[:, None]
 
 
-def unknown_sigma(problem):
-    run = problem.experiments[0]
-    return replace(problem, experiments=replace(run, data=[replace(run.data[0], sigma=None)]))
-
-
 def check_same(problems, level, *, rtol=1e-4):
     """Each interval of the batch is that of a single fit, measured by its length; returns the batch."""
     many = sf.estimate_many(problems)
@@ -92,51 +87,46 @@ def test_a_way_ends_where_the_others_are_not_determined():
     assert left[1, 1] == -9.0
 
 
-def test_intervals_where_sigma_is_unknown():
-    check_same([unknown_sigma(build_problem(measured(2.0, seed), 2.0, rate_known=False)) for seed in range(12)], 0.95)
+def charged(tau, seed):
+    """A log whose rate is unknown too."""
+    return build_problem(measured(tau, seed), tau, rate_known=False)
 
 
-def test_intervals_of_samples_with_a_delay():
+def unknown_sigma(seed):
+    problem = charged(2.0, seed)
+    run = problem.experiments[0]
+    return replace(problem, experiments=replace(run, data=[replace(run.data[0], sigma=None)]))
+
+
+def delayed(seed):
     """The kinks are where the state was measured, not where the samples are stamped."""
-    problems = []
-    for seed in range(8):
-        problem = build_problem(measured(2.0, seed), 2.0, rate_known=False)
-        run = problem.experiments[0]
-        late = replace(run.data[0], times=run.data[0].times + 0.03, delay=0.03)
-        problems.append(replace(problem, experiments=replace(run, data=[late])))
-    many = check_same(problems, 0.95)
-    prompt = sf.estimate_many([build_problem(measured(2.0, seed), 2.0, rate_known=False) for seed in range(8)])
-    np.testing.assert_allclose(many.confidence_intervals(), prompt.confidence_intervals(), rtol=1e-6)
+    problem = charged(2.0, seed)
+    run = problem.experiments[0]
+    late = replace(run.data[0], times=run.data[0].times + 0.03, delay=0.03)
+    return replace(problem, experiments=replace(run, data=[late]))
 
 
-def test_each_log_has_its_own_sample_times():
-    problems = []
-    for seed in range(8):
-        times = TIMES + 0.01 * seed
-        data = sf.Measurements(times, measured(2.03, seed, times), sigma=SIGMA)
-        run = sf.Experiment(data, ("rest", "charge"), (2.03,), 0.0, 4.2)
-        problems.append(sf.Problem(SYSTEM, run, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)}))
-    many = check_same(problems, 0.95)
+def several_runs(seed, taus=(2.0, 1.51), shift=0.0):
+    """Runs that share the rate, each with sample times of its own."""
+    runs = []
+    for e, tau in enumerate(taus):
+        times = TIMES + shift * seed
+        data = sf.Measurements(times, measured(tau, seed + 10 * e, times), sigma=SIGMA)
+        runs.append(sf.Experiment(data, ("rest", "charge"), (tau,), 0.0, 4.2))
+    return sf.Problem(SYSTEM, runs, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)})
+
+
+@pytest.mark.parametrize(
+    "build", [unknown_sigma, delayed, several_runs, partial(several_runs, taus=(2.03,), shift=0.01)]
+)
+def test_intervals_of_other_logs_are_those_of_single_fits_too(build):
+    many = check_same([build(seed) for seed in range(8)], 0.95)
     assert (~np.isnan(many.pieces[:, :, 0, 0, 0])).sum() > 4
-
-
-def test_runs_of_one_problem_have_theirs():
-    problems = []
-    for seed in range(6):
-        runs = [
-            sf.Experiment(
-                sf.Measurements(TIMES, measured(tau, seed + 10 * e), sigma=SIGMA), ("rest", "charge"), (tau,), 0.0, 4.0
-            )
-            for e, tau in enumerate((2.0, 1.51))
-        ]
-        problems.append(sf.Problem(SYSTEM, runs, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)}))
-    many = check_same(problems, 0.95)
-    assert many.pieces.shape[1] == 2
-    assert many.piece_places.tolist() == [0, 1]
+    assert many.pieces.shape[1] == (2 if build is several_runs else 1)
 
 
 def test_an_interval_grows_with_its_level_beyond_the_pieces_too():
-    many = sf.estimate_many([build_problem(measured(2.0, seed), 2.0, rate_known=False) for seed in range(12)])
+    many = sf.estimate_many([charged(2.0, seed) for seed in range(12)])
     lengths = [
         np.ptp(many.confidence_intervals(level)[:, 0], axis=1) for level in (0.5, 0.9, 0.95, 0.99, 0.999, 0.9999)
     ]
@@ -191,59 +181,18 @@ def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
         np.testing.assert_array_equal(array, np.concatenate([part[name] for part in parts]), err_msg=name)
 
 
-def do_all_again(monkeypatch, kind=Evaluator):
-    """Let all fits of a study count as done again, on meshes of their own."""
-
-    def redo(study, chunk, runs, batch):
-        for k, run in enumerate(runs):
-            batch.own[k] = cache(partial(kind, study.problem_of(run), chunk.theta[k].copy()))
-
-    monkeypatch.setattr(Study, "_redo_unresolved", redo)
-
-
-def test_a_model_that_is_undefined_near_a_fit_that_was_done_again_costs_the_others_no_interval(monkeypatch):
-    problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
-    do_all_again(monkeypatch)
-    plain = sf.monte_carlo(problem, 8, theta=[2.0])
-    traced = np.isfinite(plain.pieces[:, 0, 0, 0, 0])
-    smooth = traced & (plain.status != "CONVERGED_AT_KINK")
-    assert traced.sum() > smooth.sum() > 0
-    undefined = int(np.flatnonzero(smooth)[0])
-
-    class Undefined(Evaluator):
-        def __call__(self, theta, side=1):
-            if self.start == plain.theta[undefined, 0]:
-                raise ValueError("undefined here")
-            return super().__call__(theta, side)
-
-        def __init__(self, problem, theta=None, **settings):
-            super().__init__(problem, theta, **settings)
-            self.start = None if theta is None else theta[0]
-
-    do_all_again(monkeypatch, Undefined)
-    found = sf.monte_carlo(problem, 8, theta=[2.0])
-    others = np.arange(8) != undefined
-    np.testing.assert_array_equal(found.pieces[others], plain.pieces[others])
-    kept = np.isfinite(found.pieces[undefined, 0, :, :, 0])
-    assert kept.sum(axis=1).tolist() == [1, 1]  # up to where it is undefined
-
-
-def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
+def test_evaluations_where_a_model_is_undefined_are_not_numbers():
     problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
     thetas, sides = np.array([[1.9], [2.02], [2.1]]), np.ones(3, dtype=int)
-    meshes = Evaluator(problem, truth).meshes
-    batch = Batch(problem, meshes, Varying((), ()), Limits(1e-7, 200))
-    assert batch.layout.natively
+    batch = Batch(problem, Evaluator(problem, truth).meshes, Varying((), ()), Limits(1e-7, 200))
     expected = batch.evaluate(np.arange(3), thetas, sides)
-    evaluate = batch.evaluator
 
     def evaluate_or_raise(theta, side):
         if theta[0] == 2.02:
             raise ZeroDivisionError("undefined here")
-        return evaluate(theta, side)
+        return batch.evaluator(theta, side)
 
-    batch.layout = replace(batch.layout, natively=False)
-    monkeypatch.setattr(batch, "_give_data", lambda k: evaluate_or_raise)
+    batch.own = dict.fromkeys(range(3), lambda: evaluate_or_raise)  # as those that were done again
     for found, all_ in zip(batch.evaluate(np.arange(3), thetas, sides), expected, strict=True):
         assert np.isnan(found[1]).all()
         np.testing.assert_allclose(found[[0, 2]], all_[[0, 2]], rtol=1e-12)
@@ -252,12 +201,11 @@ def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
 def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
     problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
     plain = sf.monte_carlo(problem, 8, theta=[2.0])
-    do_all_again(monkeypatch)
+
+    def redo(study, chunk, runs, batch):
+        for k, run in enumerate(runs):
+            batch.own[k] = cache(partial(Evaluator, study.problem_of(run), chunk.theta[k].copy()))
+
+    monkeypatch.setattr(Study, "_redo_unresolved", redo)
     own = sf.monte_carlo(problem, 8, theta=[2.0])
     np.testing.assert_allclose(own.confidence_intervals(), plain.confidence_intervals(), rtol=1e-5)
-
-
-def test_a_folder_keeps_them(tmp_path):
-    problems = [build_problem(measured(2.0, seed), 2.0, rate_known=True) for seed in range(4)]
-    first, second = (sf.estimate_many(problems, folder=tmp_path) for _ in range(2))
-    np.testing.assert_array_equal(first.confidence_intervals(), second.confidence_intervals())

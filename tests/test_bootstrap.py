@@ -12,7 +12,7 @@ from models import RAMP, STILL, curve
 
 import switchfit as sf
 from switchfit.batch.program import CHUNK, Limits
-from switchfit.batch.resampling import StudyOfRuns, _compute_acceleration, _Draw
+from switchfit.batch.resampling import StudyOfRuns
 
 TIMES = np.linspace(0.1, 4.0, 40)
 
@@ -48,21 +48,15 @@ def test_the_bootstrap_of_a_mean_is_that_of_scipy():
     ).confidence_interval
     expected = values.mean() + inflation * (np.array([other.low, other.high]) - values.mean())
     np.testing.assert_allclose(study.intervals()[0], expected, atol=0.02)
+    shift = scipy.stats.norm.ppf(np.mean(study.theta[:, 0] < study.estimate[0]))
+    z = shift + scipy.stats.norm.ppf([0.05, 0.95])
+    parts = scipy.stats.norm.cdf(shift + z / (1 - study.acceleration[0] * z))
+    np.testing.assert_allclose(study.intervals(0.9)[0], np.quantile(study.theta[:, 0], parts), rtol=1e-9)
     # scipy's acceleration, by leaving each value out and taking the mean of the rest
     without = (values.sum() - values) / 39
     influence = without.mean() - without
     expected = np.sum(influence**3) / (6 * np.sum(influence**2) ** 1.5)
     assert study.acceleration[0] == pytest.approx(expected, rel=1e-9)
-
-
-def test_intervals_are_shifted_quantiles_of_the_estimates():
-    study = sf.bootstrap(mean_of(skewed()), 400)
-    theta = study.theta[:, 0]
-    z0 = scipy.stats.norm.ppf(np.mean(theta < study.estimate[0]))
-    a = study.acceleration[0]
-    z = z0 + scipy.stats.norm.ppf([0.05, 0.95])
-    parts = scipy.stats.norm.cdf(z0 + z / (1 - a * z))
-    np.testing.assert_allclose(study.intervals(0.9)[0], np.quantile(theta, parts), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -122,9 +116,7 @@ def test_over_runs_the_spread_is_that_of_the_runs():
     assert study.standard_deviation[-1] == pytest.approx(slopes.std() / np.sqrt(12), rel=0.25)
     assert study.standard_deviation[-1] > 5 * fit.standard_errors[-1]
     assert "of one run alone" in str(study)
-    figure = study.plot()
-    assert [ax.get_xlabel() for ax in figure.axes if ax.get_visible()] == ["v"]
-    figure.draw_without_rendering()
+    assert [ax.get_xlabel() for ax in study.plot().axes if ax.get_visible()] == ["v"]
 
 
 def test_a_run_weighs_as_often_as_it_was_drawn():
@@ -153,9 +145,6 @@ def test_missing_values_stay_missing_and_channels_stay_together():
     study = sf.bootstrap(fit, 300)
     assert study.samples.tolist() == [78] * 300
     assert np.corrcoef(study.theta.T)[0, 1] < -0.9
-    draw = _Draw(fit, fit.problem, "residuals", None)
-    clean = np.zeros((40, 2))
-    assert np.isfinite(draw(np.random.default_rng(0), clean, fit.problem.experiments[0].data[0])).all()
 
 
 def test_seeds_and_folders(tmp_path):
@@ -163,26 +152,12 @@ def test_seeds_and_folders(tmp_path):
     one, same, other = (sf.bootstrap(fit, CHUNK + 8, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.theta, same.theta)
     assert not np.array_equal(one.theta, other.theta)
-    first = sf.bootstrap(fit, CHUNK + 8, folder=tmp_path, callback=lambda done, total: True)
-    assert len(first) < CHUNK + 8
-    assert "STOPPED" in str(first)
     np.testing.assert_array_equal(sf.bootstrap(fit, CHUNK + 8, folder=tmp_path).theta, one.theta)
     with pytest.raises(ValueError, match="holds the results of another run"):
         sf.bootstrap(fit, CHUNK + 8, folder=tmp_path, resample="wild")
     runs = sf.estimate(ramps([0.9, 1.0, 1.2]))
     with pytest.raises(ValueError, match="holds the results of another run"):
         sf.bootstrap(runs, CHUNK + 8, folder=tmp_path, resample="runs")
-
-
-def test_figure_of_a_bootstrap():
-    study = sf.bootstrap(mean_of(skewed()), 100)
-    figure = study.plot()
-    assert figure.axes[0].get_xlabel() == "m"
-    assert figure.legends[0].get_title().get_text() == "Bootstrap of residuals"
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "100 estimates", "estimate", "95 % interval (BCa)",
-    ]  # fmt: skip
-    figure.draw_without_rendering()
 
 
 @pytest.mark.parametrize(
@@ -202,19 +177,15 @@ def test_settings_that_make_no_sense(settings, message):
 
 def test_what_cannot_be_resampled():
     fit = mean_of(skewed())
-    with pytest.raises(TypeError, match=r"bootstrap needs the result of sf.estimate; got Problem"):
-        sf.bootstrap(fit.problem)
-    with pytest.raises(ValueError, match="a bootstrap begins at a minimum"):
-        sf.bootstrap(sf.estimate(fit.problem, max_iterations=0))
     signal = sf.ReferenceSignal.from_samples(TIMES, skewed(), observe=level)
-    mixed = sf.Problem(STILL, sf.Experiment(signal, ("still",), (), 0.1, 4.0), {"m": 0.0})
-    with pytest.raises(ValueError, match="a bootstrap resamples Measurements; this problem has a ReferenceSignal"):
-        sf.bootstrap(sf.estimate(mixed))
+    mixed = sf.estimate(sf.Problem(STILL, sf.Experiment(signal, ("still",), (), 0.1, 4.0), {"m": 0.0}))
+    for given, message in (
+        (fit.problem, r"bootstrap needs the result of sf.estimate; got Problem"),
+        (sf.estimate(fit.problem, max_iterations=0), "a bootstrap begins at a minimum"),
+        (mixed, "a bootstrap resamples Measurements; this problem has a ReferenceSignal"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            sf.bootstrap(given)
     study = sf.bootstrap(fit, 10)
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 0"):
         study.intervals(0)
-
-
-def test_the_acceleration_of_a_symmetric_sample_is_zero():
-    values = np.concatenate([1.0 + np.arange(20), 1.0 - np.arange(20)])
-    assert _compute_acceleration(mean_of(values), by_run=False)[0] == pytest.approx(0.0, abs=1e-12)

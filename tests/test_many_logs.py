@@ -67,13 +67,9 @@ def test_patterns_and_folders(tmp_path):
     ("paths", "names"),
     [
         (["logs/a.csv", "logs/b.csv.gz"], ["a", "b"]),
-        (["1/drive.csv", "2/drive.csv"], ["1", "2"]),
         (["logs/1/drive.csv", "logs/2/drive.csv"], ["1", "2"]),
         (["a.csv", "a.mat"], ["a.csv", "a.mat"]),
         (["1/a.csv", "1/a.mat", "2/a.csv"], ["1/a.csv", "1/a.mat", "2/a.csv"]),
-        (["bag_1", "bag_2"], ["bag_1", "bag_2"]),
-        (["a.json", "out/b.json"], ["a", "b"]),
-        (["one/estimate.json", "v1.2/estimate.json"], ["one", "v1.2"]),
         (["one/fit.json", "one/other.json", "two/fit.json"], ["one/fit", "one/other", "two/fit"]),
         (["a/out/estimate.json", "b/out/estimate.json"], ["a", "b"]),
         (["x/a/1/fit.json", "x/b/1/fit.json", "x/b/2/fit.json"], ["a/1", "b/1", "b/2"]),
@@ -88,9 +84,8 @@ def test_names(paths, names):
 # --- in problem files -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("pattern", ["logs/*.csv", "logs"])
-def test_a_pattern_is_a_run_for_each_log(folder, pattern):
-    (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", pattern))
+def test_a_pattern_is_a_run_for_each_log(folder):
+    (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", "logs/*.csv"))
     loaded = load_problem(folder / "problem.toml")
     assert [run.name for run in loaded.problem.experiments] == ["monday", "tuesday"]
     assert loaded.problem.theta_names == ("monday.tau_1", "tuesday.tau_1", "heating")
@@ -101,16 +96,11 @@ def test_a_pattern_is_a_run_for_each_log(folder, pattern):
 def test_a_bad_log_is_left_out_of_a_problem(folder):
     spoil(folder)
     (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", "logs/*.csv"))
-    for command in (["check"], ["check", "--no-run"], ["fit", "--max-iterations", "30"]):
-        result = run(command[0], folder / "problem.toml", *command[1:])
-        assert result.exit_code == 2
-        said = (
-            "sunday.csv, line 3, column 'T': 'cold' is not a number; leave the cell empty where a value is missing.\n"
-        )
-        assert result.stderr.startswith("switchfit: Left out: ")
-        assert result.stderr.endswith(said)
-        assert "monday" in result.stdout
-        assert "tuesday" in result.stdout
+    result = run("check", folder / "problem.toml", "--no-run")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("switchfit: Left out: ")
+    assert "sunday.csv, line 3, column 'T': 'cold' is not a number; leave the cell empty" in result.stderr
+    assert "monday" in result.stdout
     for name in ("monday", "tuesday"):
         (folder / "logs" / f"{name}.csv").unlink()
     with pytest.raises(InputError, match=r"sunday\.csv, line 3"):  # not one of the logs can be used
@@ -141,12 +131,9 @@ def read(path):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("given", ["files", "folder"])
-def test_logs_one_by_one(folder, given):
-    logs = folder / "logs"
-    names = {"files": sorted(logs.iterdir()), "folder": [logs]}[given]
-    out, table = folder / "out", folder / "new" / "table.csv"
-    result = run("fit", *names, "--problem", folder / "problem.toml", "--table", table, "--out", out, "--no-figures")
+def test_logs_one_by_one(folder):
+    logs, problem, out, table = (folder / name for name in ("logs", "problem.toml", "out", "new/table.csv"))
+    result = run("fit", logs, "--problem", problem, "--table", table, "--out", out, "--no-figures")
     assert result.exit_code == 0, result.stderr
     rows = read(table)
     assert [row["log"] for row in rows] == [str(logs / "monday.csv"), str(logs / "tuesday.csv")]
@@ -162,18 +149,24 @@ def test_logs_one_by_one(folder, given):
 
 
 def test_a_bad_log_does_not_end_the_run(folder):
+    """Nor does one of a room that is heated again and again, by a model that heats once: its row says why it is bad."""
     spoil(folder)
+    times = np.arange(0.25, 6.0, 0.5)
+    rows = "".join(f"{t:g};{5 * np.sin(3 * t):.6g}\n" for t in times)
+    (folder / "logs" / "friday.csv").write_text("t;T\n" + rows)
     (folder / "logs" / "short.csv").write_text("t;U\n0;1\n")
     table = folder / "table.csv"
     result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", table)
     assert result.exit_code == 2
     rows = {row["log"].rpartition("/")[2]: row for row in read(table)}
-    assert [row["verdict"] == "refused" for row in rows.values()] == [False, True, True, False]
+    assert [row["verdict"] for row in rows.values()] == ["bad", "good", "refused", "refused", "good"]
     assert "short.csv has no column 'T'; its columns are t, U." in rows["short.csv"]["message"]
     assert "sunday.csv, line 3, column 'T': 'cold' is not a number" in rows["sunday.csv"]["message"]
+    assert "of the variance" in rows["friday.csv"]["message"]
+    assert rows["friday.csv"]["message"] in result.stdout
     assert float(rows["tuesday.csv"]["tau_1 (s)"]) == pytest.approx(2.1, rel=1e-5)
     assert rows["sunday.csv"]["tau_1 (s)"] == ""
-    assert "4 logs: 2 fitted, 0 not, 2 refused" in result.stderr
+    assert "5 logs: 2 fitted, 1 not, 2 refused" in result.stderr
 
 
 def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):
@@ -234,17 +227,3 @@ def test_what_is_missing_or_too_much(folder):
     (folder / "problem.toml").write_text(two)
     with pytest.raises(InputError, match=r"must have one \[\[experiments\]\], .*; got 2\. Write a problem file"):
         load_problem(folder / "problem.toml", folder / "logs" / "monday.csv")
-
-
-def test_a_bad_fit_says_why(folder):
-    """A room that is heated twice, by a model that heats once."""
-    times = np.arange(0.25, 6.0, 0.5)
-    rows = "".join(f"{t:g};{5 * np.sin(3 * t):.6g}\n" for t in times)
-    (folder / "logs" / "monday.csv").write_text("t;T\n" + rows)
-    table = folder / "table.csv"
-    result = run("fit", folder / "logs" / "monday.csv", "--problem", folder / "problem.toml", "--table", table)
-    assert result.exit_code == 1
-    (row,) = read(table)
-    assert row["verdict"] == "bad"
-    assert "of the variance" in row["message"]
-    assert row["message"] in result.stdout

@@ -11,17 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.interpolate
 
-import switchfit as sf
 from switchfit.models import bicycle, differential_drive, rolling_body, skid_steer
-from switchfit.models.magic_formula import (
-    ALIGNING_MOMENT,
-    MAGIC_FORMULA,
-    compute_aligning_moment,
-    lateral_force,
-    longitudinal_force,
-)
 from switchfit.models.skid_steer import STUCK
 
 G = 9.81
@@ -211,38 +202,6 @@ def test_resets_keep_the_momentum_along_what_the_axles_admit():
             assert momentum @ admit(after, q, admitted) == pytest.approx(0.0, abs=1e-11)
 
 
-@pytest.mark.slow
-def test_energy_of_a_drive_is_the_work_of_wheels_less_frictions_and_impacts():
-    """Through all modes: reactions of axles that stick do no work, and resets lose what Carnot's theorem says."""
-    system = make_skid_steer()
-    sequence, times = ("stick", "slip", "rear_slip", "front_slip", "stick"), (1.0, 2.0, 3.0, 4.0)
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 0.0, 5.0)
-    path = sf.simulate(sf.Problem(system, run, GROUND))
-    q, dq = jnp.asarray(path.states[:, ::2]), jnp.asarray(path.states[:, 1::2])
-    energy = np.asarray(jax.jit(jax.vmap(lambda q, dq: kinetic(MASSES, q, dq) + lift(q)))(q, dq))
-    modes, forces = np.array(path.modes), {"stick": [15.0] * 4}
-
-    def power(q, dq, mode):
-        """Power of the wheels less that of the frictions, which is the slope of Rayleigh's function along q'."""
-        ahead = jnp.array([jnp.cos(q[2]), jnp.sin(q[2])])
-        pairs = zip(WHEELS, forces.get(mode, [27.0, 0.0, 0.0, 27.0]), strict=True)
-        driven = sum(F * ahead @ velocity(jnp.array(wheel), q, dq) for wheel, F in pairs)
-        lost = jax.grad(dissipate, argnums=1)(q, dq, mode, 0.72 if mode == "stick" else 0.92) @ dq
-        return driven - lost
-
-    starts = np.flatnonzero(np.diff(path.times) == 0) + 1
-    pieces = np.split(np.arange(len(path.times)), starts)
-    assert len(pieces) == 5
-    for piece, mode in zip(pieces, sequence, strict=True):
-        assert modes[piece[0]] == mode
-        powers = np.asarray(jax.jit(jax.vmap(lambda q, dq, mode=mode: power(q, dq, mode)))(q[piece], dq[piece]))
-        work = scipy.interpolate.CubicSpline(path.times[piece], powers).integrate(*path.times[piece[[0, -1]]])
-        assert energy[piece[-1]] - energy[piece[0]] == pytest.approx(float(work), abs=1e-6 * np.abs(powers).max())
-    for k in starts:
-        lost = float(kinetic(MASSES, q[k], dq[k] - dq[k - 1]))
-        assert energy[k - 1] - energy[k] == pytest.approx(lost, abs=1e-10)
-
-
 # --- the bicycle ------------------------------------------------------------------------------------------------------
 
 CAR = {"m": 1500.0, "I_z": 2500.0, "a": 1.2, "b": 1.4, "C_f": 8e4, "C_r": 9e4, "mu": 0.6}
@@ -328,41 +287,3 @@ def test_a_vehicle_that_drives_when_the_command_comes_goes_on_as_it_drove(first)
     waits, moves = (evaluate(system.modes[name], x, p, u) for name in ("wait", first))
     np.testing.assert_array_equal(waits, [*moves[:3], 0.0, 0.0])
     assert abs(waits[2] - evaluate(system.modes[other], x, p, u)[2]) > 0.5
-
-
-# --- tyres ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("force", "shape", "peak", "slope"),
-    [
-        (
-            longitudinal_force,
-            1.65,
-            lambda F: -21.3 * F**2 + 1144 * F,
-            lambda F: (49.6 * F**2 + 226 * F) / np.exp(0.069 * F),
-        ),
-        (lateral_force, 1.30, lambda F: -22.1 * F**2 + 1011 * F, lambda F: 1078 * np.sin(1.82 * np.arctan(0.208 * F))),
-        (
-            compute_aligning_moment,
-            2.40,
-            lambda F: -2.72 * F**2 - 2.28 * F,
-            lambda F: (-1.86 * F**2 - 2.73 * F) / np.exp(0.110 * F),
-        ),
-    ],
-)
-def test_what_the_factors_of_the_magic_formula_mean(force, shape, peak, slope):
-    """D is the extreme value, BCD the slope at zero, and D sin(C pi / 2) the limit at large slip where E < 1."""
-    p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
-    slips = np.linspace(0.0, 60.0, 60001)
-
-    @jax.jit
-    def evaluate_at(load):
-        values = jax.vmap(lambda slip: force(slip, load, p))(jnp.asarray(slips))
-        return values, jax.grad(force)(0.0, load, p), force(1e9, load, p)
-
-    for load in (2.0, 4.0, 6.0):
-        values, stiffness, limit = map(np.asarray, evaluate_at(load))
-        assert values[np.argmax(np.abs(values))] == pytest.approx(peak(load), rel=1e-6)
-        assert float(stiffness) == pytest.approx(slope(load), rel=1e-12)
-        assert float(limit) == pytest.approx(peak(load) * np.sin(shape * np.pi / 2), rel=1e-6)

@@ -5,18 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
-from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
+from switchfit.models.magic_formula import MAGIC_FORMULA
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, LIGHT, PAGE, RED, Figure, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Parameter
-from switchfit.problem.functions import use_float64
 from switchfit.report.style import MODE_COLOURS
 from switchfit.uncertainty.certificate import identifiability
 
@@ -28,8 +25,6 @@ SECONDS = np.arange(16.0)
 ROUNDING = 1e-15
 #: Times (s) in which the wheels reach and lose their difference of speed, which the paper does not print.
 RAMPS = ((0.6, 0.6), (0.6, 1.5), (0.6, 2.5), (0.6, 3.4), (1.5, 3.4), (3.4, 3.4), (3.4, 0.6))
-#: Static load of a wheel (kN), and the part of it by which load transfer changes it in the comparison.
-LOAD, TRANSFER = 0.1962, 0.2
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
@@ -45,7 +40,6 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
         "fits": vehicle.fit_resticks(vehicle.gps_reference(SECONDS, positions), START, positions),
     }
     found["ramps"] = _ramps(say)
-    found["forces"] = {"static": _force_spectrum((LOAD,)), "transfer": _force_spectrum(_transfer_load())}
     found.update(_coefficients(speeds, say))
     return found
 
@@ -59,35 +53,6 @@ def _ramps(say: Say) -> list[Found]:
         fit = fit_locally(vehicle.stick_slip(vehicle.gps_reference(SECONDS, positions), START))
         lines.append({"rise": rise, "fall": fall, **vehicle.summary(fit)})
     return lines
-
-
-def _transfer_load() -> tuple[float, ...]:
-    return LOAD * (1 - TRANSFER), LOAD, LOAD * (1 + TRANSFER)
-
-
-def _force_spectrum(loads: tuple[float, ...]) -> list[float]:
-    """Return the singular values of the tyre forces' derivatives in the 16 coefficients, relative to their values.
-
-    A force at one load depends on the coefficients through D, BCD and E alone: three numbers per direction, six in all.
-    """
-    names = list(MAGIC_FORMULA)
-    with use_float64():
-        slips = jnp.linspace(0.5, 30.0, 40)
-
-        def forces(values: Any) -> Any:
-            p = dict(zip(names, values, strict=True))
-            found = [force(slips, load, p) for load in loads for force in (longitudinal_force, lateral_force)]
-            return jnp.concatenate(found)
-
-        values = jnp.asarray(list(MAGIC_FORMULA.values()))
-        derivative = np.asarray(jax.jacfwd(forces)(values))
-    size = np.array([abs(value) or 1.0 for value in MAGIC_FORMULA.values()])
-    return np.linalg.svd(derivative * size, compute_uv=False).tolist()
-
-
-def rank(singular_values: list[float]) -> int:
-    """Return the number of singular values above rounding."""
-    return int(np.sum(np.array(singular_values) > 1e-12 * singular_values[0]))
 
 
 def _coefficients(speeds: Any, say: Say) -> Found:
@@ -178,15 +143,6 @@ def rows(found: Found) -> list[Row]:
             f"eigenvalues {values[-1]:.1e} to below rounding; {found['undetermined']} of 16 combinations undetermined",
             f"positions at 10 Hz without noise, coefficients in units of their values; the identifiability analysis "
             f"(scaled Hessian) says of one that it cannot be seen: {found['worst'][0]}",
-        ),
-        Row(
-            "V-A 1: rank of the tyre forces in the 16 coefficients, at the static load",
-            "not done",
-            f"{rank(found['forces']['static'])} of 16; {rank(found['forces']['transfer'])} with loads of "
-            f"±{100 * TRANSFER:g} % beside it",
-            "at one load a force depends on its eight coefficients through D, BCD and E alone: the Hessian is singular "
-            f"for any data; singular values 6 and 7 are {found['forces']['static'][5]:.1e} and "
-            f"{found['forces']['static'][6]:.0e}, the largest {found['forces']['static'][0]:.1e}",
         ),
     ]
 
