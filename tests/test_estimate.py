@@ -36,40 +36,34 @@ GUESS = np.array([0.8, 1.5, 0.7])
 SIGMA = 0.01
 
 
-def voltage(times, tau=TRUTH[0], k=TRUTH[1:], start=0.0):
+def voltage(times, tau=TRUTH[0], k=TRUTH[1:]):
     """x(t) in closed form."""
-    at_tau = 1.0 - (1.0 - start) * np.exp(-k[0] * tau)
-    charged = 1.0 - (1.0 - start) * np.exp(-k[0] * times)
-    return np.where(times < tau, charged, at_tau * np.exp(-k[1] * (times - tau)))
+    at_tau = 1.0 - np.exp(-k[0] * tau)
+    return np.where(times < tau, 1.0 - np.exp(-k[0] * times), at_tau * np.exp(-k[1] * (times - tau)))
 
 
 def noise(seed, size=40):
     return SIGMA * np.random.default_rng(seed).normal(size=size)
 
 
-def run(values, *, tau=GUESS[0], sigma=SIGMA, start=None, name=None):
-    data = sf.Measurements(TIMES, values, sigma=sigma)
-    return sf.Experiment(data, ("charge", "discharge"), (tau,), 0.0, 2.0, initial_state=start, name=name)
+def run(values, tau=GUESS[0]):
+    return sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("charge", "discharge"), (tau,), 0.0, 2.0)
 
 
-def capacitor(values, *, k=None, sigma=SIGMA, tau=GUESS[0], **settings):
-    return sf.Problem(CAPACITOR, run(values, sigma=sigma, tau=tau), {"k": GUESS[1:] if k is None else k}, **settings)
-
-
-@cache
-def noisy_fit(sigma=SIGMA):
-    return sf.estimate(capacitor(voltage(TIMES) + noise(0), sigma=sigma))
+def capacitor(values, *, k=GUESS[1:], tau=GUESS[0], **settings):
+    return sf.Problem(CAPACITOR, run(values, tau), {"k": k}, **settings)
 
 
 def test_truth_from_noisy_samples():
-    found = noisy_fit()
+    problem = capacitor(voltage(TIMES) + noise(0))
+    found = sf.estimate(problem)
     assert found.status is sf.Status.CONVERGED
     assert found.optimality < 1e-7
     assert np.all(np.abs(found.theta - TRUTH) < 4 * found.standard_errors)
     assert 0.5 < found.residual_variance < 2.0
     assert np.all(found.standard_errors < 0.1)
     # Nothing that is reported is stale: it is all at theta.
-    at = sf.evaluate(capacitor(voltage(TIMES) + noise(0)), found.theta)
+    at = sf.evaluate(problem, found.theta)
     assert found.cost == pytest.approx(at.cost, rel=1e-12)
     np.testing.assert_allclose(found.gradient, at.gradient, rtol=0, atol=1e-7)
     np.testing.assert_allclose(found.hessian, at.hessian, rtol=1e-9)
@@ -79,29 +73,12 @@ def test_truth_from_noisy_samples():
     assert [record.iteration for record in found.history] == list(range(found.iterations + 1))
 
 
-def test_two_experiments_share_their_parameters():
-    """Each has its own transition time; together they know the parameters better than either alone."""
-    values = [voltage(TIMES) + noise(1), voltage(TIMES, 1.1, start=0.3) + noise(2)]
-    runs = [run(values[0], name="first"), run(values[1], start=[0.3], tau=1.3, name="second")]
-    both = sf.estimate(sf.Problem(CAPACITOR, runs, {"k": GUESS[1:]}))
-    assert both.success
-    assert both.theta_names == ("first.tau_1", "second.tau_1", "k[0]", "k[1]")
-    truth = np.array([0.63, 1.1, 2.0, 1.0])
-    assert np.all(np.abs(both.theta - truth) < 4 * both.standard_errors)
-    assert [len(times) for times in both.transition_times] == [1, 1]
-    assert len(both.trajectories) == len(both.comparisons) == 2
-    assert both.samples == 80
-    alone = sf.estimate(capacitor(values[0]))
-    assert np.all(both.standard_errors[2:] < alone.standard_errors[1:])
-
-
 def test_what_is_fixed_stays_and_is_not_in_theta():
     values = voltage(TIMES) + noise(3)
     k = sf.Parameter([2.0, 1.0], fixed=True)
     found = sf.estimate(capacitor(values, k=k))
     assert found.theta_names == ("tau_1",)
     assert found.parameters["k"].tolist() == [2.0, 1.0]
-    assert abs(found.theta[0] - TRUTH[0]) < 4 * found.standard_errors[0]
     held = sf.estimate(capacitor(values, tau=sf.Parameter(0.63, fixed=True)))
     assert held.theta_names == ("k[0]", "k[1]")
     assert held.transition_times[0].tolist() == [0.63]
@@ -179,10 +156,8 @@ def test_unknowns_that_trade_off_are_named():
     data = sf.Measurements(TIMES, values, sigma=SIGMA)
     found = sf.estimate(sf.Problem(system, sf.Experiment(data, ("decay",), (), 0.0, 2.0), {"a": 0.5, "b": 0.5}))
     assert found.status is sf.Status.SINGULAR
-    assert "flat to second order along" in found.message
-    assert "0.71 a" in found.message
-    assert "0.71 b" in found.message
-    assert "Fix one of them or add data" in found.message
+    for said in ("flat to second order along", "0.71 a", "0.71 b", "Fix one of them or add data"):
+        assert said in found.message
     assert found.success
     assert found.parameters["a"] + found.parameters["b"] == pytest.approx(1.4, abs=0.02)
     assert np.isnan(found.covariance).all()
@@ -202,15 +177,13 @@ def test_a_time_is_not_determined_if_the_others_gain_nothing_as_it_moves(slope, 
 # Scales
 
 
-def scaled_charge(t, x, p):
-    return p["k"][0] * p["unit"] * (1.0 - x)
-
-
-def scaled_discharge(t, x, p):
-    return -p["k"][1] * p["unit"] * x
-
-
-SCALED = sf.HybridSystem({"charge": scaled_charge, "discharge": scaled_discharge}, [0.0])
+SCALED = sf.HybridSystem(
+    {
+        "charge": lambda t, x, p: p["k"][0] * p["unit"] * (1.0 - x),
+        "discharge": lambda t, x, p: -p["k"][1] * p["unit"] * x,
+    },
+    [0.0],
+)
 
 
 def test_badly_scaled_unknowns_take_the_same_iterates():
@@ -234,7 +207,7 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
 # Ends
 
 
-def test_a_callback_that_returns_true_stops_the_fit():
+def test_a_callback_that_returns_true_and_ctrl_c_stop_the_fit_at_the_best_point_so_far():
     records = []
 
     def callback(record):
@@ -251,17 +224,14 @@ def test_a_callback_that_returns_true_stops_the_fit():
     assert f"Interrupted after {found.iterations} iteration" in found.message
     assert len(found.trajectory.times) > 40
 
-
-def test_ctrl_c_returns_the_best_point_so_far():
-    def callback(record):
+    def interrupt(record):
         if record.iteration == 2:
             raise KeyboardInterrupt
 
-    found = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=callback)
-    assert found.status is sf.Status.INTERRUPTED
-    assert found.iterations == 2
-    assert found.cost == min(record.cost for record in found.history)
-    assert found.cost < found.history[0].cost
+    interrupted = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=interrupt)
+    assert interrupted.status is sf.Status.INTERRUPTED
+    assert interrupted.iterations == 2
+    assert interrupted.cost == min(record.cost for record in interrupted.history) < interrupted.history[0].cost
 
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
@@ -314,18 +284,9 @@ def test_times_out_of_order_by_rounding_are_put_in_order():
         sf.estimate(problem, start=[tau, 2.0, 1.0])
     with pytest.raises(ValueError, match="must not decrease inside"):
         problem.check_theta([-1e-9, 2.0, 1.0])
-    two = sf.Problem(
-        CAPACITOR,
-        sf.Experiment(
-            sf.Measurements(TIMES, voltage(TIMES), sigma=SIGMA),
-            ("charge", "discharge", "charge", "discharge"),
-            (0.5, sf.Parameter(1.0, fixed=True), 1.5),
-            0.0,
-            2.0,
-        ),
-        {"k": GUESS[1:]},
-    )
-    theta = two.check_theta([1.0 + 4e-16, 1.0 - 4e-16, 2.0, 1.0])
+    data, held = sf.Measurements(TIMES, voltage(TIMES), sigma=SIGMA), sf.Parameter(1.0, fixed=True)
+    twice = sf.Experiment(data, ("charge", "discharge") * 2, (0.5, held, 1.5), 0.0, 2.0)
+    theta = sf.Problem(CAPACITOR, twice, {"k": GUESS[1:]}).check_theta([1.0 + 4e-16, 1.0 - 4e-16, 2.0, 1.0])
     np.testing.assert_array_equal(theta, [1.0, 1.0, 2.0, 1.0])
 
 
@@ -360,17 +321,11 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     np.testing.assert_allclose(found.theta[known], plain.theta, rtol=1e-6)
     np.testing.assert_allclose(found.standard_errors[known], plain.standard_errors, rtol=1e-4)
     assert "; mode 'drain' collapsed: strategy='thorough', or leave the mode out" in str(found.verdict)
-    assert "MODE COLLAPSED" in str(found)
-    text = found.report(full=True)
-    for said in (
-        "cost depends neither on where it would stand nor on what acts in it alone",
-        "Leave it out of mode_sequence",
-        "give min_duration",
-        "leak: acts only in modes",
-    ):
-        assert said in " ".join(text.split())
+    text = " ".join(found.report(full=True).split())
+    assert "cost depends neither on where it would stand nor on what acts in it alone" in text
+    assert "leak: acts only in modes" in text
     for unsaid in ("not identified", "Fix one of", "add data", "hardly determine", "NOT UNIQUE"):
-        assert unsaid not in " ".join(text.split())
+        assert unsaid not in text
     assert "because a mode has collapsed" in " ".join(str(found.identifiability).split())
 
 
@@ -424,15 +379,8 @@ def test_the_hessian_reported_is_exact_whatever_the_fit_worked_with(hessian, ite
 # Uncertainties
 
 
-def parabola(t, x, p):
-    return p["c"][0] + 2.0 * p["c"][1] * t + 0.0 * x
-
-
-def straight_fit(sigma, values, times):
-    """x = c0 t + c1 t^2: linear in its parameters."""
-    system = sf.HybridSystem({"m": parabola}, [0.0])
-    data = sf.Measurements(times, values, sigma=sigma)
-    return sf.estimate(sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 2.0), {"c": [0.0, 0.0]}))
+STRAIGHT = sf.HybridSystem({"m": lambda t, x, p: p["c"][0] + 2.0 * p["c"][1] * t + 0.0 * x}, [0.0])
+"""x = c0 t + c1 t^2: linear in its parameters."""
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["sigma known", "sigma unknown"])
@@ -446,7 +394,8 @@ def test_covariance_of_a_linear_model_in_closed_form(known):
     freedom = there.sum() - 2
     variance = (5 * SIGMA) ** 2 if known else squares / freedom
     covariance = variance * np.linalg.inv(design.T @ design)
-    found = straight_fit(5 * SIGMA if known else None, values, TIMES)
+    data = sf.Measurements(TIMES, values, sigma=5 * SIGMA if known else None)
+    found = sf.estimate(sf.Problem(STRAIGHT, sf.Experiment(data, ("m",), (), 0.0, 2.0), {"c": [0.0, 0.0]}))
     assert found.samples == 38
     np.testing.assert_allclose(found.theta, best, rtol=1e-9)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8)
@@ -473,10 +422,6 @@ def test_a_cost_without_noise_has_no_covariance():
 
 
 # The mesh
-
-
-def rate(i):
-    return lambda t, x, p: p["rates"][i] - 0.2 * x
 
 
 def follow(t, x, p):
@@ -512,19 +457,11 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     rough, fine = first(found.theta).cost, first.divide(32)(found.theta).cost
     assert abs(rough - fine) > 1e-3 * fine
     assert found.cost == pytest.approx(fine, rel=2e-5)
-    data = found.problem.experiments[0].data[0]
-
-    def residuals(k):
-        return (followed(data.times, k[0]) - data.values[:, 0]) / SIGMA
-
-    exact = scipy.optimize.least_squares(residuals, [7.0], xtol=1e-14)
+    times, values = found.comparisons[0][0].times, found.comparisons[0][0].measured[:, 0]
+    exact = scipy.optimize.least_squares(lambda k: (followed(times, k[0]) - values) / SIGMA, [7.0], xtol=1e-14)
     assert found.theta[0] == pytest.approx(exact.x[0], rel=1e-5)
-
-
-def test_iterations_are_numbered_on_after_the_mesh_was_refined():
-    history = refined_fit().history
-    assert [record.iteration for record in history] == list(range(len(history)))
-    assert np.all(np.diff([record.evaluations for record in history]) > 0)
+    assert [record.iteration for record in found.history] == list(range(len(found.history)))  # over all meshes
+    assert np.all(np.diff([record.evaluations for record in found.history]) > 0)
 
 
 # A tank that runs dry inside the last mode: the root of its level has no derivative there, whatever the mesh
