@@ -16,7 +16,6 @@ from switchfit.uncertainty.prediction import (
     build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
-    find_nearest,
 )
 
 SIGMA = 0.1
@@ -259,15 +258,6 @@ def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known(
         fit("linear").predict([9.0])
 
 
-def test_the_figure_of_a_forecast(fitted):
-    figure = fitted.predict(np.linspace(0.0, 9.0, 60)).plot(level=0.9)
-    (panel,) = figure.axes
-    assert panel.get_xlim()[1] >= 9.0
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert {"measured", "90 % prediction", "90 % confidence"} <= set(labels)
-    assert any(line.get_label() == "end of the data" for line in panel.lines)
-
-
 def test_bands_in_the_figure(fitted):
     panel, residuals = fitted.plot().axes
     assert len(panel.collections) == len(residuals.collections) == 2
@@ -277,10 +267,3 @@ def test_bands_in_the_figure(fitted):
     assert not replace(fitted, problem=None).plot().axes[0].collections
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 2"):
         fitted.plot(level=2)
-
-
-def test_the_nearest_sample():
-    samples = np.array([1.0, 2.0, 4.0])
-    times = np.array([0.0, 1.0, 1.4, 1.5, 1.6, 3.1, 4.0, 9.0])
-    assert find_nearest(samples, times).tolist() == [0, 0, 0, 0, 1, 2, 2, 2]
-    assert find_nearest(samples[:1], times).tolist() == [0] * 8

@@ -187,24 +187,19 @@ def test_a_traced_value_is_refused():
         jax.jit(lambda theta: as_array(theta, "theta"))(jnp.zeros(2))
 
 
-@pytest.mark.parametrize("given", [[1.0, 2.0], [], np.zeros((2, 2))])
-def test_a_number_is_one(given):
-    with pytest.raises(ValueError, match="tf must be a single number"):
-        as_number(given, "tf")
-
-
 # Missing samples
 
 
-def test_masked_values_of_measurements_are_missing():
-    values = np.ma.array([[1.0, 2.0], [3.0, 4.0]], mask=[[False, True], [False, False]])
-    data = sf.Measurements([0.0, 1.0], values)
-    np.testing.assert_array_equal(data.values, [[1.0, np.nan], [3.0, 4.0]])
-    assert data.count == 3
-    np.testing.assert_array_equal(sf.Measurements([0.0, 1.0], [np.ma.masked, 2.0]).values, [[np.nan], [2.0]])
-    np.testing.assert_array_equal(
-        sf.Measurements([0.0, 1.0], np.ma.array([1, 2], mask=[1, 0])).values, [[np.nan], [2.0]]
-    )
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (np.ma.array([[1.0, 2.0], [3.0, 4.0]], mask=[[0, 1], [0, 0]]), [[1.0, np.nan], [3.0, 4.0]]),
+        ([np.ma.masked, 2.0], [[np.nan], [2.0]]),
+        (np.ma.array([1, 2], mask=[1, 0]), [[np.nan], [2.0]]),
+    ],
+)
+def test_masked_values_of_measurements_are_missing(given, expected):
+    np.testing.assert_array_equal(sf.Measurements([0.0, 1.0], given).values, expected)
 
 
 def test_masked_values_of_a_reference_are_bridged():
@@ -259,7 +254,7 @@ def test_what_is_accepted_is_returned():
         (lambda: as_callable(lambda: None, "f", "a function", arguments=1), TypeError, "cannot be called with 1"),
         (lambda: as_callable(int, "f", "a function"), TypeError, "f must be a function; got the class int"),
         (lambda: as_path(None, "path"), TypeError, "path must be a path"),
-        (lambda: as_path(b"a", "path"), TypeError, "path must be a path"),
+        (lambda: as_number([1.0, 2.0], "tf"), ValueError, "tf must be a single number"),
         (lambda: as_path("", "path"), ValueError, "path must be a path"),
     ],
 )
@@ -321,29 +316,18 @@ def filtered(hz):
     ("build", "error", "said"),
     [
         (lambda: sf.estimate(None), TypeError, "problem must be an sf.Problem; several .*estimate_many.*NoneType"),
-        (lambda: sf.estimate([PROBLEM, PROBLEM]), TypeError, "problem must be an sf.Problem; .*; got list"),
-        (lambda: sf.estimate(PROBLEM, tolerance="1.0"), ValueError, "tolerance must be a number; got '1.0'"),
-        (lambda: sf.estimate(PROBLEM, max_iterations=5.0), TypeError, "max_iterations must be a whole number"),
         (lambda: sf.estimate(PROBLEM, callback=5), TypeError, r"must be a function callback\(record\); got int"),
         (lambda: sf.estimate(PROBLEM, start=[0.5, 9.0]), ValueError, "The start violates k at its upper bound 5"),
         (lambda: samples(sigma=""), ValueError, "sigma must not be empty"),
         (lambda: samples(sigma=1e-200), ValueError, r"sigma must not be so small that 1 / sigma\*\*2 is infinite"),
         (lambda: samples(delay=""), ValueError, "delay must not be empty"),
         (lambda: samples(values=TWO, names=("a", "a")), ValueError, "names must differ .*; got 'a' twice"),
-        (lambda: samples(values=TWO, names=("a", "")), ValueError, "names must not be empty"),
         (lambda: samples(sigma=1.0, loss="huber", loss_scale=1e200), ValueError, "loss_scale must have a square"),
         (lambda: run(mode_sequence=[["decay"], "decay"]), TypeError, "each of mode_sequence must be the name of a"),
-        (lambda: run(mode_sequence={"decay": 1, "b": 2}), TypeError, "mode_sequence must be a sequence of mode names"),
-        (lambda: run(name=""), ValueError, "name of an experiment must not be empty"),
-        (lambda: run(name=3), TypeError, "name of an experiment must be a string; got 3"),
         (lambda: run(t0=np.timedelta64(1, "s")), TypeError, "t0 must be a number; .*time differences .*not supported"),
-        (lambda: run(transition_times={0.5}), TypeError, "transition_times must be a sequence"),
         (lambda: run(parameter_map={"k": ""}), ValueError, "parameter_map must not be empty"),
         (lambda: sf.HybridSystem({"": decay}, [1.0]), ValueError, "mode names must not be empty"),
         (lambda: sf.HybridSystem({"d": decay}, [1, 2], state_names=("a", "a")), ValueError, "state_names must differ"),
-        (lambda: sf.HybridSystem({"d": decay}, [1], state_units=(1,)), TypeError, "of state_units must be a string"),
-        (lambda: sf.Problem(SYSTEM, run(), {"": 1.0}), ValueError, "parameter names must not be empty"),
-        (lambda: sf.Parameter(1.0, unit=None), TypeError, "Parameter unit must be a string; got None"),
         (lambda: sf.Normal(1.0, 1e-200), ValueError, r"Normal sd must not be so small that 1 / sd\*\*2 is infinite"),
         (lambda: filtered(1e308), ValueError, "lowpass_hz must not need more than 10000000 points, .*; got 1e.308 Hz"),
         (lambda: filtered(1e-12), ValueError, "lowpass_hz must be 7.*e-06 Hz or more"),
@@ -353,11 +337,8 @@ def filtered(hz):
             ValueError,
             "signal between the .* over",
         ),
-        (lambda: sf.monte_carlo(PROBLEM, 2, folder=5), TypeError, "folder must be a path"),
         (lambda: sf.monte_carlo(PROBLEM, 2, theta=[0.5, 1], noise=lambda *given: "x"), ValueError, "what noise.* 'x'"),
         (lambda: sf.estimate_many([PROBLEM, None]), TypeError, r"problems\[1\] must be an sf.Problem; got NoneType"),
-        (lambda: sf.evaluate(None), TypeError, "problem must be an sf.Problem; got NoneType"),
-        (lambda: sf.simulate(PROBLEM, experiment=None), TypeError, "experiment must be a whole number"),
     ],
 )
 def test_mistakes_are_told(build, error, said):
