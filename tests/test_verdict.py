@@ -14,9 +14,7 @@ import switchfit as sf
 from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
-from switchfit.optimize import Status
 from switchfit.report.sentences import format_share
-from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.answers import Doubt, Numbers, compare_with_sigma, find_doubts, find_levels
 from switchfit.uncertainty.residuals import correct_correlation
 
@@ -158,9 +156,7 @@ SITUATIONS = {
     "far from the data, sigma far too large": (
         2 + 0.1 * TIMES + WAVE, {"sigma": 10.0}, "doubtful", "little explained", "explains only 6 %",
     ),
-    "few values, most of it explained": (
-        0.5 * TIMES[::9] + 0.05 * WAVE[::9], FEW_TIMES, "good", "fits", "of the variance.",
-    ),
+    "few values": (0.5 * TIMES[::9] + 0.05 * WAVE[::9], FEW_TIMES, "good", "fits", "of the variance."),
     "few values, too little of it explained": (
         0.5 * TIMES[::9] + WAVE[::9], FEW_TIMES, "doubtful", "little explained", "explains only",
     ),
@@ -178,15 +174,8 @@ def test_situations(name):
     assert words in str(fit.verdict)
     assert str(fit.verdict).startswith(f"{level.capitalize()}: converged; one fit; ")
     assert fit.success == (level != "bad")
-
-
-def test_a_fit_to_its_noise_answers_three_questions():
-    fit = straight(LINE + noise(0.1), sigma=0.1)
-    assert [answer.kind for answer in fit.verdict.answers] == ["converged", "looked", "fits"]
-    assert fit.verdict.next_steps == ()
-    share = format_share(fit.verdict.reasons[0].figures["explained"])
-    said = f"the model explains {share} of the variance (chi² {2 * fit.cost:.3g} for 98 degrees of freedom)"
-    assert str(fit.verdict) == f"Good: converged; one fit; {said}, what is left is noise."
+    assert (fit.verdict.next_steps == ()) == (level == "good")
+    assert [answer.kind for answer in fit.verdict.answers][:2] == ["converged", "looked"]
 
 
 def test_an_estimated_sigma_confirms_no_fit():
@@ -266,8 +255,7 @@ def test_errors_of_correlated_residuals_are_corrected_and_the_naive_ones_stand_b
 
 
 def test_the_error_of_a_time_is_corrected_by_its_own_run():
-    times = np.linspace(0.1, 6.0, 60)
-    runs = []
+    times, runs = np.linspace(0.1, 6.0, 60), []
     for e, wave in enumerate((0.0, 0.05)):
         values = temperature(times, 3.0 + 0.01 * e, 2.0, 0.5) + wave * np.sin(2 * times) + noise(0.02, 60, seed=e)
         runs.append(sf.Experiment(sf.Measurements(times, values), ("on", "off"), (3.0,), 0.0, 6.0))
@@ -275,54 +263,10 @@ def test_the_error_of_a_time_is_corrected_by_its_own_run():
     factors = fit.corrected_standard_errors / fit.standard_errors
     assert factors[0] == 1.0
     assert factors[1] > 1.5
-    np.testing.assert_array_equal(factors[2:], factors[1])
+    np.testing.assert_allclose(factors[2:], factors[1], rtol=1e-14)
 
 
 # --- modes, bounds, directions, kinks ---------------------------------------------------------------------------------
-
-
-def heated(values, sequence=("on", "off"), guess=(4.0,), *, sigma=0.05, **parameters) -> sf.Estimate:
-    times = np.linspace(0.1, 9.9, 50)
-    run = sf.Experiment(sf.Measurements(times, values, sigma=sigma), sequence, guess, 0.0, 10.0)
-    return sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": 0.5} | parameters), strategy="local")
-
-
-HEATED = temperature(np.linspace(0.1, 9.9, 50), 4.03, 2.0, 0.5) + noise(0.05, 50, seed=2)
-
-
-def test_a_collapsed_mode_is_doubtful():
-    assert heated(HEATED).verdict.level == "good"
-    three = heated(HEATED + 0.2 * np.exp(-np.linspace(0, 10, 50)), ("on", "off", "on"), (4.0, 8.0), sigma=0.1)
-    assert three.status is Status.COLLAPSED or any(c.kind == "collapsed" for c in three.active)
-    assert three.verdict.level == "doubtful"
-    assert "a mode collapsed" in kinds(three)
-    assert steps(three)[0] == "next: more starts"
-
-
-def test_a_bound_that_holds_is_doubtful():
-    values = 2.0 + 0.5 * TIMES + noise(0.1)
-    held, free = straight(values, sigma=0.1, b=0.3, upper=0.49), straight(values, sigma=0.1, b=0.3, upper=0.6)
-    assert held.active
-    assert not free.active
-    assert free.verdict.level == "good"
-    assert held.verdict.level == "doubtful"
-    assert held.verdict.reasons[-1] == Issue("at bounds", ("b",))
-    assert "b at a bound" in str(held.verdict)
-
-
-def test_a_direction_that_the_data_do_not_determine_is_doubtful():
-    def product(t, x, p):
-        return jnp.stack([p["a"] * p["b"] * t])
-
-    def fit(observe):
-        values = (0.5 * TIMES + noise(0.1))[:, None]
-        return sf.estimate(curve(observe, TIMES, values, {"a": 0.7, "b": 0.7}, tf=10.0, sigma=0.1), strategy="local")
-
-    found = fit(product)
-    assert found.verdict.level == "doubtful"
-    assert kinds(found) == ["not determined"]
-    assert set(found.verdict.reasons[0].subjects) == {"a", "b"}
-    assert fit(line).verdict.level == "good"
 
 
 def test_a_kink_is_a_note_and_no_doubt():
@@ -500,13 +444,12 @@ def test_shares_are_never_rounded_up(share, text):
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_file_begins_with_the_verdict_and_a_loaded_estimate_has_it(tmp_path):
     for k, fit in enumerate((straight(TIMES + noise(0.1), sigma=0.1), straight(np.sin(TIMES), sigma=0.01))):
-        fit.save(tmp_path / f"{k}.json")
-        content = json.loads((tmp_path / f"{k}.json").read_text(encoding="utf-8"))
+        path = tmp_path / f"{k}.json"
+        fit.save(path)
+        content = json.loads(path.read_text(encoding="utf-8"))
         assert next(iter(content)) == "verdict"
-        assert next(iter(content["verdict"])) == "level"
-        assert content["verdict"]["level"] == fit.verdict.level
-        assert content["verdict"]["text"] == str(fit.verdict)
+        assert list(content["verdict"].items())[:2] == [("level", fit.verdict.level), ("text", str(fit.verdict))]
         assert [reason["kind"] for reason in content["verdict"]["reasons"]] == kinds(fit)
-        loaded = sf.Estimate.load(tmp_path / f"{k}.json")
+        loaded = sf.Estimate.load(path)
         assert loaded.verdict == fit.verdict
         assert loaded.success == fit.success == (k == 0)
