@@ -72,7 +72,7 @@ TESTS = {
     ],
     "report/html": ["html"],
     "runtime": ["progress", "save", "files", "threads", "bad_input"],
-    "strategy": ["validate", "strategy", "known_order", "beam", "validation", "compare", "starts", "final_time"],
+    "strategy": ["validate", "strategy", "known_order", "beam", "validation", "starts", "final_time"],
     "uncertainty": ["uncertainty", "profile", "prediction", "verdict"],
 }
 """What must notice the mistakes of each room: files of tests, one after the other until something does."""

@@ -396,7 +396,7 @@ def test_a_cost_without_data_is_judged_by_its_minimum():
 # --- known right and wrong ends ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["thermostat", "two-turns-anywhere"])
+@pytest.mark.parametrize("name", ["thermostat", pytest.param("two-turns-anywhere", marks=pytest.mark.slow)])
 def test_wrong_ends_are_never_good(name):
     """Nine tenths of those of two turns explain 99 % of positions that go over hundreds of metres."""
     case = build_case(name)
