@@ -102,6 +102,7 @@ def test_of_a_transition_time_with_kinks_at_the_samples(noisy_ramp):
 
         expected = [brentq(excess, *sorted((tau, tau + side * span))) for side in (-1, 1)]
         np.testing.assert_allclose(found.interval(level), expected, rtol=1e-6)
+    assert found.lower_cost is None
     inside = [t for t in TIMES if found.interval()[0] < t < found.interval()[1]]
     assert len(inside) > 1
     assert f"{len(inside)} sample times lie in the interval, where the slope of the profile may jump" in str(found)
