@@ -122,10 +122,3 @@ def test_default_tolerances_give_the_solution_to_1e_8():
     assert fit.success
     assert exact.success
     np.testing.assert_allclose(fit.theta, exact.theta, rtol=1e-8, atol=0)
-
-
-@pytest.mark.parametrize("begin", [1.0, 4.0, -50.0])
-def test_a_constrained_fit_does_not_depend_on_the_clock(begin):
-    fit = fit_locally(fastest_swing(begin))
-    assert fit.success
-    np.testing.assert_allclose(fit.theta - begin, swing().theta, atol=1e-7)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import jax.numpy as jnp
 import models
@@ -17,6 +18,7 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.result import termination_of
 from switchfit.fit.solution import REACH, _compute_reach, minimize_cost
 from switchfit.fit.trajectory import SimulatedProblem
+from switchfit.runtime.errors import Issue
 
 # A capacitor that is charged through one resistor and discharged through another one
 
@@ -36,40 +38,34 @@ GUESS = np.array([0.8, 1.5, 0.7])
 SIGMA = 0.01
 
 
-def voltage(times, tau=TRUTH[0], k=TRUTH[1:], start=0.0):
+def voltage(times, tau=TRUTH[0], k=TRUTH[1:]):
     """x(t) in closed form."""
-    at_tau = 1.0 - (1.0 - start) * np.exp(-k[0] * tau)
-    charged = 1.0 - (1.0 - start) * np.exp(-k[0] * times)
-    return np.where(times < tau, charged, at_tau * np.exp(-k[1] * (times - tau)))
+    at_tau = 1.0 - np.exp(-k[0] * tau)
+    return np.where(times < tau, 1.0 - np.exp(-k[0] * times), at_tau * np.exp(-k[1] * (times - tau)))
 
 
 def noise(seed, size=40):
     return SIGMA * np.random.default_rng(seed).normal(size=size)
 
 
-def run(values, *, tau=GUESS[0], sigma=SIGMA, start=None, name=None):
-    data = sf.Measurements(TIMES, values, sigma=sigma)
-    return sf.Experiment(data, ("charge", "discharge"), (tau,), 0.0, 2.0, initial_state=start, name=name)
+def run(values, tau=GUESS[0]):
+    return sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("charge", "discharge"), (tau,), 0.0, 2.0)
 
 
-def capacitor(values, *, k=None, sigma=SIGMA, tau=GUESS[0], **settings):
-    return sf.Problem(CAPACITOR, run(values, sigma=sigma, tau=tau), {"k": GUESS[1:] if k is None else k}, **settings)
-
-
-@cache
-def noisy_fit(sigma=SIGMA):
-    return sf.estimate(capacitor(voltage(TIMES) + noise(0), sigma=sigma))
+def capacitor(values, *, k=GUESS[1:], tau=GUESS[0], **settings):
+    return sf.Problem(CAPACITOR, run(values, tau), {"k": k}, **settings)
 
 
 def test_truth_from_noisy_samples():
-    found = noisy_fit()
+    problem = capacitor(voltage(TIMES) + noise(0))
+    found = sf.estimate(problem)
     assert found.status is sf.Status.CONVERGED
     assert found.optimality < 1e-7
     assert np.all(np.abs(found.theta - TRUTH) < 4 * found.standard_errors)
     assert 0.5 < found.residual_variance < 2.0
     assert np.all(found.standard_errors < 0.1)
     # Nothing that is reported is stale: it is all at theta.
-    at = sf.evaluate(capacitor(voltage(TIMES) + noise(0)), found.theta)
+    at = sf.evaluate(problem, found.theta)
     assert found.cost == pytest.approx(at.cost, rel=1e-12)
     np.testing.assert_allclose(found.gradient, at.gradient, rtol=0, atol=1e-7)
     np.testing.assert_allclose(found.hessian, at.hessian, rtol=1e-9)
@@ -77,35 +73,6 @@ def test_truth_from_noisy_samples():
     np.testing.assert_allclose(fitted, voltage(TIMES, found.theta[0], found.theta[1:]), rtol=0, atol=1e-8)
     assert found.history[-1].theta.tolist() == found.theta.tolist()
     assert [record.iteration for record in found.history] == list(range(found.iterations + 1))
-
-
-def test_two_experiments_share_their_parameters():
-    """Each has its own transition time; together they know the parameters better than either alone."""
-    values = [voltage(TIMES) + noise(1), voltage(TIMES, 1.1, start=0.3) + noise(2)]
-    runs = [run(values[0], name="first"), run(values[1], start=[0.3], tau=1.3, name="second")]
-    both = sf.estimate(sf.Problem(CAPACITOR, runs, {"k": GUESS[1:]}))
-    assert both.success
-    assert both.theta_names == ("first.tau_1", "second.tau_1", "k[0]", "k[1]")
-    truth = np.array([0.63, 1.1, 2.0, 1.0])
-    assert np.all(np.abs(both.theta - truth) < 4 * both.standard_errors)
-    assert [len(times) for times in both.transition_times] == [1, 1]
-    assert len(both.trajectories) == len(both.comparisons) == 2
-    assert both.samples == 80
-    alone = sf.estimate(capacitor(values[0]))
-    assert np.all(both.standard_errors[2:] < alone.standard_errors[1:])
-
-
-def test_what_is_fixed_stays_and_is_not_in_theta():
-    values = voltage(TIMES) + noise(3)
-    k = sf.Parameter([2.0, 1.0], fixed=True)
-    found = sf.estimate(capacitor(values, k=k))
-    assert found.theta_names == ("tau_1",)
-    assert found.parameters["k"].tolist() == [2.0, 1.0]
-    assert abs(found.theta[0] - TRUTH[0]) < 4 * found.standard_errors[0]
-    held = sf.estimate(capacitor(values, tau=sf.Parameter(0.63, fixed=True)))
-    assert held.theta_names == ("k[0]", "k[1]")
-    assert held.transition_times[0].tolist() == [0.63]
-    assert np.all(np.abs(held.theta - TRUTH[1:]) < 4 * held.standard_errors)
 
 
 def test_a_bound_that_is_reached_is_named():
@@ -116,7 +83,8 @@ def test_a_bound_that_is_reached_is_named():
     (active,) = found.active
     assert (active.kind, active.unknown, active.value) == ("upper bound", "k[0]", 1.6)
     assert active.multiplier == pytest.approx(-found.gradient[1], rel=1e-9)
-    assert str(active) == "k[0] at its upper bound 1.6"
+    assert found.verdict.reasons[-1] == Issue("at bounds", ("k[0]",))
+    assert "k[0] at a bound" in str(found.verdict)
     assert "k[0] at its upper bound 1.6" in found.message
     assert found.gradient[1] < -1.0
     np.testing.assert_allclose(found.gradient[[0, 2]], 0.0, atol=1e-7)
@@ -169,22 +137,18 @@ def test_a_fit_that_passes_samples_does_not_stop_at_them():
 # Unknowns that the data does not determine
 
 
-def sum_of_rates(t, x, p):
-    return -(p["a"] + p["b"]) * x
-
-
 def test_unknowns_that_trade_off_are_named():
     values = np.exp(-1.4 * TIMES) + noise(4)
-    system = sf.HybridSystem({"decay": sum_of_rates}, [1.0])
+    system = sf.HybridSystem({"decay": lambda t, x, p: -(p["a"] + p["b"]) * x}, [1.0])
     data = sf.Measurements(TIMES, values, sigma=SIGMA)
     found = sf.estimate(sf.Problem(system, sf.Experiment(data, ("decay",), (), 0.0, 2.0), {"a": 0.5, "b": 0.5}))
     assert found.status is sf.Status.SINGULAR
-    assert "flat to second order along" in found.message
-    assert "0.71 a" in found.message
-    assert "0.71 b" in found.message
-    assert "Fix one of them or add data" in found.message
+    for said in ("flat to second order along", "0.71 a", "0.71 b", "Fix one of them or add data"):
+        assert said in found.message
     assert found.success
     assert found.parameters["a"] + found.parameters["b"] == pytest.approx(1.4, abs=0.02)
+    (reason,) = found.verdict.reasons
+    assert (found.verdict.level, reason.kind, set(reason.subjects)) == ("doubtful", "not determined", {"a", "b"})
     assert np.isnan(found.covariance).all()
 
 
@@ -202,15 +166,10 @@ def test_a_time_is_not_determined_if_the_others_gain_nothing_as_it_moves(slope, 
 # Scales
 
 
-def scaled_charge(t, x, p):
-    return p["k"][0] * p["unit"] * (1.0 - x)
-
-
-def scaled_discharge(t, x, p):
-    return -p["k"][1] * p["unit"] * x
-
-
-SCALED = sf.HybridSystem({"charge": scaled_charge, "discharge": scaled_discharge}, [0.0])
+UNITS = {
+    "charge": lambda t, x, p: p["k"][0] * p["unit"] * (1.0 - x),
+    "discharge": lambda t, x, p: -p["k"][1] * p["unit"] * x,
+}
 
 
 def test_badly_scaled_unknowns_take_the_same_iterates():
@@ -219,7 +178,7 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
     histories = []
     for unit in (1.0, 1e6, 1e-6):
         parameters = {"k": GUESS[1:] / unit, "unit": sf.Parameter(unit, fixed=True)}
-        found = sf.estimate(sf.Problem(SCALED, run(values), parameters))
+        found = sf.estimate(sf.Problem(sf.HybridSystem(UNITS, [0.0]), run(values), parameters))
         assert found.success
         size = np.array([1.0, 1.0 / unit, 1.0 / unit])
         assert np.all(np.abs(found.theta / size - TRUTH) < 4 * found.standard_errors / size)
@@ -234,7 +193,7 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
 # Ends
 
 
-def test_a_callback_that_returns_true_stops_the_fit():
+def test_a_callback_that_returns_true_and_ctrl_c_stop_the_fit_at_the_best_point_so_far():
     records = []
 
     def callback(record):
@@ -251,17 +210,14 @@ def test_a_callback_that_returns_true_stops_the_fit():
     assert f"Interrupted after {found.iterations} iteration" in found.message
     assert len(found.trajectory.times) > 40
 
-
-def test_ctrl_c_returns_the_best_point_so_far():
-    def callback(record):
+    def interrupt(record):
         if record.iteration == 2:
             raise KeyboardInterrupt
 
-    found = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=callback)
-    assert found.status is sf.Status.INTERRUPTED
-    assert found.iterations == 2
-    assert found.cost == min(record.cost for record in found.history)
-    assert found.cost < found.history[0].cost
+    interrupted = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=interrupt)
+    assert interrupted.status is sf.Status.INTERRUPTED
+    assert interrupted.iterations == 2
+    assert interrupted.cost == min(record.cost for record in interrupted.history) < interrupted.history[0].cost
 
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
@@ -269,34 +225,28 @@ def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
     compare = SimulatedProblem.compare
     monkeypatch.setattr(SimulatedProblem, "compare", lambda self: simulated.append(self) or compare(self))
     fit = sf.estimate(capacitor(voltage(TIMES)))
+    assert fit.status.successful
     assert not simulated
-    shown = fit.trajectories
-    assert fit.trajectories is shown
-    assert type(shown) is tuple
+    assert fit.trajectories is fit.trajectories
     assert replace(fit, seconds=0.0).comparisons is fit.comparisons
     assert len(simulated) == 1
-    np.testing.assert_array_equal(fit.comparisons[0][0].times, TIMES)
     with pytest.raises(AttributeError, match="no attribute 'trajectorys'"):
         fit.trajectorys  # noqa: B018
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_budget_is_that_of_one_mesh():
     """The fit converges on the first mesh with its last iteration, and is resumed on a finer one all the same."""
     problem = refined_fit().problem
     first = evaluator_of(problem)
-    follower = Follower(first)
-    on_first = minimize_cost(first, problem.initial_theta, "auto", 1e-7, 200, follower=follower).iterations
+    on_first = minimize_cost(first, problem.initial_theta, "auto", 1e-7, 200, follower=Follower(first)).iterations
     found = sf.estimate(problem, max_iterations=on_first)
     assert found.success
     assert found.iterations == refined_fit().iterations > on_first
     np.testing.assert_array_equal(found.theta, refined_fit().theta)
-
-
-def test_a_fit_that_is_out_of_iterations_is_not_resumed_with_none_left():
-    found = sf.estimate(refined_fit().problem, max_iterations=1)
-    assert found.status is sf.Status.MAX_ITERATIONS
-    assert found.iterations == 1
-    assert "Stopped after 1 iteration with" in found.message
+    stopped = sf.estimate(problem, max_iterations=1)  # not resumed with none left
+    assert (stopped.status, stopped.iterations) == (sf.Status.MAX_ITERATIONS, 1)
+    assert "Stopped after 1 iteration with" in stopped.message
 
 
 def test_a_fit_that_is_out_of_iterations_on_a_finer_mesh_says_how_many_there_were():
@@ -314,33 +264,20 @@ def test_times_out_of_order_by_rounding_are_put_in_order():
         sf.estimate(problem, start=[tau, 2.0, 1.0])
     with pytest.raises(ValueError, match="must not decrease inside"):
         problem.check_theta([-1e-9, 2.0, 1.0])
-    two = sf.Problem(
-        CAPACITOR,
-        sf.Experiment(
-            sf.Measurements(TIMES, voltage(TIMES), sigma=SIGMA),
-            ("charge", "discharge", "charge", "discharge"),
-            (0.5, sf.Parameter(1.0, fixed=True), 1.5),
-            0.0,
-            2.0,
-        ),
-        {"k": GUESS[1:]},
-    )
-    theta = two.check_theta([1.0 + 4e-16, 1.0 - 4e-16, 2.0, 1.0])
+    data, held = sf.Measurements(TIMES, voltage(TIMES), sigma=SIGMA), sf.Parameter(1.0, fixed=True)
+    twice = sf.Experiment(data, ("charge", "discharge") * 2, (0.5, held, 1.5), 0.0, 2.0)
+    theta = sf.Problem(CAPACITOR, twice, {"k": GUESS[1:]}).check_theta([1.0 + 4e-16, 1.0 - 4e-16, 2.0, 1.0])
     np.testing.assert_array_equal(theta, [1.0, 1.0, 2.0, 1.0])
 
 
 # Modes that collapse
 
 
-def drain(t, x, p):
-    return 0.0 * x - p["leak"]
-
-
 def with_a_mode_too_many(sequence, times):
-    system = sf.HybridSystem({"charge": charge, "discharge": discharge, "drain": drain}, [0.0])
+    modes = {"charge": charge, "discharge": discharge, "drain": lambda t, x, p: 0.0 * x - p["leak"]}
     data = sf.Measurements(TIMES, voltage(TIMES) + noise(1), sigma=SIGMA)
     parameters = {"k": GUESS[1:], "leak": sf.Parameter(1.0, lower=0.1, upper=5.0)}
-    return sf.Problem(system, sf.Experiment(data, sequence, times, 0.0, 2.0), parameters)
+    return sf.Problem(sf.HybridSystem(modes, [0.0]), sf.Experiment(data, sequence, times, 0.0, 2.0), parameters)
 
 
 def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
@@ -360,17 +297,11 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     np.testing.assert_allclose(found.theta[known], plain.theta, rtol=1e-6)
     np.testing.assert_allclose(found.standard_errors[known], plain.standard_errors, rtol=1e-4)
     assert "; mode 'drain' collapsed: strategy='thorough', or leave the mode out" in str(found.verdict)
-    assert "MODE COLLAPSED" in str(found)
-    text = found.report(full=True)
-    for said in (
-        "cost depends neither on where it would stand nor on what acts in it alone",
-        "Leave it out of mode_sequence",
-        "give min_duration",
-        "leak: acts only in modes",
-    ):
-        assert said in " ".join(text.split())
+    text = " ".join(found.report(full=True).split())
+    assert "cost depends neither on where it would stand nor on what acts in it alone" in text
+    assert "leak: acts only in modes" in text
     for unsaid in ("not identified", "Fix one of", "add data", "hardly determine", "NOT UNIQUE"):
-        assert unsaid not in " ".join(text.split())
+        assert unsaid not in text
     assert "because a mode has collapsed" in " ".join(str(found.identifiability).split())
 
 
@@ -382,13 +313,8 @@ def test_a_parameter_that_acts_only_in_a_mode_that_collapsed_at_the_start_is_nam
     assert "mode 1 ('drain') has collapsed to nothing" in map(str, found.active)
 
 
-MET_EXACTLY = [
-    pytest.param(guess, rate, strategy, marks=[] if usual else pytest.mark.slow)
-    for strategy in ("auto", "local")
-    for rate in (0.8, 1.0)
-    for guess in ((2.0, 3.5, 3.6), (1.0, 2.0, 4.0), (2.0, 4.0, 5.0), (3.0, 3.2, 5.0))
-    for usual in [strategy == "local" or (rate, guess[0]) == (0.8, 1.0)]
-]
+GUESSES = ((2.0, 3.5, 3.6), (1.0, 2.0, 4.0), (2.0, 4.0, 5.0), (3.0, 3.2, 5.0))
+MET_EXACTLY = [*product(GUESSES, (0.8, 1.0), ("local",)), (GUESSES[1], 0.8, "auto")]
 
 
 @pytest.mark.parametrize(("guess", "rate", "strategy"), MET_EXACTLY)
@@ -424,15 +350,8 @@ def test_the_hessian_reported_is_exact_whatever_the_fit_worked_with(hessian, ite
 # Uncertainties
 
 
-def parabola(t, x, p):
-    return p["c"][0] + 2.0 * p["c"][1] * t + 0.0 * x
-
-
-def straight_fit(sigma, values, times):
-    """x = c0 t + c1 t^2: linear in its parameters."""
-    system = sf.HybridSystem({"m": parabola}, [0.0])
-    data = sf.Measurements(times, values, sigma=sigma)
-    return sf.estimate(sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 2.0), {"c": [0.0, 0.0]}))
+STRAIGHT = sf.HybridSystem({"m": lambda t, x, p: p["c"][0] + 2.0 * p["c"][1] * t + 0.0 * x}, [0.0])
+"""x = c0 t + c1 t^2: linear in its parameters."""
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["sigma known", "sigma unknown"])
@@ -446,7 +365,8 @@ def test_covariance_of_a_linear_model_in_closed_form(known):
     freedom = there.sum() - 2
     variance = (5 * SIGMA) ** 2 if known else squares / freedom
     covariance = variance * np.linalg.inv(design.T @ design)
-    found = straight_fit(5 * SIGMA if known else None, values, TIMES)
+    data = sf.Measurements(TIMES, values, sigma=5 * SIGMA if known else None)
+    found = sf.estimate(sf.Problem(STRAIGHT, sf.Experiment(data, ("m",), (), 0.0, 2.0), {"c": [0.0, 0.0]}))
     assert found.samples == 38
     np.testing.assert_allclose(found.theta, best, rtol=1e-9)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8)
@@ -473,10 +393,6 @@ def test_a_cost_without_noise_has_no_covariance():
 
 
 # The mesh
-
-
-def rate(i):
-    return lambda t, x, p: p["rates"][i] - 0.2 * x
 
 
 def follow(t, x, p):
@@ -512,19 +428,11 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     rough, fine = first(found.theta).cost, first.divide(32)(found.theta).cost
     assert abs(rough - fine) > 1e-3 * fine
     assert found.cost == pytest.approx(fine, rel=2e-5)
-    data = found.problem.experiments[0].data[0]
-
-    def residuals(k):
-        return (followed(data.times, k[0]) - data.values[:, 0]) / SIGMA
-
-    exact = scipy.optimize.least_squares(residuals, [7.0], xtol=1e-14)
+    times, values = found.comparisons[0][0].times, found.comparisons[0][0].measured[:, 0]
+    exact = scipy.optimize.least_squares(lambda k: (followed(times, k[0]) - values) / SIGMA, [7.0], xtol=1e-14)
     assert found.theta[0] == pytest.approx(exact.x[0], rel=1e-5)
-
-
-def test_iterations_are_numbered_on_after_the_mesh_was_refined():
-    history = refined_fit().history
-    assert [record.iteration for record in history] == list(range(len(history)))
-    assert np.all(np.diff([record.evaluations for record in history]) > 0)
+    assert [record.iteration for record in found.history] == list(range(len(found.history)))  # over all meshes
+    assert np.all(np.diff([record.evaluations for record in found.history]) > 0)
 
 
 # A tank that runs dry inside the last mode: the root of its level has no derivative there, whatever the mesh

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from models import STILL, VEHICLE_TRUTH, curve, drive, positions, rest
+from models import STILL, VEHICLE_TRUTH, curve, drive, positions
 from test_report import comparison_of, made, trajectory_of, warnings_of
 from test_report import write_report as report
 
 import switchfit as sf
+from benchmarks import vehicle_coverage
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import disagreement
+from switchfit.models import heater_problem, lugre
 from switchfit.optimize import Status
-from switchfit.uncertainty.certificate import Identifiability, analyse, certify
+from switchfit.uncertainty.certificate import LARGEST_GAP, Identifiability, analyse, certify, measure_derivative_gap
 from switchfit.uncertainty.residuals import correct_correlation, diagnose, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)
@@ -35,6 +37,11 @@ def decay(t, x, p):
 def noisy_decay(sigma, seed=0, **changes):
     values = np.exp(-0.5 * TIMES) + sigma * np.random.default_rng(seed).standard_normal(24)
     return observed(decay, values, {"a": 1.0, "k": 0.5}, sigma, **changes)
+
+
+def one_line(result) -> str:
+    """What is printed of a result, without its line breaks."""
+    return " ".join(str(result).split())
 
 
 # Covariances
@@ -58,36 +65,27 @@ def test_where_the_covariances_differ_the_report_says_so():
     near, far = sf.estimate(noisy_decay(0.01)), sf.estimate(noisy_decay(0.4, seed=3))
     assert disagreement(near).factor < 1.02
     assert "Gauss-Newton's are within" in str(near)
-    found = disagreement(far)
-    both = far.covariance, far.covariance_from("gauss-newton")
-    ratios = np.linalg.eigvals(np.linalg.solve(both[0], both[1])).real
-    assert found.factor == pytest.approx(np.sqrt(max(ratios.max(), 1 / ratios.min())), rel=1e-9)
-    assert found.factor > 1.2
+    ratios = np.linalg.eigvals(np.linalg.solve(far.covariance, far.covariance_from("gauss-newton"))).real
+    assert disagreement(far).factor == pytest.approx(np.sqrt(max(ratios.max(), 1 / ratios.min())), rel=1e-9)
+    assert disagreement(far).factor > 1.2
     assert any("Standard errors from the exact Hessian and from the Gauss-Newton" in w for w in warnings_of(far))
-    assert "Gauss-Newton's are within" not in str(far)
 
 
-@pytest.mark.parametrize("part", [4.0, 0.25])
+@pytest.mark.parametrize("part", [4.0, 0.25, 1e-8])
 def test_the_factor_between_the_covariances_goes_either_way(part):
-    hessian = np.diag([1.0, 4.0, 9.0])
-    found = disagreement(made(hessian=hessian, saved_gauss_newton=np.diag([1.0, part, 1.0]) @ hessian))
-    assert found.factor == pytest.approx(2.0, rel=1e-12)
-    assert (found.name, found.exact) == ("tau_2", pytest.approx(0.5, rel=1e-12))
-    assert found.gauss_newton == pytest.approx(0.5 / np.sqrt(part), rel=1e-12)
-
-
-def test_an_unknown_that_is_seen_to_second_order_only():
     hessian = np.diag([100.0, 400.0, 900.0])
-    fit = made(hessian=hessian, saved_gauss_newton=np.diag([1.0, 1e-8, 1.0]) @ hessian)
-    (warning,) = warnings_of(fit)
-    assert warning.startswith("To first order the fitted values hardly depend on tau_2: its standard errors")
-    assert "are 0.05 and 5e+02." in warning
+    fit = made(hessian=hessian, saved_gauss_newton=np.diag([1.0, part, 1.0]) @ hessian)
+    found = disagreement(fit)
+    assert found.factor == pytest.approx(max(part, 1 / part) ** 0.5, rel=1e-9)
+    assert (found.name, found.exact) == ("tau_2", pytest.approx(0.05, rel=1e-12))
+    assert found.gauss_newton == pytest.approx(0.05 / np.sqrt(part), rel=1e-12)
+    unseen = "To first order the fitted values hardly depend on tau_2: its standard errors"
+    assert (unseen in warnings_of(fit)[0]) == (part < 1e-4)
 
 
 def test_no_covariance_of_another_kind():
-    fit = sf.estimate(noisy_decay(0.1))
     with pytest.raises(ValueError, match="hessian must be 'exact', 'gauss-newton' or 'sandwich'; got 'fisher'"):
-        fit.covariance_from("fisher")
+        sf.estimate(noisy_decay(0.1)).covariance_from("fisher")
     with pytest.raises(ValueError, match="The Gauss-Newton matrix of this fit is not known"):
         made().covariance_from("gauss-newton")
     assert disagreement(made()) is None
@@ -110,8 +108,8 @@ def test_a_trade_off_in_words_with_its_size_and_what_was_found():
         assert direction.rises == pytest.approx((found.rise, found.rise), rel=1e-6)  # the model is linear
         assert found.rise == pytest.approx(0.5 * scipy.stats.chi2.ppf(0.95, 1), rel=1e-9)
         moved = f"a {abs(direction.change[0]):.2g} m {'higher' if direction.change[0] > 0 else 'lower'}"
-        assert moved in str(found)
-        assert "or the opposite, raises J by 1.9; noise hides 1.9 (95 %)" in str(found).replace("\n    ", " ")
+        assert moved in one_line(found)
+        assert "or the opposite, raises J by 1.9; noise hides 1.9 (95 %)" in one_line(found)
     evaluate = evaluator_of(problem)
     theta = sf.estimate(problem).theta
     rise = evaluate(theta + direction.change).cost - evaluate(theta).cost
@@ -123,19 +121,13 @@ def test_a_singular_hessian_and_unknowns_without_effect():
         return jnp.array([p["a"] * p["b"] * t + 0.0 * p["c"]])
 
     problem = observed(h, 2.0 * TIMES, {"a": 1.0, "b": 2.0, "c": 3.0}, 0.1)
-    before, after = sf.identifiability(problem), sf.identifiability(sf.estimate(problem))
-    for found in (before, after):
+    for found in (sf.identifiability(problem), sf.identifiability(sf.estimate(problem))):
         assert found.without == ("c",)
         assert found.undetermined == 2
         assert found.condition_number == np.inf
-        assert {"a", "b"} == set(found.directions[0].summary.removesuffix(" trade off").split(" and "))
-        assert "the cost does not depend on c" in str(found)
-        assert "do not determine one combination of the 3 unknowns" in str(found)
-
-
-def one_line(result) -> str:
-    """What is printed of a result, without its line breaks."""
-    return " ".join(str(result).split())
+        assert set(found.directions[0].names) == {"a", "b"}
+        assert "the cost does not depend on c" in one_line(found)
+        assert "do not determine one combination of the 3 unknowns" in one_line(found)
 
 
 def test_twenty_unknowns_over_eight_decades():
@@ -156,7 +148,6 @@ def test_twenty_unknowns_over_eight_decades():
     found = analyse(about, H, np.eye(d), theta, cost)
     np.testing.assert_allclose(found.eigenvalues[[0, -1]], [1e-4, 1.9999], rtol=1e-6)
     (direction,) = found.directions
-    assert set(direction.names) == {"p4", "p11"}
     assert set(direction.summary.removesuffix(" trade off").split(" and ")) == {"p4", "p11"}
     assert np.flatnonzero(np.abs(direction.weights) > 1e-6).tolist() == [4, 11]
     # No unknown moves by more than its own size, so that J rises by less than asked for.
@@ -199,14 +190,14 @@ def test_identifiability_of_what_is_neither():
 
 
 def test_before_a_fit_without_sigma_and_without_measurements():
-    data = sf.Measurements(TIMES, 0.0 * TIMES, observe=decay)
-    run = sf.Experiment(data, ("still",), (), 0.0, 6.0)
-    unknown = sf.identifiability(sf.Problem(STILL, run, {"a": 1.0, "k": 0.5}))
-    assert "a change of all that is measured by 1 % of how it varies does" in str(unknown).replace("\n    ", " ")
+    samples = sf.Measurements(TIMES, 0.0 * TIMES, observe=decay)
     signal = sf.ReferenceSignal.from_samples(TIMES, np.exp(-0.4 * TIMES), observe=decay)
-    run = sf.Experiment(signal, ("still",), (), 0.25, 6.0)
-    found = sf.identifiability(sf.Problem(STILL, run, {"a": 1.0, "k": 0.5}))
-    assert "1 % of J is" in str(found)
+    for data, t0, said in (
+        (samples, 0.0, "a change of all that is measured by 1 % of how it varies does"),
+        (signal, 0.25, "1 % of J is"),
+    ):
+        run = sf.Experiment(data, ("still",), (), t0, 6.0)
+        assert said in one_line(sf.identifiability(sf.Problem(STILL, run, {"a": 1.0, "k": 0.5})))
 
 
 # Residuals
@@ -236,20 +227,9 @@ def test_residuals_against_scipy_and_the_textbook():
     assert found.normal
 
 
-def test_the_tests_fail_as_often_as_they_say():
-    """Of white normal noise the probabilities are uniform: 10 % of them below 0.1."""
-    rng = np.random.default_rng(1)
-    found = [diagnose_channel(diagnostics_of(0.1 * rng.standard_normal(300)), 0) for _ in range(400)]
-    assert np.mean([c.whiteness < 0.1 for c in found]) == pytest.approx(0.1, abs=0.045)
-    assert np.mean([c.normality < 0.1 for c in found]) == pytest.approx(0.1, abs=0.045)
-
-
 def test_correlated_residuals_are_worth_fewer():
-    rng = np.random.default_rng(2)
-    noise = rng.standard_normal(2000)
-    residual = np.zeros(2000)
-    for k in range(1, 2000):
-        residual[k] = 0.6 * residual[k - 1] + 0.08 * noise[k]
+    shocks = 0.08 * np.random.default_rng(2).standard_normal(2000)
+    residual = scipy.signal.lfilter([1.0], [1.0, -0.6], shocks)
     found = diagnose_channel(diagnostics_of(residual), 0)
     assert not found.white
     assert found.correlation == pytest.approx(0.6, abs=0.05)
@@ -293,17 +273,7 @@ def test_outliers_are_told():
     assert any(w.startswith("The residuals are not normal in X (kurtosis") for w in warnings_of(fit))
 
 
-def test_residuals_as_text_and_as_a_figure():
-    fit = sf.estimate(noisy_decay(0.1))
-    text = str(fit.residuals)
-    assert text.splitlines()[0] == "Standardised residuals"
-    assert text.splitlines()[2].split()[0] == "y1"
-    figure = fit.plot_residuals()
-    assert [ax.get_title() for ax in figure.axes] == ["Residuals in time", "Autocorrelation", "Quantiles"]
-    assert [ax.get_xlabel() for ax in figure.axes] == ["time (s)", "lag (samples)", "normal quantile"]
-    assert figure.axes[0].get_ylabel() == "y1\nresidual / sigma"
-    assert all(ax.lines for ax in figure.axes)
-    figure.draw_without_rendering()
+def test_a_cost_without_measurements_has_no_residuals():
     cost = sf.TerminalCost(lambda x, p: (p["a"] - 1.0) ** 2)
     none = sf.estimate(sf.Problem(STILL, sf.Experiment(cost, ("still",), (), 0.0, 1.0), {"a": 2.0}))
     assert str(none.residuals) == "No residuals: the cost has no Measurements."
@@ -330,15 +300,18 @@ def test_a_good_certificate():
     assert str(certificate).splitlines()[-1].split() == ["verdict", "passed"]
 
 
-class WrongHessian(Evaluator):
-    """An evaluator whose Hessian is off by 1 %."""
+def shift_derivatives(monkeypatch, method, *, gradient=0.0, hessian=0.0):
+    """Make the derivatives of one method wrong by a share of each entry."""
+    right = Evaluator.__call__
 
-    def __call__(self, theta, side=1, method="auto", matrix="exact"):
-        found = super().__call__(theta, side, method, matrix)
-        return found if method == "adjoint" else Evaluation(found.cost, found.gradient, 1.01 * found.hessian)
+    def evaluate(self, theta, side=1, method_="auto", matrix="exact", **settings):
+        asked = settings.get("method", method_)
+        found = right(self, theta, side, asked, matrix)
+        if asked != method:
+            return found
+        return Evaluation(found.cost, found.gradient * (1 + gradient), found.hessian * (1 + hessian))
 
-    def divide(self, parts):
-        return WrongHessian(self.problem, meshes=super().divide(parts).meshes)
+    monkeypatch.setattr(Evaluator, "__call__", evaluate)
 
 
 @pytest.mark.parametrize(
@@ -361,14 +334,66 @@ def test_a_certificate_that_fails_is_the_first_line_of_the_report(changes, words
     assert words[:30] not in report(replace(fit, status=Status.MAX_ITERATIONS)).split("\n\n")[0]
 
 
-def test_a_wrong_hessian_fails_the_certificate_and_the_report_says_so():
+def test_a_wrong_hessian_fails_the_certificate_and_the_report_says_so(monkeypatch):
     fit = sf.estimate(noisy_decay(0.1))
-    certificate = certify(fit, WrongHessian(fit.problem))
-    assert any("the paper's equations differ from the derivatives of J" in str(f) for f in certificate.failures)
-    assert any("the Taylor orders are" in str(f) for f in certificate.failures)
+    shift_derivatives(monkeypatch, "auto", hessian=0.01)
+    certificate = certify(fit, Evaluator(fit.problem))
+    failures = " ".join(map(str, certificate.failures))
+    assert "the paper's equations differ from the derivatives of J" in failures
+    assert "the Taylor orders are" in failures
     assert "; the paper's equations differ from the derivatives of J" in " ".join(report(fit, certificate).split())
     assert report(fit, certificate).startswith("Doubtful: ")
     assert str(fit).startswith("Good: ")
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "said"),
+    [
+        ("adjoint", {"gradient": 1e-3}, "the paper's equations differ from the derivatives of J by 1.0e-03"),
+        ("adjoint", {"hessian": 1e-3}, "the paper's equations differ from the derivatives of J by 1.0e-03"),
+        ("adjoint", {"hessian": np.nan}, "the paper's equations differ from the derivatives of J by inf"),
+        ("auto", {"gradient": 1e-2}, "FAILED: the derivatives do not belong to the cost."),
+        ("auto", {"hessian": 1e-2}, "FAILED: the derivatives do not belong to the cost."),
+    ],
+)
+def test_wrong_derivatives_fail(monkeypatch, method, wrong, said):
+    """Those of the paper by a gap that does not close, and overflow is none that is unchecked; the others by Taylor."""
+    shift_derivatives(monkeypatch, method, **wrong)
+    check = sf.check_derivatives(heater_problem(), paper=method == "adjoint")
+    assert len(check.failures) == 1
+    assert said in str(check)
+
+
+@pytest.mark.slow
+def test_a_gap_of_unstable_adjoints_is_no_failure():
+    """Omega decays twice as fast as the state: at the longest steps that are stable for that, it is not."""
+    problem = vehicle_coverage.draw_log(vehicle_coverage.CASES["lugre, force"]())
+    check = sf.check_derivatives(problem)
+    assert measure_derivative_gap(Evaluator(problem), check.theta)[1] > 1e3
+    assert max(check.gradient_gap, check.hessian_gap) < LARGEST_GAP
+    assert check.passed, check
+
+
+def test_a_cost_that_is_not_finite_fails():
+    """A model that is defined at theta itself, and not a step beside it."""
+
+    def undefined(t, x, p):
+        return jnp.array([jnp.where(p["a"] == 1.0, 1.0, jnp.nan)])
+
+    check = sf.check_derivatives(observed(undefined, 0.0 * TIMES, {"a": 1.0}, 0.1), paper=False)
+    assert not check.passed
+    assert [issue.kind for issue in check.failures] == ["cost not finite"]
+
+
+def test_explicit_steps_that_blow_up_are_not_called_wrong_derivatives():
+    """LuGre friction with the published stiffness, which takes 20,000 explicit steps at the limit of stability."""
+    case = vehicle_coverage.CASES["lugre, spring"]()
+    system = lugre(k=2.0, sigma_0=1e5, sigma_1=np.sqrt(1e5), v_s=0.001)
+    problem = sf.Problem(system, case.problem.experiments, case.problem.parameters, solver="explicit")
+    check = sf.check_derivatives(problem, case.theta, paper=False)
+    assert [issue.kind for issue in check.failures] == ["cost not finite"]
+    assert "not finite at this theta or near it" in str(check)
+    assert "solver='stiff'" in str(check)
 
 
 # Coverage
@@ -398,14 +423,13 @@ def test_a_log_that_does_not_vary_has_a_report(sigma):
 # --- the sandwich covariance ------------------------------------------------------------------------------------------
 
 
-def location(values, loss="huber", scale=1.5, sigma=1.0, **settings):
+def location(values, loss="huber", sigma=1.0, m=0.1):
     """A fit of a constant m to values."""
     times = np.arange(1.0, len(values) + 1)
-    data = sf.Measurements(
-        times, values, observe=lambda t, x, p: p["m"] + 0 * x, sigma=sigma, loss=loss, loss_scale=scale, **settings
-    )
+    settings = {"loss": loss, "loss_scale": 1.5 if loss != "linear" else 1.0}
+    data = sf.Measurements(times, values, observe=lambda t, x, p: p["m"] + 0 * x, sigma=sigma, **settings)
     run = sf.Experiment(data, ("still",), (), 0.0, times[-1])
-    return sf.estimate(sf.Problem(sf.HybridSystem({"still": rest}, [0.0]), run, {"m": 0.1}), strategy="local")
+    return sf.estimate(sf.Problem(STILL, run, {"m": m}), strategy="local")
 
 
 @pytest.mark.parametrize("sigma", [1.0, 0.5])
@@ -419,7 +443,7 @@ def test_the_sandwich_of_a_location_in_closed_form(sigma):
     assert 30 < slope.sum() < 50
     expected = 50 / 49 * np.sum(psi**2) / np.sum(slope) ** 2 * sigma**2
     assert fit.covariance_from("sandwich") == pytest.approx(np.array([[expected]]), rel=1e-9)
-    assert "the robust loss as that of the noise: covariance_from('sandwich') does not" in " ".join(str(fit).split())
+    assert "the robust loss as that of the noise: covariance_from('sandwich') does not" in one_line(fit)
     half = scipy.stats.t.ppf(0.95, 49) * np.sqrt(expected)
     ends = fit.theta[0] + half * np.array([-1.0, 1.0])
     np.testing.assert_allclose(fit.confidence_intervals(0.9, hessian="sandwich"), [ends], rtol=1e-9)
@@ -444,29 +468,9 @@ def test_no_sandwich_without_the_gradients_of_the_samples(tmp_path):
     fit.save(tmp_path / "fit.json")
     with pytest.raises(ValueError, match="needs the gradient of each sample: fit the problem again"):
         sf.Estimate.load(tmp_path / "fit.json").covariance_from("sandwich")
-    times = np.arange(1.0, 31.0)
-    prior = sf.Parameter(0.1, prior=sf.Normal(0.0, 1.0))
-    data = sf.Measurements(times, np.zeros(30), observe=lambda t, x, p: p["m"] + 0 * x, sigma=1.0, loss="huber")
-    problem = sf.Problem(
-        sf.HybridSystem({"still": rest}, [0.0]), sf.Experiment(data, ("still",), (), 0.0, 30.0), {"m": prior}
-    )
-    with_prior = sf.estimate(problem, strategy="local")
+    with_prior = location(np.zeros(30), m=sf.Parameter(0.1, prior=sf.Normal(0.0, 1.0)))
     with pytest.raises(ValueError, match="needs a cost of Measurements alone, without guards"):
         with_prior.covariance_from("sandwich")
-    assert "They take the robust loss as that of the noise." in " ".join(str(with_prior).split())
+    assert "They take the robust loss as that of the noise." in one_line(with_prior)
     with pytest.raises(ValueError, match="needs more values than free unknowns; got 1 values for 1"):
         location(np.array([0.3])).covariance_from("sandwich")
-
-
-@pytest.mark.slow
-def test_intervals_by_the_sandwich_hold_the_truth_with_contaminated_noise():
-    """One sample in five has noise five times as large: 95 % intervals by the inverse Hessian hold it too seldom."""
-    rng = np.random.default_rng(3)
-    held = np.zeros(2)
-    for _ in range(1000):
-        fit = location(rng.standard_normal(60) * np.where(rng.random(60) < 0.2, 5.0, 1.0))
-        for k, kind in enumerate(("exact", "sandwich")):
-            low, high = fit.confidence_intervals(hessian=kind)[0]
-            held[k] += low < 0 < high
-    assert held[0] / 1000 < 0.93
-    assert 0.935 < held[1] / 1000 < 0.97

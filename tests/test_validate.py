@@ -1,139 +1,131 @@
-"""Validation on another run: closed forms of linear regression, the error of the parameters counted."""
+"""Validation on another run and comparison of models, in closed form of linear regression."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
+import scipy.signal
 import scipy.stats
 
 import switchfit as sf
 from switchfit.io.command_line import summarize_validation
 from switchfit.models import heater_problem
+from switchfit.problem.data import robust
 from switchfit.report.formats import format_rounded
+from switchfit.strategy.comparison import compute_log_norm
 from switchfit.strategy.validation import correlate
 
 SIGMA = 0.3
 TRAIN, TEST = np.array([0.5, 1.0, 1.7, 2.2, 3.0, 3.9]), np.linspace(0.2, 4.5, 31)
-PARABOLA = sf.HybridSystem({"m": lambda t, x, p: p["a"] + p["b"] * t + 0.0 * x}, [0.0], state_names=("x",))
+TIMES = np.linspace(0.3, 4.0, 12)
+POWERS = sf.HybridSystem(
+    {"m": lambda t, x, p: p["a"] + p["b"] * t + p["c"] * t**2 + 0.0 * x}, [0.0], state_names=("x",)
+)
 
 
-def design(times):
-    """x = a t + b t^2 / 2."""
-    return np.stack([times, times**2 / 2], axis=1)
+def design(times, count=2):
+    """x = a t + b t^2 / 2 + c t^3 / 3."""
+    return np.stack([times ** (k + 1) / (k + 1) for k in range(count)], axis=1)
 
 
 def values(times, seed, shift=0.0):
     return shift + design(times) @ [1.2, -0.4] + SIGMA * np.random.default_rng(seed).standard_normal(len(times))
 
 
-def run(times, y, sigma=SIGMA, **settings):
-    return sf.Experiment(sf.Measurements(times, y, sigma=sigma, names=("x",)), ("m",), (), 0.0, 5.0, **settings)
+def run(times, y, sigma=SIGMA, names=("x",), initial_state=None, **settings):
+    data = sf.Measurements(times, y, sigma=sigma, names=names, **settings)
+    return sf.Experiment(data, ("m",), (), 0.0, 5.0, initial_state=initial_state)
+
+
+def pose(runs, count=2, **parameters):
+    """A polynomial with so many coefficients; the others are 0."""
+    powers = {name: sf.Parameter(0.0, fixed=k >= count) for k, name in enumerate("abc")}
+    return sf.Problem(POWERS, runs, powers | parameters)
 
 
 def fit_line(sigma=SIGMA, seed=0):
-    return sf.estimate(sf.Problem(PARABOLA, run(TRAIN, values(TRAIN, seed), sigma), {"a": 1.0, "b": 0.0}))
+    return sf.estimate(pose(run(TRAIN, values(TRAIN, seed), sigma)))
 
 
 def by_hand(seed=0):
-    """Estimates of the parameters and their covariance over sigma^2."""
-    X = design(TRAIN)
-    return np.linalg.lstsq(X, values(TRAIN, seed), rcond=None)[0], np.linalg.inv(X.T @ X)
+    """Estimates of the parameters, their covariance over sigma^2, and the residual variance."""
+    X, y = design(TRAIN), values(TRAIN, seed)
+    p, (squares,), *_ = np.linalg.lstsq(X, y, rcond=None)
+    return p, np.linalg.inv(X.T @ X), squares / (len(y) - 2)
 
 
-def test_chi_square_in_closed_form_with_sigma_known():
-    fit, y = fit_line(seed=5), values(TEST, 1)
-    found = fit.validate(run(TEST, y))
-    p, C = by_hand(seed=5)
-    r, X = y - design(TEST) @ p, design(TEST)
-    expected = r @ np.linalg.solve(SIGMA**2 * (np.eye(len(TEST)) + X @ C @ X.T), r)
+@pytest.mark.parametrize("known", [True, False], ids=["sigma known", "sigma unknown"])
+def test_the_test_of_the_residuals_in_closed_form(known):
+    """Chi-square where sigma is known, Fisher's F where it is that of the residuals of the fit."""
+    fit, y = fit_line(SIGMA if known else None, seed=5), values(TEST, 1)
+    found = fit.validate(run(TEST, y, SIGMA if known else None))
+    p, C, variance = by_hand(seed=5)
+    variance = SIGMA**2 if known else variance
+    r, X, n = y - design(TEST) @ p, design(TEST), len(TEST)
+    expected = r @ np.linalg.solve(variance * (np.eye(n) + X @ C @ X.T), r)
     assert found.chi_square == pytest.approx(expected, rel=1e-6)
-    assert found.freedom == len(TEST)
-    assert found.probability == pytest.approx(scipy.stats.chi2.sf(expected, len(TEST)), rel=1e-5)
-    naive = r @ r / SIGMA**2
-    assert naive > 1.2 * expected, "otherwise the error of the parameters would not matter in this test"
-    np.testing.assert_allclose(found.covariance, SIGMA**2 * C, rtol=1e-6)
+    assert found.freedom == n
+    probability = scipy.stats.chi2.sf(expected, n) if known else scipy.stats.f.sf(expected / n, n, len(TRAIN) - 2)
+    assert found.probability == pytest.approx(probability, rel=1e-5)
+    assert r @ r / variance > 1.2 * expected, "otherwise the error of the parameters would not matter in this test"
+    np.testing.assert_allclose(found.covariance, variance * C, rtol=1e-6)
     assert found.refit is None
     assert found.kept == ("a", "b")
     mean = y.mean()
     assert found.percent == pytest.approx(100 * (1 - np.linalg.norm(r) / np.linalg.norm(y - mean)), rel=1e-6)
     assert found.explained == pytest.approx(1 - r @ r / np.sum((y - mean) ** 2), rel=1e-6)
     assert found.channels == {"x": pytest.approx(found.percent)}
+    (prediction,) = found.predictions
+    X = design(prediction.times)
+    bands = np.sqrt(np.einsum("ki,ij,kj->k", X, variance * C, X))
+    np.testing.assert_allclose(prediction.output_errors[:, 0], bands, rtol=1e-5, atol=1e-12)
 
 
 def test_the_table_allows_for_correlated_residuals():
     """Of the fit: its parameters' errors are as wide as in its own table."""
     times = np.linspace(0.0, 5.0, 201)[1:]
-    red = SIGMA * np.random.default_rng(4).standard_normal(200)
-    for i in range(1, 200):
-        red[i] += 0.8 * red[i - 1]
-    y = design(times) @ [1.2, -0.4] + red
-    fit = sf.estimate(sf.Problem(PARABOLA, run(times, y, None), {"a": 1.0, "b": 0.0}))
+    red = scipy.signal.lfilter([1.0], [1.0, -0.8], SIGMA * np.random.default_rng(4).standard_normal(200))
+    fit = sf.estimate(pose(run(times, design(times) @ [1.2, -0.4] + red, None)))
     found = fit.validate(run(TEST, values(TEST, 1), None))
     np.testing.assert_allclose(found.corrected_standard_errors, fit.corrected_standard_errors, rtol=1e-6)
     np.testing.assert_allclose(found.standard_errors, fit.standard_errors, rtol=1e-6)
     assert np.all(found.corrected_standard_errors > 1.5 * found.standard_errors)
-    for k, value in enumerate(found.theta):
-        assert format_rounded(value, found.corrected_standard_errors[k])[1] in str(found)
-        assert format_rounded(value, found.standard_errors[k])[1] not in str(found)
-    said = "Standard errors allow for the correlation of the residuals."
-    assert said in str(found)
+    for value, error in zip(found.theta, found.corrected_standard_errors, strict=True):
+        assert format_rounded(value, error)[1] in str(found)
     written = [entry["standard_error"] for entry in summarize_validation(found)["unknowns"]]
     np.testing.assert_array_equal(written, found.corrected_standard_errors)
+    said = "Standard errors allow for the correlation of the residuals."
+    assert said in str(found)
     assert said not in str(fit_line().validate(run(TEST, values(TEST, 1))))
 
 
-def test_f_test_in_closed_form_with_sigma_unknown():
-    fit, y = fit_line(sigma=None), values(TEST, 1)
-    found = fit.validate(run(TEST, y, None))
-    p, C = by_hand()
-    s2 = np.sum((values(TRAIN, 0) - design(TRAIN) @ p) ** 2) / (len(TRAIN) - 2)
-    r, X = y - design(TEST) @ p, design(TEST)
-    expected = r @ np.linalg.solve(np.eye(len(TEST)) + X @ C @ X.T, r) / s2
-    assert found.chi_square == pytest.approx(expected, rel=1e-6)
-    probability = scipy.stats.f.sf(expected / len(TEST), len(TEST), len(TRAIN) - 2)
-    assert found.probability == pytest.approx(probability, rel=1e-5)
+@pytest.mark.parametrize("prior", [None, sf.Normal(0.5, 0.1)], ids=["no prior", "prior"])
+def test_own_unknowns_are_estimated_and_cost_a_degree_of_freedom(prior):
+    """The initial state of the other run: chi-square is that of generalized least squares, which does not use M.
 
-
-def test_own_unknowns_are_estimated_and_cost_a_degree_of_freedom():
-    """The initial state of the other run: chi-square is that of generalized least squares, which does not use M."""
-    fit, y = fit_line(), values(TEST, 2, shift=0.8)
-    found = fit.validate(run(TEST, y, initial_state=[sf.Parameter(0.0)]))
-    p, C = by_hand()
-    r, X, G = y - design(TEST) @ p, design(TEST), np.ones((len(TEST), 1))
-    W = np.linalg.inv(SIGMA**2 * (np.eye(len(TEST)) + X @ C @ X.T))
-    expected = r @ (W - W @ G @ np.linalg.inv(G.T @ W @ G) @ G.T @ W) @ r
+    A prior counts as a measurement.
+    """
+    fit, y, n = fit_line(), values(TEST, 2, shift=0.8), len(TEST)
+    found = fit.validate(run(TEST, y, initial_state=[sf.Parameter(0.0, prior=prior)]))
+    p, C, _ = by_hand()
+    r, X, G = y - design(TEST) @ p, design(TEST), np.ones((n, 1))
+    if prior is None:
+        Z, z, H = X / SIGMA, r / SIGMA, G / SIGMA
+    else:
+        Z, z, H = np.vstack([X / SIGMA, np.zeros(2)]), np.append(r / SIGMA, 5.0), np.vstack([G / SIGMA, [10.0]])
+    W = np.linalg.inv(np.eye(len(z)) + Z @ (SIGMA**2 * C) @ Z.T)
+    expected = z @ (W - W @ H @ np.linalg.inv(H.T @ W @ H) @ H.T @ W) @ z
     assert found.chi_square == pytest.approx(expected, rel=1e-6)
-    assert found.freedom == len(TEST) - 1
+    assert found.freedom == len(z) - 1
     assert found.theta_names == ("a", "b", "x(t0)")
-    assert found.theta[2] == pytest.approx(r.mean(), rel=1e-6)
     np.testing.assert_allclose(found.theta[:2], p, rtol=1e-6)
-    u = X.mean(axis=0)  # x(t0) = mean (y - X p), so that it follows dp by -u
-    variance = SIGMA**2 * (1 / len(TEST) + u @ C @ u)
-    assert found.covariance[2, 2] == pytest.approx(variance, rel=1e-6)
-    np.testing.assert_allclose(found.covariance[2, :2], -(SIGMA**2) * u @ C, rtol=1e-6)
-
-
-def test_a_prior_of_an_own_unknown_counts_as_a_measurement():
-    fit, y = fit_line(), values(TEST, 2, shift=0.8)
-    start = sf.Parameter(0.0, prior=sf.Normal(0.5, 0.1))
-    found = fit.validate(run(TEST, y, initial_state=[start]))
-    p, C = by_hand()
-    X = np.vstack([design(TEST) / SIGMA, np.zeros(2)])
-    r, G = np.append((y - design(TEST) @ p) / SIGMA, 5.0), np.append(np.full(len(TEST), 1 / SIGMA), 10.0)[:, None]
-    W = np.linalg.inv(np.eye(len(r)) + X @ (SIGMA**2 * C) @ X.T)
-    expected = r @ (W - W @ G @ np.linalg.inv(G.T @ W @ G) @ G.T @ W) @ r
-    assert found.chi_square == pytest.approx(expected, rel=1e-6)
-    assert found.freedom == len(TEST)
-
-
-def test_bands_of_another_run():
-    fit = fit_line()
-    found = fit.validate(run(TEST, values(TEST, 1)))
-    (prediction,) = found.predictions
-    X = design(prediction.times)
-    expected = np.sqrt(np.einsum("ki,ij,kj->k", X, SIGMA**2 * by_hand()[1], X))
-    np.testing.assert_allclose(prediction.output_errors[:, 0], expected, rtol=1e-5, atol=1e-12)
+    if prior is None:
+        assert found.theta[2] == pytest.approx(r.mean(), rel=1e-6)
+        u = X.mean(axis=0)  # x(t0) = mean (y - X p), so that it follows dp by -u
+        assert found.covariance[2, 2] == pytest.approx(SIGMA**2 * (1 / n + u @ C @ u), rel=1e-6)
+        np.testing.assert_allclose(found.covariance[2, :2], -(SIGMA**2) * u @ C, rtol=1e-6)
 
 
 def test_residuals_are_tested_without_the_error_of_the_parameters_that_they_share():
@@ -167,64 +159,54 @@ def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay
     assert "Estimated from this run\n  tau_1" in str(found)
     held = fit.validate(sf.Measurements(times, y), refit=())
     assert held.theta[0] == fit.theta[0]
-    assert held.refit is None
-    assert held.verdict.level == "bad"
+    assert (held.refit, held.freedom, held.verdict.level) == (None, 20, "bad")
     assert "predicts" not in {reason.kind for reason in held.verdict.reasons}
-    assert held.freedom == 20
-    found.plot().draw_without_rendering()
+
+
+def calibrated(t, x, p):
+    return p["gain"][0] * x + p["gain"][1]
 
 
 def test_a_problem_brings_parameters_of_its_own():
-    """Another offset of the sensor, which the fit has not."""
-    fit = fit_line()
-
-    def observe(t, x, p):
-        return x + p["offset"]
-
-    data = sf.Measurements(TEST, values(TEST, 3, shift=0.5), observe=observe, sigma=SIGMA)
-    parameters = {"a": 0.0, "b": 0.0, "offset": 0.0}
-    other = sf.Problem(PARABOLA, sf.Experiment(data, ("m",), (), 0.0, 5.0), parameters)
+    """Another scale and offset of the sensor, which the fit has not; they are refitted as a whole."""
+    fit, y = fit_line(), values(TEST, 3, shift=0.5)
+    other = pose(run(TEST, y, observe=calibrated), gain=[1.0, 0.0])
     found = fit.validate(other)
     np.testing.assert_allclose(found.theta[:2], fit.theta, rtol=1e-12)
-    r = values(TEST, 3, shift=0.5) - design(TEST) @ by_hand()[0]
-    assert found.theta[2] == pytest.approx(r.mean(), rel=1e-5)
-    assert fit.validate(other, refit=()).theta[2] == 0.0
-    assert fit.validate(other, refit=("offset",)).theta[2] == found.theta[2]
+    predicted = np.stack([design(TEST) @ by_hand()[0], np.ones(len(TEST))], axis=1)
+    np.testing.assert_allclose(found.theta[2:], np.linalg.lstsq(predicted, y, rcond=None)[0], rtol=1e-5)
+    assert found.freedom == len(TEST) - 2
+    np.testing.assert_array_equal(fit.validate(other, refit=()).theta[2:], [1.0, 0.0])
+    np.testing.assert_array_equal(fit.validate(other, refit=("gain[0]", "gain[1]")).theta, found.theta)
+    with pytest.raises(ValueError, match="the entries of 'gain' are estimated all together, or none of them"):
+        fit.validate(other, refit=("gain[0]",))
 
 
-def test_a_log_is_read_by_the_names_of_the_channels(tmp_path):
+def test_a_log_is_read_by_the_names_of_the_channels():
     fit, y = fit_line(), values(TEST, 1)
-    lines = ["t [s],x [m],other", *(f"{t},{v},0" for t, v in zip(TEST.tolist(), y.tolist(), strict=True))]
-    (tmp_path / "log.csv").write_text("\n".join(lines))
-    found = fit.validate(sf.read_log(tmp_path / "log.csv"))
-    assert found.chi_square == pytest.approx(fit.validate(run(TEST, y)).chi_square, rel=1e-6)
-    (tmp_path / "wrong.csv").write_text("\n".join(["t [s],y [m]", *lines[1:][:0], "0,1", "1,2"]))
+    log = sf.Log(TEST, {"x": y, "other": 0.0 * y}, {}, "s", "log")
+    assert fit.validate(log).chi_square == pytest.approx(fit.validate(run(TEST, y)).chi_square, rel=1e-6)
     with pytest.raises(ValueError, match="the log has no column x; it has y"):
-        fit.validate(sf.read_log(tmp_path / "wrong.csv"))
+        fit.validate(sf.Log(TEST, {"y": y}, {}, "s", "log"))
+    with pytest.raises(ValueError, match="the channels of the fit have no names"):
+        sf.estimate(pose(run(TRAIN, values(TRAIN, 0), names=None))).validate(log)
 
 
 def driven(missing):
     """A fit and another run of a system with an input, which the model may miss in part."""
+    system = sf.HybridSystem({"m": lambda t, x, p, u: p["a"] * u - x}, [0.0])
+    times, knots, rng = np.linspace(0.1, 20.0, 200), np.arange(0.0, 20.0, 0.5), np.random.default_rng(0)
 
-    def mode(t, x, p, u):
-        return p["a"] * u - x
+    def build(y, u, a):
+        data = sf.Measurements(times, y, sigma=0.05)
+        return sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 20.0, inputs=sf.Input(knots, u)), {"a": a})
 
-    times = np.linspace(0.1, 20.0, 200)
-    rng = np.random.default_rng(0)
     problems = []
     for seed in (1, 2):
-        knots = np.arange(0.0, 20.0, 0.5)
         u = np.random.default_rng(seed).standard_normal(len(knots))
-        inputs = sf.Input(knots, u)
-        system = sf.HybridSystem({"m": mode}, [0.0])
-        data = sf.Measurements(times, np.zeros(200), sigma=0.05)
-        path = sf.simulate(
-            sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 20.0, inputs=inputs), {"a": 1.0}), [1.0]
-        )
-        y = np.interp(times, path.times, path.states[:, 0]) + 0.05 * rng.standard_normal(200)
+        y = sf.simulate(build(np.zeros(200), u, 1.0), times=times).states[:, 0] + 0.05 * rng.standard_normal(200)
         y += missing * u[np.clip((times / 0.5).astype(int), 0, len(u) - 1)]
-        data = sf.Measurements(times, y, sigma=0.05)
-        problems.append(sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 20.0, inputs=inputs), {"a": 0.8}))
+        problems.append(build(y, u, 0.8))
     return sf.estimate(problems[0]), problems[1]
 
 
@@ -259,7 +241,7 @@ def test_the_test_of_inputs_is_that_of_a_regression():
 
 def test_without_a_noise_level_there_is_no_chi_square():
     fit = fit_line()
-    found = fit.validate(sf.Problem(PARABOLA, run(TEST, values(TEST, 1), None), {"a": 1.0, "b": 0.0}))
+    found = fit.validate(pose(run(TEST, values(TEST, 1), None)))
     assert np.isnan(found.chi_square)
     assert found.predictions == ()
     r = values(TEST, 1) - design(TEST) @ by_hand()[0]
@@ -269,53 +251,38 @@ def test_without_a_noise_level_there_is_no_chi_square():
 
 
 def test_what_cannot_be_validated():
-    fit = fit_line()
-    with pytest.raises(TypeError, match=r"validate needs another run: an sf.Experiment.*got 3"):
-        fit.validate(3)
-    with pytest.raises(ValueError, match=r"refit names 'b', which is no unknown of the other run's own; these are"):
-        fit.validate(run(TEST, values(TEST, 1), initial_state=[sf.Parameter(0.0)]), refit=("b",))
+    fit, y = fit_line(), values(TEST, 1)
+    data = sf.Measurements(TEST, y)
     two = sf.Measurements(TEST, np.zeros((len(TEST), 2)), observe=lambda t, x, p: jnp.stack([x[0], x[0]]))
-    with pytest.raises(ValueError, match="of the fit have 1 channels, those of the other run 2"):
-        fit.validate(two)
-    with pytest.raises(ValueError, match="the fit has 1 data in its experiment, 1 of them Measurements; got 2"):
-        fit.validate([sf.Measurements(TEST, values(TEST, 1))] * 2)
-    both = sf.Problem(PARABOLA, [run(TRAIN, values(TRAIN, s)) for s in (0, 1)], {"a": 1.0, "b": 0.0})
-    with pytest.raises(ValueError, match=r"the fit has 2 experiments: give validate an sf.Experiment"):
-        sf.estimate(both).validate(sf.Measurements(TEST, values(TEST, 1)))
-    sigma = np.full((len(TRAIN), 1), SIGMA)
-    each = sf.estimate(sf.Problem(PARABOLA, run(TRAIN, values(TRAIN, 0), sigma), {"a": 1.0, "b": 0.0}))
-    with pytest.raises(ValueError, match="sigma differs from sample to sample in the fit"):
-        each.validate(sf.Measurements(TEST, values(TEST, 1)))
-    unnamed = sf.Measurements(TRAIN, values(TRAIN, 0), sigma=SIGMA)
-    problem = sf.Problem(PARABOLA, sf.Experiment(unnamed, ("m",), (), 0.0, 5.0), {"a": 1.0, "b": 0.0})
-    log = sf.Log(TEST, {"x": values(TEST, 1)}, {}, "s", "log")
-    with pytest.raises(ValueError, match="the channels of the fit have no names"):
-        sf.estimate(problem).validate(log)
-
-
-def test_an_array_parameter_is_refitted_as_a_whole():
-    fit = fit_line()
-
-    def observe(t, x, p):
-        return p["c"][0] * x + p["c"][1]
-
-    data = sf.Measurements(TEST, values(TEST, 3), observe=observe, sigma=SIGMA)
-    parameters = {"a": 0.0, "b": 0.0, "c": [1.0, 0.0]}
-    other = sf.Problem(PARABOLA, sf.Experiment(data, ("m",), (), 0.0, 5.0), parameters)
-    assert fit.validate(other).freedom == len(TEST) - 2
-    with pytest.raises(ValueError, match="the entries of 'c' are estimated all together, or none of them"):
-        fit.validate(other, refit=("c[0]",))
+    both = sf.estimate(pose([run(TRAIN, values(TRAIN, s)) for s in (0, 1)]))
+    each = sf.estimate(pose(run(TRAIN, values(TRAIN, 0), np.full((len(TRAIN), 1), SIGMA))))
+    own = run(TEST, y, initial_state=[sf.Parameter(0.0)])
+    for of, other, settings, error, said in (
+        (fit, 3, {}, TypeError, r"validate needs another run: an sf.Experiment.*got 3"),
+        (
+            fit,
+            own,
+            {"refit": ("b",)},
+            ValueError,
+            r"refit names 'b', which is no unknown of the other run's own; these",
+        ),
+        (fit, two, {}, ValueError, "of the fit have 1 channels, those of the other run 2"),
+        (fit, [data] * 2, {}, ValueError, "the fit has 1 data in its experiment, 1 of them Measurements; got 2"),
+        (both, data, {}, ValueError, r"the fit has 2 experiments: give validate an sf.Experiment"),
+        (each, data, {}, ValueError, "sigma differs from sample to sample in the fit"),
+    ):
+        with pytest.raises(error, match=said):
+            of.validate(other, **settings)
 
 
 def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_the_exact_hessian():
     """A block that slides until its speed is zero: to first order, the data do not depend on when it rests."""
     system = sf.HybridSystem({"slide": lambda t, x, p: p["v"] - t + 0.0 * x, "rest": lambda t, x, p: 0.0 * x}, [0.0])
     times = np.linspace(0.03, 2.0, 40)
-    exact = np.minimum(times, 1.0) - np.minimum(times, 1.0) ** 2 / 2
-    logs = [exact + 0.003 * np.random.default_rng(seed).standard_normal(40) for seed in (1, 2)]
-    runs = [
-        sf.Experiment(sf.Measurements(times, log, sigma=0.003), ("slide", "rest"), (0.95,), 0.0, 2.0) for log in logs
-    ]
+    exact, runs = np.minimum(times, 1.0) - np.minimum(times, 1.0) ** 2 / 2, []
+    for seed in (1, 2):
+        data = sf.Measurements(times, exact + 0.003 * np.random.default_rng(seed).standard_normal(40), sigma=0.003)
+        runs.append(sf.Experiment(data, ("slide", "rest"), (0.95,), 0.0, 2.0))
     found = sf.estimate(sf.Problem(system, runs[0], {"v": 1.1})).validate(runs[1])
     assert found.theta_names == ("tau_1", "v")
     assert not found.refit.kinks
@@ -349,16 +316,150 @@ def test_another_log_with_dates():
     fit = sf.estimate(sf.Problem(base.system, run, base.parameters))
     same = fit.validate(build(1))
     assert same.chi_square == pytest.approx(fit.validate(sf.Measurements(log.times, log.values)).chi_square, rel=1e-9)
-    with pytest.raises(
-        ValueError, match=r"begins at 2024-03-05T00:15:00, after .* at 2024-03-01 06:00.*: give validate"
-    ):
+    with pytest.raises(ValueError, match=r"begins at 2024-03-05T00:15:00, after .* 2024-03-01 06:00.*: give validate"):
         fit.validate(build(5))
-    with pytest.raises(
-        ValueError, match="the other log has dates, and the times of the fit are numbers: give validate"
-    ):
+    with pytest.raises(ValueError, match="the other log has dates, and the times of the fit are numbers: give valid"):
         sf.estimate(base).validate(build(1))
     held = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), time_unit="h")
     fit = sf.estimate(sf.Problem(base.system, held, base.parameters))
     other = fit.validate(build(5))
     assert other.problem.experiments[0].t0 == pytest.approx(96.0, abs=1e-9)
     assert other.theta[0] - 96.0 == pytest.approx(fit.theta[0], abs=1e-3)
+
+
+# --- comparison of models ---------------------------------------------------------------------------------------------
+
+
+def fit(count, sigma=SIGMA, runs=None):
+    noise = {sigma: sf.Parameter(0.5, lower=0.01)} if isinstance(sigma, str) else {}
+    return sf.estimate(pose(runs or run(TIMES, values(TIMES, 0), sigma), count, **noise))
+
+
+def squares(count, y):
+    X = design(TIMES, count)
+    return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=None)[0]) ** 2))
+
+
+def test_criteria_in_closed_form_with_sigma_known():
+    table = sf.compare([fit(k) for k in (1, 2, 3)], names=("a", "ab", "abc"))
+    n, k = len(TIMES), np.array([1, 2, 3])
+    rss = np.array([squares(count, values(TIMES, 0)) for count in k])
+    log_l = -0.5 * rss / SIGMA**2 - n * np.log(SIGMA) - 0.5 * n * np.log(2 * np.pi)
+    np.testing.assert_allclose(table.log_likelihood, log_l, rtol=1e-8)
+    assert table.unknown_counts.tolist() == [1, 2, 3]
+    assert table.values == n
+    np.testing.assert_allclose(table.aic, 2 * k - 2 * log_l, rtol=1e-8)
+    np.testing.assert_allclose(table.aicc, 2 * k - 2 * log_l + 2 * k * (k + 1) / (n - k - 1), rtol=1e-8)
+    np.testing.assert_allclose(table.bic, k * np.log(n) - 2 * log_l, rtol=1e-8)
+    weight = np.exp(-0.5 * (table.aicc - table.aicc.min()))
+    np.testing.assert_allclose(table.weights, weight / weight.sum(), rtol=1e-12)
+    assert table.best == "ab"
+    assert table.delta_bic.min() == 0.0
+
+
+def test_criteria_in_closed_form_with_sigma_unknown():
+    table = sf.compare([fit(k, None) for k in (1, 2)])
+    n = len(TIMES)
+    rss = np.array([squares(count, values(TIMES, 0)) for count in (1, 2)])
+    log_l = -0.5 * n * (np.log(2 * np.pi * rss / n) + 1)
+    np.testing.assert_allclose(table.log_likelihood, log_l, rtol=1e-8)
+    assert table.unknown_counts.tolist() == [2, 3]
+    assert table.names == ("model1", "model2")
+
+
+def test_a_sigma_that_is_a_parameter_is_the_same_as_one_left_out():
+    table = sf.compare([fit(2, None), fit(2, "noise"), fit(2)], names=("left out", "parameter", "known"))
+    assert table.log_likelihood[0] == pytest.approx(table.log_likelihood[1], rel=1e-9)
+    assert table.unknown_counts.tolist() == [3, 3, 2]
+    assert table.log_likelihood[2] < table.log_likelihood[0]
+
+
+@pytest.mark.parametrize("loss", ["linear", "huber", "soft_l1", "cauchy"])
+def test_losses_are_densities(loss):
+    norm = compute_log_norm(loss, 1.7)
+    z = np.concatenate([-np.logspace(6, -6, 200_001), np.logspace(-6, 6, 200_001)])
+    total = scipy.integrate.trapezoid(np.exp(-0.5 * robust(loss, 1.7, z**2) - norm), z)
+    assert total == pytest.approx(1.0, abs=1e-3)
+    assert np.isinf(compute_log_norm("cauchy", 1.0))
+
+
+def test_a_robust_loss_is_better_where_there_are_outliers():
+    y = values(TIMES, 0)
+    y[[3, 8]] += [5.0, -4.0]
+    fits = [fit(2, runs=run(TIMES, y)), fit(2, runs=run(TIMES, y, loss="cauchy", loss_scale=1.5))]
+    table = sf.compare(fits, names=("normal", "cauchy"))
+    r = y - design(TIMES, 2) @ table.estimates[1].theta
+    norm = np.log(SIGMA) + compute_log_norm("cauchy", 1.5)
+    by_hand = -np.sum(0.5 * 1.5**2 * np.log1p((r / SIGMA) ** 2 / 1.5**2)) - len(y) * norm
+    assert table.log_likelihood[1] == pytest.approx(by_hand, rel=1e-9)
+    assert table.best == "cauchy"
+
+
+def test_models_with_the_same_bic_are_as_good_as_each_other():
+    """No evidence is printed where the difference in BIC would be printed as 0.0."""
+    one, known, poor = fit(2), fit(3), fit(1)
+    assert str(sf.compare([one, one])).startswith("model1 and model2 are as good as each other by BIC. 12 values.")
+    text = str(sf.compare([poor, one, known, one], names=("poor", "one", "all", "same")))
+    assert text.startswith("one and same are as good as each other by BIC, 2.5 below all: positive evidence. 12 ")
+    assert str(sf.compare([one, known])).startswith("model1 has the smallest BIC, 2.5 below model2: positive evidence.")
+
+
+def test_different_data_are_refused_wherever_they_differ():
+    y = values(TIMES, 0)
+    changed = y + 1e-9 * (np.arange(12) == 4)
+    twice = sf.Experiment([sf.Measurements(TIMES, y, sigma=SIGMA)] * 2, ("m",), (), 0.0, 4.0)
+    for runs, said in (
+        (run(TIMES, changed), r"model1 and model2 were fitted to different data, .*: values differ first at"),
+        ([run(TIMES, y), run(TIMES, values(TIMES, 1))], "1 and 2 experiments"),
+        (run(TIMES[1:], y[1:]), r"values of shape \(12, 1\) and \(11, 1\)"),
+        (run(TIMES - 0.01, y), r"times differ first at index 0, 0.3 and 0.29"),
+        (twice, "1 and 2 Measurements"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            sf.compare([fit(2), fit(2, runs=runs)])
+
+
+def test_equal_data_in_other_arrays_and_with_missing_values_are_the_same():
+    y = np.where(np.arange(12) == 2, np.nan, values(TIMES, 0))
+    assert sf.compare([fit(1, runs=run(TIMES, y)), fit(2, runs=run(TIMES, y.copy()))]).values == len(TIMES) - 1
+
+
+def test_what_cannot_be_compared():
+    one = fit(1)
+    area = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2), ("m",), (), 0.0, 4.0)
+    # 1 is the scale if none is given: the tail of Cauchy's loss falls as 1 / |z|, whose integral is infinite.
+    heavy = run(TIMES, values(TIMES, 0), loss="cauchy", loss_scale=1.0)
+    for estimates, settings, error, said in (
+        ([one, one.problem], {}, TypeError, "compare needs results of sf.estimate; got Problem"),
+        ([one], {}, ValueError, "compare needs two estimates or more; got 1"),
+        ([one, one], {"names": ("a",)}, ValueError, "names must have one entry for each of the 2 estimates"),
+        ([one, fit(1, runs=area)], {}, ValueError, "model2 has no likelihood: its cost has other terms than Measure"),
+        ([one, fit(2, runs=heavy)], {}, ValueError, r"model2 .*: loss='cauchy' is .* a loss_scale above 1; got 1\."),
+    ):
+        with pytest.raises(error, match=said):
+            sf.compare(estimates, **settings)
+
+
+def test_few_values():
+    y = np.where(np.arange(12) < 3, values(TIMES, 0), np.nan)
+    table = sf.compare([fit(k, runs=run(TIMES, y)) for k in (1, 2)])
+    assert np.isinf(table.aicc[1])
+    np.testing.assert_allclose(table.weights, [1.0, 0.0])
+
+
+def test_the_figure_has_the_best_at_the_top():
+    figure = sf.compare([fit(k) for k in (1, 2)], names=("line", "parabola")).plot()
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["parabola", "line"]
+    assert figure.axes[0].patches[0].get_width() == 0.0
+
+
+def test_guards_are_equations_between_unknowns():
+    """A limit that is an unknown alone gives the same model as a transition time that is free."""
+    base = heater_problem()
+    guards = {("on", "off"): lambda t, x, p: x[0] - p["limit"]}
+    guarded = sf.HybridSystem(dict(base.system.modes), base.system.initial_state, guards=guards)
+    limits = (sf.Parameter(15.0), sf.Parameter(15.7, fixed=True))
+    problems = [sf.Problem(guarded, base.experiments, {**base.parameters, "limit": limit}) for limit in limits]
+    table = sf.compare([sf.estimate(each) for each in (*problems, base)], names=("limit unknown", "known", "free"))
+    assert table.unknown_counts.tolist() == [2, 1, 2]
+    assert table.log_likelihood[0] == pytest.approx(table.log_likelihood[2], abs=1e-6)

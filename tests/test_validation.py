@@ -21,7 +21,6 @@ from switchfit.problem.validation import (
     as_callable,
     as_choice,
     as_count,
-    as_flag,
     as_number,
     as_path,
     as_sequence,
@@ -55,40 +54,22 @@ PROBLEM = sf.Problem(SYSTEM, run(), {"k": sf.Parameter(1.0, 0.1, 5.0)})
 REFERENCE = {"times": [0.0, 0.25, 0.5, 1.0], "values": [1.0, 0.8, 0.6, 0.4]}
 
 NUMBERS = {
-    "initial_state": lambda bad: sf.HybridSystem({"decay": decay}, bad([0.1])),
-    "initial_state of an experiment": lambda bad: run(initial_state=bad([0.1])),
+    "initial_state": lambda bad: run(initial_state=bad([0.1])),
     "an entry of initial_state": lambda bad: run(initial_state=[sf.Parameter(1.0), bad(0.1)]),
-    "t0": lambda bad: run(t0=bad(0.1)),
     "tf": lambda bad: run(tf=bad(1.1)),
     "transition_times": lambda bad: run(transition_times=bad([0.1])),
-    "an entry of transition_times": lambda bad: run(transition_times=(bad(0.1),)),
     "a parameter": lambda bad: sf.Problem(SYSTEM, run(), {"k": bad(0.1)}),
-    "value": lambda bad: sf.Parameter(bad([0.1, 0.5])),
     "lower": lambda bad: sf.Parameter(1.0, lower=bad(0.1)),
-    "upper": lambda bad: sf.Parameter(1.0, upper=bad(1.1)),
     "mean": lambda bad: sf.Normal(bad(0.1), 1.0),
-    "sd": lambda bad: sf.Normal(0.0, bad(0.1)),
-    "median": lambda bad: sf.LogNormal(bad(0.1), 1.0),
-    "log_sd": lambda bad: sf.LogNormal(1.0, bad(0.1)),
     "times": lambda bad: samples(times=bad([0.1, 0.75])),
-    "values": lambda bad: samples(values=bad([0.1, 0.5])),
     "values in a list": lambda bad: samples(values=[bad(0.1), 0.5]),
-    "sigma": lambda bad: samples(sigma=bad(0.1)),
     "sigma of a channel": lambda bad: samples(values=[[1.0, 2.0]] * 2, sigma=["s", bad(0.1)]),
-    "delay": lambda bad: samples(delay=bad(0.1)),
     "loss_scale": lambda bad: samples(loss="huber", loss_scale=bad(1.1)),
-    "reference times": lambda bad: sf.ReferenceSignal.from_samples(**REFERENCE | {"times": bad([0.0, 0.1, 0.5, 1.0])}),
     "reference values": lambda bad: sf.ReferenceSignal.from_samples(**REFERENCE | {"values": bad([0.1, 1, 2, 3])}),
     "weights": lambda bad: sf.ReferenceSignal.from_samples(**REFERENCE, weights=bad([0.1])),
-    "lowpass_hz": lambda bad: sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=bad(1.1)),
-    "input times": lambda bad: sf.Input(bad([0.0, 0.1]), [1.0, 2.0]),
     "input values": lambda bad: sf.Input([0.0, 1.0], bad([0.1, 2.0])),
-    "min_duration": lambda bad: sf.Problem(SYSTEM, run(), {"k": 1.0}, min_duration=bad(0.1)),
     "rtol": lambda bad: sf.Problem(SYSTEM, run(), {"k": 1.0}, rtol=bad(0.1)),
-    "atol": lambda bad: sf.Problem(SYSTEM, run(), {"k": 1.0}, atol=bad(0.1)),
     "theta": lambda bad: sf.evaluate(PROBLEM, bad([0.1, 1.0])),
-    "start": lambda bad: sf.estimate(PROBLEM, start=bad([0.1, 1.0])),
-    "tolerance": lambda bad: sf.estimate(PROBLEM, tolerance=bad(0.1)),
     "starts": lambda bad: sf.multistart(PROBLEM, bad([[0.1, 1.0]])),
     "noise": lambda bad: sf.monte_carlo(PROBLEM, 1, noise=bad(0.1)),
 }
@@ -97,9 +78,8 @@ NUMBERS = {
 @pytest.mark.parametrize("precision", [single, in_jax], ids=["numpy", "jax"])
 @pytest.mark.parametrize("door", NUMBERS)
 def test_no_number_of_single_precision_changes_in_silence(door, precision):
-    with pytest.raises(
-        ValueError, match=r"(0\.1 became 0\.10000000149|1\.1 became 1\.10000002384).* \(float32\)"
-    ) as caught:
+    said = r"(0\.1 became 0\.10000000149|1\.1 became 1\.10000002384).* \(float32\)"
+    with pytest.raises(ValueError, match=said) as caught:
         NUMBERS[door](precision)
     advice = "a list or a NumPy array" if precision is in_jax else "np.asarray(values, dtype=np.float64)"
     assert advice in str(caught.value)
@@ -107,7 +87,7 @@ def test_no_number_of_single_precision_changes_in_silence(door, precision):
 
 @given(arrays(np.float32, st.integers(1, 20), elements=st.floats(width=32)))
 def test_single_precision_is_refused_if_and_only_if_a_shortest_text_is_another_double(values):
-    """The first_state, fast test of exactness may pass no number that the texts refuse."""
+    """The first, fast test of exactness may pass no number that the texts refuse."""
     finite = values[np.isfinite(values)]
     changes = any(float(str(value)) != float(value) for value in finite)
     if not changes:
@@ -134,7 +114,6 @@ def test_halves_pass_and_tenths_do_not(kind):
     [
         (1, 1.0),
         ([1, 2.5], [1.0, 2.5]),
-        ((1, [2, 3]), None),
         (range(3), [0.0, 1.0, 2.0]),
         (np.int32(3), 3.0),
         (np.array([1, 2], dtype=np.uint8), [1.0, 2.0]),
@@ -142,7 +121,6 @@ def test_halves_pass_and_tenths_do_not(kind):
         (Decimal("0.1"), 0.1),
         ([Fraction(1, 4), 1], [0.25, 1.0]),
         (np.array([1.0, 2], dtype=object), [1.0, 2.0]),
-        (10**30, 1e30),
         ([np.array([1.0, 2.0]), [3, 4]], [[1.0, 2.0], [3.0, 4.0]]),
         ([], []),
         (np.array([1.0, 2.0], dtype=">f8"), [1.0, 2.0]),
@@ -150,10 +128,6 @@ def test_halves_pass_and_tenths_do_not(kind):
     ],
 )
 def test_numbers_are_read_as_they_are(given, expected):
-    if expected is None:
-        with pytest.raises(ValueError, match=r"x must be .*; got \(1, \[2, 3\]\), whose rows differ in length"):
-            as_array(given, "x")
-        return
     array = as_array(given, "x")
     assert type(array) is np.ndarray
     assert array.dtype == np.float64
@@ -162,8 +136,7 @@ def test_numbers_are_read_as_they_are(given, expected):
 
 def test_the_array_is_a_copy():
     mine = np.array([1.0, 2.0])
-    as_array(mine, "x")[0] = 5.0
-    assert mine[0] == 1.0
+    assert not np.shares_memory(as_array(mine, "x"), mine)
 
 
 DATES = [datetime.datetime(2020, 1, 1), datetime.datetime(2020, 1, 2)]
@@ -175,30 +148,22 @@ DATES = [datetime.datetime(2020, 1, 1), datetime.datetime(2020, 1, 2)]
         (None, TypeError, "got None"),
         (True, TypeError, "got True"),
         ([1.0, True], TypeError, "in which True is not a number"),
-        (np.array([True]), TypeError, r"\(bool\)"),
         (1j, TypeError, "got 1j"),
         ("1.0", ValueError, "got '1.0'"),
         (["1.0", 2.0], ValueError, "in which '1.0' is not a number"),
         (np.array(["1.0"]), ValueError, r"got \['1.0'\] \(<U3\)"),
         (b"1.0", ValueError, "got b'1.0'"),
-        (bytearray(b"1"), ValueError, "got bytearray"),
         ({1.0, 2.0}, TypeError, "give a list or an array"),
-        ({"a": 1.0}, TypeError, "got {'a': 1.0}"),
         ((value for value in (1.0,)), TypeError, "give a list or an array"),
         ([None, 1.0], TypeError, "in which None is not a number"),
         (np.array([1.0, None], dtype=object), TypeError, "in which None is not a number"),
         (10**400, ValueError, "an integer of 1329 bits, which is larger"),
-        ([1.0, 10**400], ValueError, "which is larger"),
         (Fraction(10**400), ValueError, "beyond the largest double"),
         ([[1.0], [2.0, 3.0]], ValueError, "whose rows differ in length"),
         (DATES, TypeError, "dates and time differences are not supported.*np.timedelta64"),
         (np.array(DATES, dtype="datetime64[ns]"), TypeError, "dates and time differences are not supported"),
-        (np.datetime64("2020-01-01"), TypeError, "dates and time differences are not supported"),
         (np.timedelta64(1, "s"), TypeError, "dates and time differences are not supported"),
-        (datetime.timedelta(1), TypeError, "dates and time differences are not supported"),
         (np.ma.array([1.0, 2.0], mask=[True, False]), ValueError, "a masked array with 1 masked entries"),
-        ([1.0, np.ma.masked], ValueError, "a masked array with 1 masked entries"),
-        (sf.Parameter, TypeError, "got <class"),
         (PROBLEM, TypeError, "got <Problem>"),
         (np.zeros(2, dtype=[("a", float)]), TypeError, "got"),
     ],
@@ -222,24 +187,19 @@ def test_a_traced_value_is_refused():
         jax.jit(lambda theta: as_array(theta, "theta"))(jnp.zeros(2))
 
 
-@pytest.mark.parametrize("given", [[1.0, 2.0], [], np.zeros((2, 2))])
-def test_a_number_is_one(given):
-    with pytest.raises(ValueError, match="tf must be a single number"):
-        as_number(given, "tf")
-
-
 # Missing samples
 
 
-def test_masked_values_of_measurements_are_missing():
-    values = np.ma.array([[1.0, 2.0], [3.0, 4.0]], mask=[[False, True], [False, False]])
-    data = sf.Measurements([0.0, 1.0], values)
-    np.testing.assert_array_equal(data.values, [[1.0, np.nan], [3.0, 4.0]])
-    assert data.count == 3
-    np.testing.assert_array_equal(sf.Measurements([0.0, 1.0], [np.ma.masked, 2.0]).values, [[np.nan], [2.0]])
-    np.testing.assert_array_equal(
-        sf.Measurements([0.0, 1.0], np.ma.array([1, 2], mask=[1, 0])).values, [[np.nan], [2.0]]
-    )
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (np.ma.array([[1.0, 2.0], [3.0, 4.0]], mask=[[0, 1], [0, 0]]), [[1.0, np.nan], [3.0, 4.0]]),
+        ([np.ma.masked, 2.0], [[np.nan], [2.0]]),
+        (np.ma.array([1, 2], mask=[1, 0]), [[np.nan], [2.0]]),
+    ],
+)
+def test_masked_values_of_measurements_are_missing(given, expected):
+    np.testing.assert_array_equal(sf.Measurements([0.0, 1.0], given).values, expected)
 
 
 def test_masked_values_of_a_reference_are_bridged():
@@ -253,41 +213,22 @@ def test_masked_values_of_a_reference_are_bridged():
 # Counts, flags, choices, functions, paths
 
 
-@pytest.mark.parametrize("given", [3, np.int64(3), np.uint8(3), np.array(3), jnp.array(3)])
+@pytest.mark.parametrize("given", [np.int64(3), np.array(3), jnp.array(3)])
 def test_integers_are_counts(given):
-    assert as_count(given, "runs") == 3
     assert type(as_count(given, "runs")) is int
+    assert as_count(given, "runs") == 3
 
 
-@pytest.mark.parametrize("given", [3.0, "3", None, True, np.True_, np.array([3]), 1j, np.array(True), [3]])
+@pytest.mark.parametrize("given", [3.0, "3", None, True, np.True_, np.array([3]), np.array(True), [3]])
 def test_what_is_no_count_is_refused(given):
     with pytest.raises(TypeError, match="runs must be a whole number"):
         as_count(given, "runs")
 
 
-def test_counts_have_limits():
-    with pytest.raises(ValueError, match="runs must be 1 or more; got 0"):
-        as_count(0, "runs", at_least=1)
-    with pytest.raises(ValueError, match="seed must not be negative; got -1"):
-        as_count(-1, "seed")
-    with pytest.raises(ValueError, match="runs must be at most 1000000000; got an integer of 1329 bits"):
-        as_count(10**400, "runs")
-
-
-@pytest.mark.parametrize("given", [0, 1, np.nan, "yes", None, np.array([True])])
+@pytest.mark.parametrize("given", [0, np.nan, "yes", None, np.array([True])])
 def test_a_flag_is_true_or_false(given):
-    with pytest.raises(TypeError, match="fixed must be True or False; got"):
-        as_flag(given, "fixed")
     with pytest.raises(TypeError, match="Parameter fixed must be True or False; got"):
         sf.Parameter(1.0, fixed=given)
-
-
-def test_choices():
-    assert as_choice(np.str_("b"), "kind", ("a", "b")) == "b"
-    with pytest.raises(ValueError, match="kind must be 'a' or 'b'; got 'c'"):
-        as_choice("c", "kind", ("a", "b"))
-    with pytest.raises(TypeError, match="kind must be one of a, b, c, d; got"):
-        as_choice(np.array(["a", "b"]), "kind", ("a", "b", "c", "d"))
 
 
 @pytest.mark.parametrize("given", [{"a", "b"}, {"a": 1}, iter("ab"), 3, None, np.array(1.0)])
@@ -296,49 +237,56 @@ def test_sequences_have_an_order_and_can_be_read_twice(given):
         as_sequence(given, "names", "a list of names")
 
 
-def test_functions():
+def test_what_is_accepted_is_returned():
+    assert as_choice(np.str_("b"), "kind", ("a", "b")) == "b"
     assert as_callable(first_state, "observe", "a function h(t, x, p)", arguments=3) is first_state
     assert as_callable(max, "observe", "a function", arguments=2) is max  # no signature
-    with pytest.raises(
-        TypeError, match=r"callback must be a function callback\(record\); got one that cannot be called with 1"
-    ):
-        as_callable(lambda: None, "callback", "a function callback(record)", arguments=1)
-    with pytest.raises(TypeError, match="observe must be a function; got the class int"):
-        as_callable(int, "observe", "a function")
 
 
-@pytest.mark.parametrize(("given", "error"), [(None, TypeError), (5, TypeError), (b"a", TypeError), ("", ValueError)])
-def test_paths(given, error):
-    with pytest.raises(error, match="path must be a path"):
-        as_path(given, "path")
+@pytest.mark.parametrize(
+    ("call", "error", "said"),
+    [
+        (lambda: as_count(0, "runs", at_least=1), ValueError, "runs must be 1 or more; got 0"),
+        (lambda: as_count(-1, "seed"), ValueError, "seed must not be negative; got -1"),
+        (lambda: as_count(10**400, "runs"), ValueError, "runs must be at most 1000000000; got an integer of 1329 bits"),
+        (lambda: as_choice("c", "kind", ("a", "b")), ValueError, "kind must be 'a' or 'b'; got 'c'"),
+        (lambda: as_choice(np.array(["a", "b"]), "kind", tuple("abcd")), TypeError, "must be one of a, b, c, d; got"),
+        (lambda: as_callable(lambda: None, "f", "a function", arguments=1), TypeError, "cannot be called with 1"),
+        (lambda: as_callable(int, "f", "a function"), TypeError, "f must be a function; got the class int"),
+        (lambda: as_path(None, "path"), TypeError, "path must be a path"),
+        (lambda: as_number([1.0, 2.0], "tf"), ValueError, "tf must be a single number"),
+        (lambda: as_path("", "path"), ValueError, "path must be a path"),
+    ],
+)
+def test_what_is_not_as_it_must_be_is_refused(call, error, said):
+    with pytest.raises(error, match=said):
+        call()
 
 
 # Messages
 
 
-class Table:
+class Shown:
+    """An object whose text is a table, is very long or is an error."""
+
+    def __init__(self, text):
+        self.text = text
+
     def __repr__(self):
-        return "a  b\n1  2"
+        if self.text is None:
+            raise RuntimeError("no text")
+        return self.text
 
 
 def test_what_messages_show_is_on_one_line():
-    assert shorten(Table()) == "a b 1 2"
+    assert shorten(Shown("a  b\n1  2")) == "a b 1 2"
 
 
-class Loud:
-    def __repr__(self):
-        return "x" * 10**7
-
-
-class Broken:
-    def __repr__(self):
-        raise RuntimeError("no text")
+LONG = ["x" * 10**6, [1.0] * 10**6, np.zeros(10**6), {k: k for k in range(10**5)}, 10**5000]
 
 
 @pytest.mark.parametrize(
-    "value",
-    ["x" * 10**6, [1.0] * 10**6, np.zeros(10**6), {k: k for k in range(10**5)}, 10**5000, Loud(), Broken(), PROBLEM],
-    ids=lambda value: type(value).__name__,
+    "value", [*LONG, Shown("x" * 10**7), Shown(None), PROBLEM], ids=lambda value: type(value).__name__
 )
 def test_what_messages_show_is_short(value):
     began = time.perf_counter()
@@ -356,87 +304,41 @@ def test_lists_of_names_are_short():
 # What has been accepted without a word
 
 
+TWO = [[1.0, 2.0]] * 2
+HUGE = {"values": [1e308, -1e308, 1e308, -1e308]}
+
+
+def filtered(hz):
+    return sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=hz)
+
+
 @pytest.mark.parametrize(
     ("build", "error", "said"),
     [
-        (
-            lambda: sf.estimate(None),
-            TypeError,
-            "problem must be an sf.Problem; several .*estimate_many.*; got NoneType",
-        ),
-        (lambda: sf.estimate([PROBLEM, PROBLEM]), TypeError, "problem must be an sf.Problem; .*; got list"),
-        (lambda: sf.estimate(PROBLEM, tolerance="x"), ValueError, "tolerance must be a number; got 'x'"),
-        (lambda: sf.estimate(PROBLEM, tolerance="1.0"), ValueError, "tolerance must be a number; got '1.0'"),
-        (lambda: sf.estimate(PROBLEM, max_iterations=None), TypeError, "max_iterations must be a whole number"),
-        (lambda: sf.estimate(PROBLEM, max_iterations=5.0), TypeError, "max_iterations must be a whole number"),
-        (
-            lambda: sf.estimate(PROBLEM, callback=5),
-            TypeError,
-            r"callback must be a function callback\(record\); got int",
-        ),
+        (lambda: sf.estimate(None), TypeError, "problem must be an sf.Problem; several .*estimate_many.*NoneType"),
+        (lambda: sf.estimate(PROBLEM, callback=5), TypeError, r"must be a function callback\(record\); got int"),
         (lambda: sf.estimate(PROBLEM, start=[0.5, 9.0]), ValueError, "The start violates k at its upper bound 5"),
         (lambda: samples(sigma=""), ValueError, "sigma must not be empty"),
         (lambda: samples(sigma=1e-200), ValueError, r"sigma must not be so small that 1 / sigma\*\*2 is infinite"),
         (lambda: samples(delay=""), ValueError, "delay must not be empty"),
-        (lambda: samples(values=[[1.0, 2.0]] * 2, names=("a", "a")), ValueError, "names must differ .*; got 'a' twice"),
-        (lambda: samples(values=[[1.0, 2.0]] * 2, names=("a", "")), ValueError, "names must not be empty"),
+        (lambda: samples(values=TWO, names=("a", "a")), ValueError, "names must differ .*; got 'a' twice"),
         (lambda: samples(sigma=1.0, loss="huber", loss_scale=1e200), ValueError, "loss_scale must have a square"),
-        (
-            lambda: run(mode_sequence=[["decay"], "decay"]),
-            TypeError,
-            "each of mode_sequence must be the name of a mode",
-        ),
-        (lambda: run(mode_sequence={"decay": 1, "b": 2}), TypeError, "mode_sequence must be a sequence of mode names"),
-        (lambda: run(name=""), ValueError, "name of an experiment must not be empty"),
-        (lambda: run(name=3), TypeError, "name of an experiment must be a string; got 3"),
+        (lambda: run(mode_sequence=[["decay"], "decay"]), TypeError, "each of mode_sequence must be the name of a"),
         (lambda: run(t0=np.timedelta64(1, "s")), TypeError, "t0 must be a number; .*time differences .*not supported"),
-        (lambda: run(transition_times={0.5}), TypeError, "transition_times must be a sequence"),
         (lambda: run(parameter_map={"k": ""}), ValueError, "parameter_map must not be empty"),
         (lambda: sf.HybridSystem({"": decay}, [1.0]), ValueError, "mode names must not be empty"),
-        (
-            lambda: sf.HybridSystem({"d": decay}, [1.0, 2.0], state_names=("a", "a")),
-            ValueError,
-            "state_names must differ",
-        ),
-        (
-            lambda: sf.HybridSystem({"d": decay}, [1.0], state_units=(1,)),
-            TypeError,
-            "each of state_units must be a string",
-        ),
-        (lambda: sf.Problem(SYSTEM, run(), {"": 1.0}), ValueError, "parameter names must not be empty"),
-        (lambda: sf.Parameter(1.0, unit=None), TypeError, "Parameter unit must be a string; got None"),
+        (lambda: sf.HybridSystem({"d": decay}, [1, 2], state_names=("a", "a")), ValueError, "state_names must differ"),
         (lambda: sf.Normal(1.0, 1e-200), ValueError, r"Normal sd must not be so small that 1 / sd\*\*2 is infinite"),
+        (lambda: filtered(1e308), ValueError, "lowpass_hz must not need more than 10000000 points, .*; got 1e.308 Hz"),
+        (lambda: filtered(1e-12), ValueError, "lowpass_hz must be 7.*e-06 Hz or more"),
+        (lambda: sf.ReferenceSignal.from_samples(**REFERENCE | HUGE), ValueError, "signal between the .* overflows"),
         (
-            lambda: sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=1e308),
+            lambda: run(inputs=sf.Input([0, 1], [1e308, -1e308], kind="linear")),
             ValueError,
-            "lowpass_hz must not need more than 10000000 points, .*; got 1e.308 Hz",
+            "signal between the .* over",
         ),
-        (
-            lambda: sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=1e-12),
-            ValueError,
-            "lowpass_hz must be 7.*e-06 Hz or more",
-        ),
-        (
-            lambda: sf.ReferenceSignal.from_samples(**REFERENCE | {"values": [1e308, -1e308, 1e308, -1e308]}),
-            ValueError,
-            "signal between the samples of an Input or a ReferenceSignal overflows",
-        ),
-        (
-            lambda: run(inputs=sf.Input([0.0, 1.0], [1e308, -1e308], kind="linear")),
-            ValueError,
-            "signal between the samples of an Input or a ReferenceSignal overflows",
-        ),
-        (lambda: sf.monte_carlo(PROBLEM, 2.0), TypeError, "runs must be a whole number"),
-        (lambda: sf.monte_carlo(PROBLEM, 2, seed=-1), ValueError, "seed must not be negative"),
-        (lambda: sf.monte_carlo(PROBLEM, 2, folder=5), TypeError, "folder must be a path"),
-        (
-            lambda: sf.monte_carlo(PROBLEM, 2, theta=[0.5, 1.0], noise=lambda rng, clean, item: "x"),
-            ValueError,
-            r"what noise\(rng, clean, item\) returns must be .* got 'x'",
-        ),
+        (lambda: sf.monte_carlo(PROBLEM, 2, theta=[0.5, 1], noise=lambda *given: "x"), ValueError, "what noise.* 'x'"),
         (lambda: sf.estimate_many([PROBLEM, None]), TypeError, r"problems\[1\] must be an sf.Problem; got NoneType"),
-        (lambda: sf.evaluate(None), TypeError, "problem must be an sf.Problem; got NoneType"),
-        (lambda: sf.simulate(PROBLEM, experiment=None), TypeError, "experiment must be a whole number"),
     ],
 )
 def test_mistakes_are_told(build, error, said):

@@ -8,17 +8,13 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import VEHICLE_TRUTH, curve, fishing, heated_room, linear, temperature, tracked_drive
-from typer.testing import CliRunner
+from models import STILL, VEHICLE_TRUTH, curve, fishing, heated_room, linear, temperature, tracked_drive
 
 import switchfit as sf
 from benchmarks.starts.problems import build_case
-from switchfit import cli
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
-from switchfit.optimize import Status
 from switchfit.report.sentences import format_share
-from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.answers import Doubt, Numbers, compare_with_sigma, find_doubts, find_levels
 from switchfit.uncertainty.residuals import correct_correlation
 
@@ -59,6 +55,11 @@ WHITE = NOISE | {"known": False}
 """The same, with sigma unknown."""
 FEW = WHITE | {"probability": np.nan}
 """The same, with too few values to tell whether it is noise."""
+FOLLOWED = WHITE | {"tried": 40, "agreeing": 2, "explained": 0.9991}
+"""A fit of an unknown sigma that explains nearly all, and was found from another start too."""
+REFERENCE = {"references": True, "explained": 0.9991}
+EXACT = NOISE | {"explained": 1 - 0.9e-10, "probability": 0.0}
+"""A fit that leaves rounding."""
 
 
 def levels(*, references=False, **changes) -> dict[str, str]:
@@ -82,16 +83,8 @@ def levels(*, references=False, **changes) -> dict[str, str]:
         ({"tried": 40, "agreeing": 4}, {"tried": 40, "agreeing": 4, "lower": 1}, {"other starts are better": "bad"}),
         ({"tried": 40, "agreeing": 4}, {"tried": 40, "agreeing": 3}, {"few starts agree": "doubtful"}),
         (NOISE | {"tried": 40}, WHITE | {"tried": 40}, {"few starts agree": "doubtful"}),
-        (
-            WHITE | {"tried": 40, "agreeing": 2, "explained": 0.9991},
-            WHITE | {"tried": 40, "agreeing": 2, "explained": 0.9989},
-            {"few starts agree": "doubtful"},
-        ),
-        (
-            WHITE | {"tried": 40, "agreeing": 2, "explained": 0.9991},
-            WHITE | {"tried": 40, "agreeing": 1, "explained": 0.9991},
-            {"few starts agree": "doubtful"},
-        ),
+        (FOLLOWED, FOLLOWED | {"explained": 0.9989}, {"few starts agree": "doubtful"}),
+        (FOLLOWED, FOLLOWED | {"agreeing": 1}, {"few starts agree": "doubtful"}),
         # Does the model explain the data?
         (NOISE | {"probability": 1.1e-3}, NOISE | {"probability": 0.9e-3}, {"no noise": "doubtful"}),
         (NOISE | {"explained": 0.1}, NOISE | {"explained": 0.1, "probability": 0.0}, {"unexplained": "bad"}),
@@ -99,16 +92,8 @@ def levels(*, references=False, **changes) -> dict[str, str]:
         (FEW | {"explained": 0.91}, FEW | {"explained": 0.89}, {"little explained": "doubtful"}),
         (FEW | {"explained": 0.91}, FEW | {"explained": 0.49}, {"unexplained": "bad"}),
         (NOISE, NOISE | {"freedom": 0.0}, {"too few samples": "doubtful"}),
-        (
-            {"references": True, "explained": 0.9991},
-            {"references": True, "explained": 0.9989},
-            {"little explained": "doubtful"},
-        ),
-        (
-            NOISE | {"explained": 1 - 0.9e-10, "probability": 0.0},
-            NOISE | {"explained": 1 - 1.1e-10, "probability": 0.0},
-            {"no noise": "doubtful"},
-        ),
+        (REFERENCE, REFERENCE | {"explained": 0.9989}, {"little explained": "doubtful"}),
+        (EXACT, EXACT | {"explained": 1 - 1.1e-10}, {"no noise": "doubtful"}),
         # Is it determined?
         ({"smallest": 1.1e-6}, {"smallest": 0.9e-6}, {"not determined": "doubtful"}),
         ({}, {"at_bounds": 1}, {"at bounds": "doubtful"}),
@@ -142,95 +127,55 @@ LINE, WAVE = 2.0 + 0.5 * TIMES, np.sin(2 * TIMES)
 SPIKES = np.where(np.arange(100) % 50 == 20, 2.0, 0.0)
 """Outliers in a fiftieth of the samples."""
 
+FEW_TIMES = {"times": TIMES[::9]}
+IS_NOISE, IS_WRONG = "what is left is noise", "is correlated: the minimum or the model is wrong"
+GIVE_LOSS = "has outliers: values or the model are wrong there: give the Measurements a robust loss"
+
 SITUATIONS = {
     # values and settings, level, kinds of the reasons, words
-    "right, sigma known": (
-        LINE + noise(0.1), {"sigma": 0.1}, "good", ["fits"], "what is left is noise",
-    ),
-    "right, sigma unknown": (
-        LINE + noise(0.1), {}, "good", ["fits"], "what is left is noise",
-    ),
-    "much noise of a known sigma": (
-        LINE + noise(3.0), {"sigma": 3.0}, "good", ["fits"], "degrees of freedom), what is left is noise",
-    ),
-    "much white noise, sigma unknown": (
-        LINE + noise(1.0), {}, "good", ["fits"], "what is left is noise",
-    ),
-    "nothing but white noise, sigma unknown": (
-        2.0 + 0.1 * TIMES + noise(1.0), {}, "doubtful", ["little explained"], "explains only",
-    ),
-    "sigma too small by 2": (
-        LINE + noise(0.1), {"sigma": 0.05}, "doubtful", ["sigma suspected"], "looks like noise: sigma is too small",
-    ),
+    "right, sigma known": (LINE + noise(0.1), {"sigma": 0.1}, "good", "fits", IS_NOISE),
+    "right, sigma unknown": (LINE + noise(0.1), {}, "good", "fits", IS_NOISE),
+    "much noise of a known sigma": (LINE + noise(3.0), {"sigma": 3.0}, "good", "fits", IS_NOISE),
+    "nothing but noise": (2 + 0.1 * TIMES + noise(), {}, "doubtful", "little explained", "explains only"),
+    "sigma too small by 2": (LINE + noise(0.1), {"sigma": 0.05}, "doubtful", "sigma suspected", "sigma is too small"),
     "sigma too small by 2, fewer than 20 values": (
-        LINE[::6] + noise(0.1, 17), {"sigma": 0.04, "times": TIMES[::6]}, "doubtful", ["model suspected"],
+        LINE[::6] + noise(0.1, 17), {"sigma": 0.04, "times": TIMES[::6]}, "doubtful", "model suspected",
         "sigma: the minimum or the model is wrong",
     ),
-    "sigma too large by 2": (
-        LINE + noise(0.1), {"sigma": 0.2}, "good", ["fits"], "what is left is noise",
-    ),
+    "sigma too large by 2": (LINE + noise(0.1), {"sigma": 0.2}, "good", "fits", IS_NOISE),
     "outliers, sigma known": (
-        LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", ["outliers suspected"],
-        "has outliers: values or the model are wrong there: give the Measurements a robust loss",
+        LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", "outliers suspected", GIVE_LOSS,
     ),
-    "outliers, sigma unknown": (
-        LINE + noise(0.1) + SPIKES, {}, "doubtful", ["outliers suspected"],
-        "has outliers: values or the model are wrong there: give the Measurements a robust loss",
-    ),
-    "model slightly wrong, sigma known": (
-        LINE + 0.02 * WAVE + noise(0.005), {"sigma": 0.005}, "doubtful", ["model suspected"],
+    "outliers, sigma unknown": (LINE + noise(0.1) + SPIKES, {}, "doubtful", "outliers suspected", GIVE_LOSS),
+    "model slightly wrong": (
+        LINE + 0.02 * WAVE + noise(0.005), {"sigma": 0.005}, "doubtful", "model suspected",
         "is correlated: the model is slightly wrong",
     ),
-    "model slightly wrong, sigma unknown": (
-        LINE + 0.02 * WAVE + noise(0.005), {}, "doubtful", ["model suspected"],
-        "is correlated: the model is slightly wrong",
-    ),
-    "model wrong": (
-        LINE + 0.5 * WAVE + noise(0.02), {"sigma": 0.02}, "doubtful", ["model suspected"],
-        "is correlated: the minimum or the model is wrong",
-    ),
-    "far from the data, sigma known": (
-        2.0 + 0.1 * TIMES + WAVE, {"sigma": 0.1}, "bad", ["unexplained"], "explains only 6 %",
-    ),
-    "far from the data, sigma unknown": (
-        2.0 + 0.1 * TIMES + WAVE, {}, "bad", ["unexplained"], "explains only 6 %",
-    ),
+    "model wrong": (LINE + 0.5 * WAVE + noise(0.02), {"sigma": 0.02}, "doubtful", "model suspected", IS_WRONG),
+    "far from the data": (2 + 0.1 * TIMES + WAVE, {}, "bad", "unexplained", "explains only 6 %"),
     "far from the data, sigma far too large": (
-        2.0 + 0.1 * TIMES + WAVE, {"sigma": 10.0}, "doubtful", ["little explained"], "explains only 6 %",
+        2 + 0.1 * TIMES + WAVE, {"sigma": 10.0}, "doubtful", "little explained", "explains only 6 %",
     ),
-    "few values, most of it explained": (
-        0.5 * TIMES[::9] + 0.05 * WAVE[::9], {"times": TIMES[::9]}, "good", ["fits"], "of the variance.",
-    ),
+    "few values": (0.5 * TIMES[::9] + 0.05 * WAVE[::9], FEW_TIMES, "good", "fits", "of the variance."),
     "few values, too little of it explained": (
-        0.5 * TIMES[::9] + WAVE[::9], {"times": TIMES[::9]}, "doubtful", ["little explained"], "explains only",
-    ),
-    "few values, hardly anything explained": (
-        0.5 * TIMES[::9] + 4.0 * WAVE[::9], {"times": TIMES[::9]}, "bad", ["unexplained"], "explains only",
+        0.5 * TIMES[::9] + WAVE[::9], FEW_TIMES, "doubtful", "little explained", "explains only",
     ),
     "as many values as unknowns": (
-        np.array([1.0, 2.5]), {"times": np.array([1.0, 2.0])}, "doubtful", ["too few samples"], "nothing to check",
+        np.array([1.0, 2.5]), {"times": np.array([1.0, 2.0])}, "doubtful", "too few samples", "nothing to check",
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SITUATIONS)
 def test_situations(name):
-    values, settings, level, reasons, words = SITUATIONS[name]
+    values, settings, level, reason, words = SITUATIONS[name]
     fit = straight(values, **settings)
-    assert (fit.verdict.level, kinds(fit)) == (level, reasons)
+    assert (fit.verdict.level, kinds(fit)) == (level, [reason])
     assert words in str(fit.verdict)
     assert str(fit.verdict).startswith(f"{level.capitalize()}: converged; one fit; ")
     assert fit.success == (level != "bad")
-
-
-def test_a_fit_to_its_noise_answers_three_questions():
-    fit = straight(LINE + noise(0.1), sigma=0.1)
-    assert [answer.kind for answer in fit.verdict.answers] == ["converged", "looked", "fits"]
-    assert fit.verdict.next_steps == ()
-    assert str(fit.verdict) == (
-        f"Good: converged; one fit; the model explains {format_share(fit.verdict.reasons[0].figures['explained'])} of "
-        f"the variance (chi² {2 * fit.cost:.3g} for 98 degrees of freedom), what is left is noise."
-    )
+    assert (fit.verdict.next_steps == ()) == (level == "good")
+    assert [answer.kind for answer in fit.verdict.answers][:2] == ["converged", "looked"]
 
 
 def test_an_estimated_sigma_confirms_no_fit():
@@ -247,22 +192,20 @@ def test_one_wrong_run_of_many_is_found_and_named():
     """Its chi-square is lost in that of all."""
     times = np.linspace(0.25, 6.0, 24)
 
-    def problem(wrong: float) -> sf.Problem:
+    def fit(wrong: float) -> sf.Estimate:
         runs = []
         for e in range(30):
-            values = temperature(times, 3.0, 2.0, 0.5) + noise(0.5, 24, seed=e)
-            if e == 7:
-                values += wrong * np.sin(3 * times)
-            run = sf.Measurements(times, values, sigma=0.5)
-            runs.append(sf.Experiment(run, ("on", "off"), (3.0,), 0.0, 6.0, name=f"room{e}"))
-        return sf.Problem(heated_room(), runs, {"power": 2.0, "k": 0.5})
+            values = temperature(times, 3.0, 2.0, 0.5) + noise(0.5, 24, seed=e) + wrong * (e == 7) * np.sin(3 * times)
+            data = sf.Measurements(times, values, sigma=0.5)
+            runs.append(sf.Experiment(data, ("on", "off"), (3.0,), 0.0, 6.0, name=f"room{e}"))
+        return sf.estimate(sf.Problem(heated_room(), runs, {"power": 2.0, "k": 0.5}), strategy="local")
 
-    assert sf.estimate(problem(0.0), strategy="local").verdict.level == "good"
-    fit = sf.estimate(problem(1.5), strategy="local")
-    assert fit.residual_variance < 1.15
-    assert fit.verdict.level == "doubtful"
-    assert fit.verdict.reasons[0].subjects == ("room7 T",)
-    assert " of room7 T" in str(fit.verdict)
+    assert fit(0.0).verdict.level == "good"
+    found = fit(1.5)
+    assert found.residual_variance < 1.15
+    assert found.verdict.level == "doubtful"
+    assert found.verdict.reasons[0].subjects == ("room7 T",)
+    assert " of room7 T" in str(found.verdict)
 
 
 def test_nothing_is_read_from_residuals_that_are_rounding():
@@ -281,9 +224,8 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     data = sf.Measurements(TIMES, values, observe=line, sigma=0.1, loss="huber")
 
     def fit(slope: sf.Parameter) -> sf.Estimate:
-        system = sf.HybridSystem({"still": lambda t, x, p: 0.0 * x}, [0.0])
         run = sf.Experiment(data, ("still",), (), 0.0, 10.0)
-        return sf.estimate(sf.Problem(system, run, {"a": 1.0, "b": slope}), strategy="local")
+        return sf.estimate(sf.Problem(STILL, run, {"a": 1.0, "b": slope}), strategy="local")
 
     right = fit(sf.Parameter(0.3))
     assert right.verdict.level == "good"
@@ -303,21 +245,17 @@ def test_errors_of_correlated_residuals_are_corrected_and_the_naive_ones_stand_b
     (channel,) = fit.residuals.channels
     r = correct_correlation(channel.correlation, len(TIMES), 2)
     np.testing.assert_allclose(fit.corrected_standard_errors, np.sqrt((1 + r) / (1 - r)) * fit.standard_errors)
-    text = str(fit)
-    (header,) = [row for row in text.splitlines() if "naive" in row and "std. error" in row]
-    (row,) = [row for row in text.splitlines() if row.strip().startswith("b ")]
-    assert header.index("std. error") < header.index("naive")
-    first, second = (float(part.split()[0]) for part in row.split("±")[1:])
-    assert first == pytest.approx(fit.corrected_standard_errors[1], rel=0.06)
-    assert second == pytest.approx(fit.standard_errors[1], rel=0.06)
+    assert "naive" in str(fit)
+    (row,) = [row for row in str(fit).splitlines() if row.strip().startswith("b ")]
+    printed = [float(part.split()[0]) for part in row.split("±")[1:]]
+    assert printed == pytest.approx([fit.corrected_standard_errors[1], fit.standard_errors[1]], rel=0.06)
     white = straight(2.0 + 0.5 * TIMES + noise(0.1))
     np.testing.assert_array_equal(white.corrected_standard_errors, white.standard_errors)
     assert "naive" not in str(white)
 
 
 def test_the_error_of_a_time_is_corrected_by_its_own_run():
-    times = np.linspace(0.1, 6.0, 60)
-    runs = []
+    times, runs = np.linspace(0.1, 6.0, 60), []
     for e, wave in enumerate((0.0, 0.05)):
         values = temperature(times, 3.0 + 0.01 * e, 2.0, 0.5) + wave * np.sin(2 * times) + noise(0.02, 60, seed=e)
         runs.append(sf.Experiment(sf.Measurements(times, values), ("on", "off"), (3.0,), 0.0, 6.0))
@@ -325,65 +263,19 @@ def test_the_error_of_a_time_is_corrected_by_its_own_run():
     factors = fit.corrected_standard_errors / fit.standard_errors
     assert factors[0] == 1.0
     assert factors[1] > 1.5
-    np.testing.assert_array_equal(factors[2:], factors[1])
+    np.testing.assert_allclose(factors[2:], factors[1], rtol=1e-14)
 
 
 # --- modes, bounds, directions, kinks ---------------------------------------------------------------------------------
 
 
-def heated(values, sequence=("on", "off"), guess=(4.0,), *, sigma=0.05, **parameters) -> sf.Estimate:
-    times = np.linspace(0.1, 9.9, 50)
-    run = sf.Experiment(sf.Measurements(times, values, sigma=sigma), sequence, guess, 0.0, 10.0)
-    return sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": 0.5} | parameters), strategy="local")
-
-
-HEATED = temperature(np.linspace(0.1, 9.9, 50), 4.03, 2.0, 0.5) + noise(0.05, 50, seed=2)
-
-
-def test_a_collapsed_mode_is_doubtful():
-    assert heated(HEATED).verdict.level == "good"
-    three = heated(HEATED + 0.2 * np.exp(-np.linspace(0, 10, 50)), ("on", "off", "on"), (4.0, 8.0), sigma=0.1)
-    assert three.status is Status.COLLAPSED or any(c.kind == "collapsed" for c in three.active)
-    assert three.verdict.level == "doubtful"
-    assert "a mode collapsed" in kinds(three)
-    assert steps(three)[0] == "next: more starts"
-
-
-def test_a_bound_that_holds_is_doubtful():
-    values = 2.0 + 0.5 * TIMES + noise(0.1)
-    held, free = straight(values, sigma=0.1, b=0.3, upper=0.49), straight(values, sigma=0.1, b=0.3, upper=0.6)
-    assert held.active
-    assert not free.active
-    assert free.verdict.level == "good"
-    assert held.verdict.level == "doubtful"
-    assert held.verdict.reasons[-1] == Issue("at bounds", ("b",))
-    assert "b at a bound" in str(held.verdict)
-
-
-def test_a_direction_that_the_data_do_not_determine_is_doubtful():
-    def product(t, x, p):
-        return jnp.stack([p["a"] * p["b"] * t])
-
-    def fit(observe):
-        values = (0.5 * TIMES + noise(0.1))[:, None]
-        return sf.estimate(curve(observe, TIMES, values, {"a": 0.7, "b": 0.7}, tf=10.0, sigma=0.1), strategy="local")
-
-    found = fit(product)
-    assert found.verdict.level == "doubtful"
-    assert kinds(found) == ["not determined"]
-    assert set(found.verdict.reasons[0].subjects) == {"a", "b"}
-    assert fit(line).verdict.level == "good"
-
-
 def test_a_kink_is_a_note_and_no_doubt():
     """The ramp ends at a sample whose noise holds the time there."""
-    times = np.linspace(0.25, 6.0, 24)
+    times, held = np.linspace(0.25, 6.0, 24), sf.Parameter(0.5, fixed=True)
     for seed in range(20):
-        values = temperature(times, 3.0, 2.0, 0.5) + noise(0.05, 24, seed)
-        run = sf.Experiment(sf.Measurements(times, values, sigma=0.05), ("on", "off"), (2.6,), 0.0, 6.0)
-        fit = sf.estimate(
-            sf.Problem(heated_room(), run, {"power": 2.0, "k": sf.Parameter(0.5, fixed=True)}), strategy="local"
-        )
+        data = sf.Measurements(times, temperature(times, 3.0, 2.0, 0.5) + noise(0.05, 24, seed), sigma=0.05)
+        run = sf.Experiment(data, ("on", "off"), (2.6,), 0.0, 6.0)
+        fit = sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": held}), strategy="local")
         if fit.kinks:
             break
     assert fit.kinks
@@ -401,24 +293,13 @@ def right() -> sf.Estimate:
     return sf.estimate(heater_problem(), strategy="local")
 
 
-@pytest.mark.parametrize(
-    ("starts", "level", "kind"),
-    [
-        (None, "good", "fits"),
-        ((40, 0, 12), "good", "fits"),
-        ((40, 0, 0), "good", "fits"),  # chi-square confirms it
-        ((40, 12, 3), "bad", "other starts are better"),
-        ((40, 1, 3), "bad", "other starts are better"),
-    ],
-)
-def test_other_starts_count(right, starts, level, kind):
-    fit = replace(right, starts=starts)
-    assert (fit.verdict.level, kinds(fit)[0]) == (level, kind)
-    if starts == (40, 12, 3):
-        assert str(fit.verdict).startswith("Bad: converged; 12 of 40 other starts are better; the model explains ")
-        assert str(fit.verdict).endswith("what is left is noise: strategy='thorough'.")
-    if starts == (40, 0, 12):
-        assert "; the lowest J was found from 12 of 40 other starts; " in str(fit.verdict)
+def test_other_starts_count(right):
+    assert kinds(replace(right, starts=(40, 0, 0))) == ["fits"]  # chi-square confirms it
+    assert "; the lowest J was found from 12 of 40 other starts; " in str(replace(right, starts=(40, 0, 12)).verdict)
+    worse = replace(right, starts=(40, 12, 3)).verdict
+    assert (worse.level, worse.reasons[0].kind) == ("bad", "other starts are better")
+    assert str(worse).startswith("Bad: converged; 12 of 40 other starts are better; the model explains ")
+    assert str(worse).endswith("what is left is noise: strategy='thorough'.")
 
 
 def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
@@ -504,7 +385,7 @@ def test_a_cost_without_data_is_judged_by_its_minimum():
 # --- known right and wrong ends ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["thermostat", "two-turns-anywhere"])
+@pytest.mark.parametrize("name", ["thermostat", pytest.param("two-turns-anywhere", marks=pytest.mark.slow)])
 def test_wrong_ends_are_never_good(name):
     """Nine tenths of those of two turns explain 99 % of positions that go over hundreds of metres."""
     case = build_case(name)
@@ -525,27 +406,14 @@ def test_wrong_ends_are_never_good(name):
 # --- reports ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("build", "level"), [(tracked_drive, "good"), (fishing, "doubtful")])
-def test_a_report_begins_with_the_verdict_and_fits_one_screen(build, level):
-    fit = sf.estimate(build(), strategy="local")
-    lines = str(fit).splitlines()
+def test_a_report_begins_with_the_verdict_and_fits_one_screen():
+    fit = sf.estimate(fishing(), strategy="local")
+    lines, whole = str(fit).splitlines(), fit.report(full=True).splitlines()
     assert " ".join(lines[: lines.index("")]).replace("   ", " ") == str(fit.verdict)
-    assert fit.verdict.level == level
     assert len(lines) <= 41
     assert max(map(len, lines)) <= 100
-    whole = fit.report(full=True).splitlines()
     assert whole[0] == lines[0]
     assert all(any(row.split()[:1] == [name] for row in whole) for name in fit.theta_names)
-
-
-def test_the_verdict_costs_nothing_until_it_is_asked_for():
-    """A fit simulates its trajectories at the first access; neither the fit nor its status needs them."""
-    fit = sf.estimate(heater_problem(), strategy="local")
-    assert fit.status.successful
-    assert "_simulation" in vars(fit)
-    assert fit.success
-    assert "_simulation" not in vars(fit)
-    assert fit.verdict is fit.verdict
 
 
 @pytest.mark.parametrize(
@@ -565,54 +433,12 @@ def test_shares_are_never_rounded_up(share, text):
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_file_begins_with_the_verdict_and_a_loaded_estimate_has_it(tmp_path):
     for k, fit in enumerate((straight(TIMES + noise(0.1), sigma=0.1), straight(np.sin(TIMES), sigma=0.01))):
-        fit.save(tmp_path / f"{k}.json")
-        content = json.loads((tmp_path / f"{k}.json").read_text(encoding="utf-8"))
+        path = tmp_path / f"{k}.json"
+        fit.save(path)
+        content = json.loads(path.read_text(encoding="utf-8"))
         assert next(iter(content)) == "verdict"
-        assert next(iter(content["verdict"])) == "level"
-        assert content["verdict"]["level"] == fit.verdict.level
-        assert content["verdict"]["text"] == str(fit.verdict)
+        assert list(content["verdict"].items())[:2] == [("level", fit.verdict.level), ("text", str(fit.verdict))]
         assert [reason["kind"] for reason in content["verdict"]["reasons"]] == kinds(fit)
-        loaded = sf.Estimate.load(tmp_path / f"{k}.json")
+        loaded = sf.Estimate.load(path)
         assert loaded.verdict == fit.verdict
         assert loaded.success == fit.success == (k == 0)
-
-
-MODEL = """
-import switchfit as sf
-system = sf.HybridSystem({"still": lambda t, x, p: 0.0 * x + p["b"]}, [0.0])
-"""
-
-FILE = """
-model = "model.py:system"
-[parameters]
-b = 1.0
-[[experiments]]
-mode_sequence = ["still"]
-transition_times = []
-[[experiments.data]]
-file = "log.csv"
-time = "t"
-columns = ["y"]
-sigma = 0.1
-"""
-
-
-@pytest.mark.parametrize(
-    ("wave", "arguments", "code", "first"),
-    [
-        (0.0, (), 0, "Good: "),
-        (0.2, (), 0, "Doubtful: "),
-        (0.0, ("--max-iterations", "0"), 1, "Bad: not converged"),
-        (0.0, ("--full",), 0, "Good: "),
-    ],
-)
-def test_exit_codes(tmp_path, wave, arguments, code, first):
-    (tmp_path / "model.py").write_text(MODEL)
-    (tmp_path / "problem.toml").write_text(FILE)
-    values = 2.0 * (TIMES - TIMES[0]) + wave * np.sin(2 * TIMES) + noise(0.1)
-    rows = "".join(f"{t!r},{y!r}\n" for t, y in zip(TIMES.tolist(), values.tolist(), strict=True))
-    (tmp_path / "log.csv").write_text("t,y\n" + rows)
-    result = CliRunner().invoke(cli.app, ["fit", str(tmp_path / "problem.toml"), *arguments])
-    assert result.exit_code == code, result.output
-    assert result.stdout.startswith(first)
-    assert ("KKT residual" in result.stdout) == ("--full" in arguments)

@@ -144,17 +144,6 @@ def describe_python_problem(fit: Fit) -> Provenance:
     return Provenance("", "", "", "", {}, (), digest_data(fit), find_versions(), describe_platform())
 
 
-def digest_bytes(name: str, raw: bytes) -> FileDigest:
-    """Return the digest of a file or an array.
-
-    Parameters
-    ----------
-    name : str
-    raw : bytes
-    """
-    return FileDigest(name, len(raw), hashlib.sha256(raw).hexdigest())
-
-
 def digest_data(fit: Fit) -> tuple[FileDigest, ...]:
     """Return the digest of times and values of each Measurements, as float64 of little-endian machines.
 
@@ -168,7 +157,8 @@ def digest_data(fit: Fit) -> tuple[FileDigest, ...]:
             if comparison.kind == "measurements":
                 columns = np.column_stack([comparison.times, comparison.measured]).astype("<f8")
                 label = ", ".join(comparison.names) if single else f"{run}: {', '.join(comparison.names)}"
-                found.append(digest_bytes(label, np.ascontiguousarray(columns).tobytes()))
+                raw = columns.tobytes()  # row by row
+                found.append(FileDigest(label, len(raw), hashlib.sha256(raw).hexdigest()))
     return tuple(found)
 
 

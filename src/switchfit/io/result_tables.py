@@ -278,7 +278,7 @@ class ResultTable:
             "cost": float(estimate.cost),
             "values": estimate.samples,
             "chi2": float(quality.chi_square),
-            "degrees of freedom": quality.freedom,
+            "degrees of freedom": estimate.freedom,
             "explained": float(quality.explained),
             "t0": float(trajectory.times[0]),
             "tf": float(trajectory.times[-1]),

@@ -19,7 +19,6 @@ from switchfit.problem.unknowns import Constraint
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import format_count, format_text, join_first
 from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY
-from switchfit.uncertainty.certificate import Combination
 from switchfit.uncertainty.verdict import Verdict
 
 ALLOWED = "Standard errors allow for the correlation of the residuals."
@@ -114,13 +113,6 @@ def write_constraint(constraint: Constraint) -> str:
 def write_kink(kink: Kink) -> str:
     """Return which unknown is at a kink, and the derivatives on both sides."""
     return f"{kink.unknown} at a kink ({kink.left:.1e}, {kink.right:.1e})"
-
-
-@format_text.register(Combination)
-def write_combination(combination: Combination) -> str:
-    """Return which unknowns trade off."""
-    names = combination.unknowns
-    return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
 
 
 # --- how a fit ended --------------------------------------------------------------------------------------------------
@@ -267,6 +259,12 @@ def _join(issue: Issue) -> str:
     return ", ".join(issue.subjects)
 
 
+def _write_combination(issue: Issue) -> str:
+    """Return which unknowns trade off, or the single one."""
+    names = issue.subjects
+    return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
+
+
 def _name_undetermined(issue: Issue) -> str:
     *others, last = issue.subjects or ("the unknowns",)
     return f"{', '.join(others)} and {last} apart from one another" if others else last
@@ -367,6 +365,7 @@ _AT_KINKS = (
 )
 """Of several unknowns, and of one."""
 _ISSUES: dict[str, Sentence] = {
+    "trade off": _write_combination,
     **_LOG_ISSUES,
     # Before the numbers are believed
     "mode collapsed": "{held mode} has collapsed to nothing: the data want no such mode there. Leave it out of "

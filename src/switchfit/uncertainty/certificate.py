@@ -300,19 +300,6 @@ Meaning = Literal["noise", "1 % of J", "1 % of variation"]
 by 1 % of their variation."""
 
 
-@dataclass(frozen=True)
-class Combination(Printed):
-    """Unknowns that trade off, or a single one; print it for the words.
-
-    Attributes
-    ----------
-    unknowns : tuple of str
-        In the order of their components, the largest first.
-    """
-
-    unknowns: tuple[str, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class Direction:
     """A combination of the unknowns, and the rise of J along it.
@@ -359,7 +346,7 @@ class Direction:
     @property
     def summary(self) -> str:
         """The combination in words, such as "tau_2 and mu trade off"."""
-        return str(Combination(self.names))
+        return str(Issue("trade off", self.names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -711,7 +698,7 @@ class Certificate(Printed):
     @property
     def worst_direction(self) -> str:
         """The worst-determined direction in words, such as "tau_2 and mu trade off"; "none" if nothing is free."""
-        return str(Combination(self.worst_unknowns))
+        return str(Issue("trade off", self.worst_unknowns))
 
 
 def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:

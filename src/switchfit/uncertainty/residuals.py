@@ -522,7 +522,6 @@ class Quality:
         sigma is 1. NaN without data.
     chi_square : float
         2 J; NaN if sigma is not a known number for all samples, or a loss is robust.
-    freedom : int
     probability : float
         Of what is left, if it is noise: the smallest of all tests, times the number of channels. NaN if none applies.
     known : bool
@@ -532,7 +531,6 @@ class Quality:
     channels: tuple[ChannelQuality, ...]
     explained: float
     chi_square: float
-    freedom: int
     probability: float
     known: bool
 
@@ -592,7 +590,6 @@ def measure_quality(fit: Fit) -> Quality:
         channels=tuple(channels),
         explained=explain_all(fit.comparisons),
         chi_square=chi_square,
-        freedom=fit.freedom,
         probability=min(found, default=np.nan),
         known=known,
     )

@@ -471,7 +471,7 @@ def _describe_fit(fit: Fit, quality: Quality | None) -> dict[str, float]:
     return figures | {
         "explained": quality.explained,
         "chi-square": quality.chi_square,
-        "freedom": float(quality.freedom),
+        "freedom": float(fit.freedom),
         "probability": quality.probability,
         "known": float(quality.known),
         "worst": worst.explained,
