@@ -79,16 +79,11 @@ CASES = {
         delay="d", sigma=["s", "s2"], loss="huber", loss_scale=1.5, outliers=4, more=DELAY | NOISE | {"s2": NOISE["s"]}
     ),
     "all at once": lambda: problem(
-        delay="d",
-        sigma=["s", "s2"],
-        loss="cauchy",
-        loss_scale=2.0,
-        outliers=4,
-        more=DELAY | NOISE | {"s2": NOISE["s"]},
-        k=sf.Parameter(2.0, lower=0.1, prior=sf.LogNormal(1.8, 0.02)),
+        delay="d", sigma=["s", "s2"], more=DELAY | NOISE | {"s2": NOISE["s"]}, loss="cauchy", loss_scale=2.0,
+        k=sf.Parameter(2.0, lower=0.1, prior=sf.LogNormal(1.8, 0.02)), outliers=4,
         tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)),
     ),
-}
+}  # fmt: skip
 
 
 COMBINED = "all at once"
@@ -115,11 +110,8 @@ def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(diff
     assert check.passed
 
 
-def test_the_simulated_cost_is_the_evaluated_one(case):
-    assert evaluator_of(case).cost(case.initial_theta) == pytest.approx(sf.evaluate(case).cost, rel=1e-12)
-
-
 def test_gauss_newton_is_never_negative_and_reaches_the_same_minimum(case):
+    assert evaluator_of(case).cost(case.initial_theta) == pytest.approx(sf.evaluate(case).cost, rel=1e-12)
     for theta in (case.initial_theta, case.initial_theta * 1.05):
         matrix = evaluator_of(case)(theta, matrix="gauss-newton").hessian
         scale = np.sqrt(np.diag(matrix))
@@ -202,7 +194,6 @@ def test_robust_fit_stays_where_outliers_pull_the_other_away():
     assert comparison.downweighted.dtype == bool
     assert 5 <= comparison.downweighted.sum() <= 9
     assert f"{comparison.downweighted.sum()} outliers weighed down by the loss" in " ".join(str(held).split())
-    assert "weighed down" in [text.get_text() for text in held.plot().legends[0].get_texts()]
 
 
 def test_covariance_of_a_robust_fit_is_the_inverse_of_its_hessian():
@@ -232,14 +223,6 @@ def test_a_prior_is_one_more_measurement():
     assert both.priors == {"free": "normal(4, 0.5)"}
     assert "prior: normal(4, 0.5)" in str(both)
     assert "values + 1 prior - 4 free unknowns" in str(both)
-
-
-def test_a_tight_prior_wins_and_a_wide_one_does_not():
-    without = sf.estimate(problem())
-    tight = sf.estimate(problem(tau=sf.Parameter(1.1, prior=sf.Normal(1.5, 1e-6))))
-    wide = sf.estimate(problem(tau=sf.Parameter(1.1, prior=sf.Normal(1.5, 1e6))))
-    assert tight.theta[0] == pytest.approx(1.5, abs=1e-6)
-    np.testing.assert_allclose(wide.theta, without.theta, rtol=1e-8)
 
 
 # Delays
@@ -275,17 +258,6 @@ def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
 
 
 # Scales
-
-
-def scaled(a, b):
-    """The same problem with k in units of a, damping in units of b."""
-
-    def rescaled(mode):
-        return lambda t, x, p: mode(t, x, {"k": p["k"] / a, "damping": p["damping"] / b})
-
-    system = sf.HybridSystem({"free": rescaled(free), "damped": rescaled(damped)}, [1.0, 0.0])
-    run = problem().experiments[0]
-    return sf.Problem(system, run, {"k": 2.0 * a, "damping": 0.3 * b})
 
 
 def test_a_logarithmic_scale_changes_the_path_and_the_intervals_alone():
