@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.problem_file import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -107,18 +106,13 @@ def test_heaters_were_switched_when_the_log_says():
     assert balance.success
     assert power.success
     # The energy balance is wrong by up to 44 s, says that it is sure, and its residuals say that it should not be.
-    away = np.abs(balance.transition_times[0] - recorded)
-    assert np.sum(away > 10.0) == 5
+    assert np.sum(np.abs(balance.transition_times[0] - recorded) > 10.0) == 5
     assert np.all(balance.standard_errors[:6] < 1.0)
-    assert not any(channel.white for channel in balance.residuals.channels)
     assert min(channel.correlation for channel in balance.residuals.channels) > 0.9
     # The better model is near, and its residuals are near noise, but not noise.
     assert power.cost < balance.cost / 15
     assert np.all(np.abs(power.transition_times[0] - recorded) < 3.0)
-    assert max(channel.rms for channel in power.residuals.channels) < 1.4
     assert not power.residuals.passed
-    # One supply feeds both heaters.
-    assert power.parameters["P2"][0] < 0.6 * power.parameters["P2"][1]
 
 
 def test_husky_loses_speed_in_turns():
@@ -150,22 +144,6 @@ def test_husky_limits_commands_and_static_fit_is_as_published():
 
 
 @pytest.fixture(scope="module")
-def tried():
-    return runpy.run_path(str(EXAMPLES / "husky" / "tried.py"))
-
-
-@pytest.mark.slow
-def test_husky_changes_do_not_earn_their_place(tried):
-    """On steps left out none lowers an error by more than 0.015 m or rad; else the page is wrong."""
-    *shares, position, yaw = tried["HUSKY"]["score"](*tried["leave_out"]("as it is"))
-    np.testing.assert_allclose(shares, [0.99, 0.92, 0.95], atol=0.01)
-    for name in tried["CHANGES"]:
-        changed = tried["HUSKY"]["score"](*tried["leave_out"](name))
-        assert changed[3] > position - 0.015, name
-        assert changed[4] > yaw - 0.015, name
-
-
-@pytest.fixture(scope="module")
 def covid():
     """The example and its fit."""
     module = runpy.run_path(str(EXAMPLES / "covid" / "covid.py"))
@@ -175,34 +153,22 @@ def covid():
 @pytest.mark.slow
 def test_covid_finds_the_rates_and_the_first_two_dates_that_were_published(covid):
     module, estimate = covid
-    days, counts = module["read"]()
-    assert [str(days[0]), str(days[-1])] == ["2020-03-02", "2020-04-21"]
-    assert (counts[0], counts.sum()) == (29, 148291 - 130)
     assert estimate.success
     assert estimate.cost < 551.2  # the lowest of 64 starts
     dates, rates = np.array(estimate.transition_dates[0], dtype="datetime64[m]"), estimate.parameters["lambda"]
-    published, other = module["PUBLISHED"], module["LEAST_SQUARES"]
+    published = module["PUBLISHED"]
     noons = np.array([f"{published[f'tau_{k}']}T12:00" for k in (1, 2, 3)], dtype="datetime64[m]")
     assert np.all(np.abs((dates - noons) / np.timedelta64(1, "D")) < [1.0, 2.0, 4.5])
     np.testing.assert_allclose(rates, [published[f"lambda[{k}]"] for k in range(4)], rtol=0.12)
-    assert np.all(np.diff(rates) < 0)
     assert rates[2] > module["RECOVERY"] > rates[3]  # it grows until the third change
-
-    profiles = {f"tau_{k}": estimate.profile(f"tau_{k}").interval() for k in (1, 2, 3)}
-    days_of = {name: float(other[name][-2:]) for name in profiles}  # of March, as t counts them
     # A published date is a day; the third lies outside, which the days from Easter on bring about.
+    profiles = {f"tau_{k}": estimate.profile(f"tau_{k}").interval() for k in (1, 2, 3)}
+    days_of = {name: float(module["LEAST_SQUARES"][name][-2:]) for name in profiles}  # of March, as t counts them
     meets = {name: low < days_of[name] + 1 and high > days_of[name] for name, (low, high) in profiles.items()}
     assert meets == {"tau_1": True, "tau_2": True, "tau_3": False}
-    within = dict(zip(estimate.theta_names, estimate.confidence_intervals(), strict=True))
-    for name in ("lambda[0]", "lambda[1]"):
-        assert within[name][0] < other[name] < within[name][1]
     early = sf.estimate(module["make_problem"](until="2020-04-09"))
-    assert early.success
     assert abs(early.transition_times[0][2] - float(published["tau_3"][-2:])) < 2.0
-
-    channel = estimate.residuals.channels[0]
-    assert channel.white
-    assert channel.normal
+    assert estimate.residuals.channels[0].white
     assert len(module["plot"](estimate, profiles).axes) == 2
 
 
@@ -245,9 +211,7 @@ def test_fishing_from_a_fleet_in_port(tmp_path):
     for switches, cost in expected.items():
         assert costs[switches] == pytest.approx(cost, abs=1e-6 if switches < 10 else 1e-10)
     assert costs[8] == pytest.approx(1.345295218283, abs=1e-10)
-    assert all(estimate.success for estimate in search.by_switches.values())
     assert [module["choose"](costs, c) for c in (0.03, 0.003, 0.0003)] == [2, 4, 8]
-    assert "8  1.345295218  0.00051" in module["table"](search)
     module["plot"](search).savefig(tmp_path / "fishing.svg")
 
 
@@ -312,33 +276,12 @@ def test_terrain_noise_has_the_order_that_it_was_made_with(terrain):
     assert len(terrain["fit_noise"](shocks)[0]) <= 2
 
 
-def test_terrain_study_of_the_intervals_in_a_few_refits(terrain):
-    corrected, naive, widths = terrain["cover"]("green_table_30", ("neither", "both"), (2.3,), 6)
-    assert corrected.shape == naive.shape == (1,)
-    assert corrected[0] >= 0.5
-    assert np.all((widths > 0.02) & (widths < 0.5))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "sequence", "times"),
-    [
-        ("table_gray_00", ("neither", "both"), (4.45,)),
-        ("table_gray_06", ("neither", "both"), (13.41,)),
-        ("table_gray_12", ("neither", "wheel 1", "both"), (7.98, 8.40)),
-    ],
-)
-def test_terrain_intervals_cover(terrain, name, sequence, times):
+def test_terrain_intervals_cover(terrain):
     """With noise as correlated as the residuals; of 100, 89 to 99 do if 95 % are right."""
-    corrected, _, widths = terrain["cover"](name, sequence, times, 100)
+    corrected, _, widths = terrain["cover"]("table_gray_12", ("neither", "wheel 1", "both"), (7.98, 8.40), 100)
     assert np.all(corrected >= 0.89)
     assert np.all(widths[:, 1] < 2 * widths[:, 0])  # and are not wide beyond need
-
-
-def test_terrain_problem_files_build_what_they_name(terrain):
-    problem = load_problem(EXAMPLES / "terrain" / "six.toml", searched=True).problem
-    assert [run.name for run in problem.experiments] == list(terrain["GREEN"])
-    assert len(problem.theta_names) == 6 + 6 * 5  # levels of the currents and lags; speeds and noise of each log
 
 
 @pytest.mark.slow

@@ -342,7 +342,8 @@ def test_a_reader_that_is_gone_ends_nothing_and_the_page_stays(folder, tmp_path,
         process.stdout.close()
         process.stdin.write("\n".join(LINES[2:20]))
         process.stdin.close()
-        assert process.stderr.readline() == "the samples have ended; Ctrl-C ends the page\n"
+        said = [process.stderr.readline() for _ in range(2)]
+        assert said == [f"written to {tmp_path}\n", "the samples have ended; Ctrl-C ends the page\n"]
         with urllib.request.urlopen(address) as answer:
             assert answer.status == 200
         process.send_signal(signal.SIGINT)
