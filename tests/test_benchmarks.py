@@ -27,7 +27,8 @@ from switchfit.problem.functions import use_float64
 ROWS = 22
 
 
-@pytest.mark.parametrize("reference", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", [False, True])
 def test_casadi_and_switchfit_agree(reference):
     problem = vehicle.with_reference(ROWS - 2) if reference else vehicle.without_reference()
     evaluator = vehicle.evaluator_with(problem, ROWS - 2)
@@ -131,6 +132,7 @@ def test_modes_count_what_is_named_and_what_is_another_sequence():
     assert (row["AMBIGUOUS"], row["of these with the truth named"]) == (1, 1)
 
 
+@pytest.mark.slow
 def test_what_peers_of_online_estimation_say():
     """On a drive of the vehicle both end where switchfit does: the modes in turn, mu, and when they changed."""
     pytest.importorskip("filterpy")

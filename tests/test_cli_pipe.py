@@ -23,15 +23,3 @@ def test_a_reader_that_is_gone_ends_nothing(stream, tmp_path, quick_processes):
     assert "Traceback" not in said
     assert {"report.txt", "estimate.json"} <= {path.name for path in tmp_path.iterdir()}
     assert ("written to" in said) == (other == "stderr")
-
-
-@pytest.mark.slow
-def test_a_check_of_which_one_line_is_read(quick_processes):
-    """Several things are printed one after the other; the reader leaves after the first line."""
-    command = [sys.executable, "-c", PROGRAM, "check", str(TOSS)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline()
-        process.stdout.close()
-        said = process.stderr.read()
-        assert process.wait(timeout=120) == 0
-    assert said == ""
