@@ -14,10 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import switchfit as sf
 from benchmarks import casadi_forms, derivatives, models, problems, side_by_side, vehicle
-from benchmarks.modes import study
-from benchmarks.modes.sets import SETS
-from benchmarks.online import drives, exact
-from benchmarks.online import side_by_side as online
+from benchmarks.online import drives
 from benchmarks.peers import casadi_collocation, casadi_horizon, casadi_shooting, scipy_differences
 from benchmarks.sharp import problems as sharp_problems
 from benchmarks.sharp.case import is_right
@@ -113,55 +110,6 @@ def test_a_state_slides_along_a_corner_and_leaves_it():
     )
     np.testing.assert_allclose(found, [[0, 0], [0, 0], [1 / 6, 1 / 2]], atol=1e-8)
     np.testing.assert_allclose(found[-1], end, rtol=1e-12)
-
-
-def test_modes_count_what_is_named_and_what_is_another_sequence():
-    """Of logs whose library lacks a mode of the truth, everything that is called FOUND is wrong."""
-    truth = SETS["pendulum, a mode missing"][0](0)
-    assert not truth.is_complete
-    assert not set(truth.sequence) <= set(truth.settings["library"])
-    assert set(SETS["pendulum, angle measured"][0](0).sequence) <= {"free", "braked", "driven"}
-    common = {"right_number": dict.fromkeys(("bic", "mbic", "aicc"), True), "lateness": 0.0, "complete": True}
-    common |= {"seconds": 0.1, "wall": 0.1, "fits": 1, "evaluations": 1}
-    ends = [(True, 0.0, "FOUND"), (False, 1.9, "FOUND"), (False, -1.9, "FOUND"), (False, -2.1, "FOUND")]
-    ends += [(False, 0.0, "AMBIGUOUS"), (False, 9.0, "FOUND")]
-    outcomes = [study.Outcome(same=same, gap=gap, status=status, named=True, **common) for same, gap, status in ends]
-    row = dict(zip(study.HEADER, study.count("x", outcomes), strict=True))
-    assert (row["FOUND"], row["of these wrong"], row["of these another sequence"]) == (5, 2, 4)
-    assert (row["the truth within 2 of it"], row["the truth better by more"]) == (2, 1)
-    assert (row["AMBIGUOUS"], row["of these with the truth named"]) == (1, 1)
-
-
-@pytest.mark.slow
-def test_what_peers_of_online_estimation_say():
-    """On a drive of the vehicle both end where switchfit does: the modes in turn, mu, and when they changed."""
-    pytest.importorskip("filterpy")
-    [drive] = online.simulate_drives([0])
-    for told in (
-        *online.run_bank("positions and headings", 0.02, 0.995, [0.9], [drive])[0.9],
-        *online.run_horizon("positions and headings", [drive])["mean of 1.2 s beyond 0.6"],
-        online.follow("positions and headings", 3.0, drive),
-    ):
-        row = dict(zip(online.HEADER, online.describe("", [told], [drive]), strict=True))
-        assert (row["wrong paths"], row["early"]) == ("0", "0")
-        assert told.mu == pytest.approx(0.7, abs=0.05)
-        if told.changes is not None:
-            np.testing.assert_allclose(told.changes, drive.taus, atol=0.15)
-
-
-def test_the_exact_likelihood_ratio_is_that_of_fits():
-    """Twice by how much a fit with a change has the lower cost than one without; the grid loses little of it."""
-    [drive] = online.simulate_drives([0])
-    count = int(np.searchsorted(drive.times, drive.taus[0])) + 9
-    begun = drives.Drive(drive.taus, drive.times[:count], drive.values[:count])
-    ratios = exact.find_ratios(begun)
-    told, end = drives.build_problem("positions"), float(begun.times[-1])
-    sensor = replace(told.experiments[0].data[0], times=begun.times, values=begun.values[:, :2])
-    run = sf.Experiment(sensor, ("stick", "slip"), (end - 0.8,), 0.0, end)
-    fitted = sf.estimate(replace(told, experiments=(run,)), strategy="local")
-    away = begun.values[:, :2] - exact.simulate_slides(count)[0][exact.PARTS :: exact.PARTS]
-    assert ratios[-1] == pytest.approx(np.sum((away / drives.SIGMA) ** 2) - 2 * fitted.cost, abs=0.5)
-    assert online.find_delay(ratios > 12.0, begun, 0) == pytest.approx(0.7, abs=0.2)
 
 
 def test_a_step_of_the_peers_is_that_of_switchfit():

@@ -351,10 +351,8 @@ def test_check_is_one_screen_of_many_runs(tmp_path, folder):
     (tmp_path / "problem.toml").write_text("\n\n".join([head, *parts]))
     result = run("check", tmp_path / "problem.toml")
     assert result.exit_code == 0, result.output
-    lines = result.stdout.splitlines()
-    assert len(lines) < 50
+    assert len(result.stdout.splitlines()) < 50
     assert "and 9 more experiments: --full lists them" in result.stdout
-    assert "and 5 more" in result.stdout
     assert "in all 12 experiments" in result.stdout
     assert "Paper's equations" not in result.stdout
     result = run("check", tmp_path / "problem.toml", "--full")
@@ -365,27 +363,17 @@ def test_check_is_one_screen_of_many_runs(tmp_path, folder):
 # --- completion -------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def complete(monkeypatch, capsys):
-    """Returns what the shell is told for the last of some words."""
-
-    def ask(*words):
-        monkeypatch.setenv("_SWITCHFIT_COMPLETE", "complete_bash")
-        monkeypatch.setenv("COMP_WORDS", " ".join(words))
-        monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+def test_commands_options_and_examples_are_completed(monkeypatch, capsys):
+    """Files are completed by the shell itself, where nothing is offered."""
+    monkeypatch.setenv("_SWITCHFIT_COMPLETE", "complete_bash")
+    for words, offered in {
+        ("fit", ""): [], ("examples", "to"): ["toss", "tosses"], ("fit", "--ver"): ["--verbose"], ("si",): ["simulate"],
+    }.items():  # fmt: skip
+        monkeypatch.setenv("COMP_WORDS", " ".join(("switchfit", *words)))
+        monkeypatch.setenv("COMP_CWORD", str(len(words)))
         with pytest.raises(SystemExit):
             cli.main()
-        return capsys.readouterr().out.split()
-
-    return ask
-
-
-def test_commands_options_and_examples_are_completed(complete):
-    """Files are completed by the shell itself, where nothing is offered."""
-    assert complete("switchfit", "fit", "") == []
-    assert complete("switchfit", "examples", "to") == ["toss", "tosses"]
-    assert complete("switchfit", "fit", "--ver") == ["--verbose"]
-    assert complete("switchfit", "si") == ["simulate"]
+        assert capsys.readouterr().out.split() == offered
 
 
 # --- progress, and all of it ------------------------------------------------------------------------------------------

@@ -153,17 +153,14 @@ def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, fol
 def test_json_and_verbose(folder):
     result = run("modes", folder / "problem.toml", "--max-switches", 3, "--json", "--verbose")
     assert result.exit_code == 0, result.stderr
-    assert "fits, J = " in result.stderr
     assert ", rise -> fall -> rise\n" in result.stderr
     shown = json.loads(result.stdout)
-    assert (shown["status"], shown["success"], shown["criterion"]) == ("FOUND", True, "bic")
-    assert shown["message"].startswith("Found: rise -> fall -> rise.")
+    assert (shown["status"], shown["success"], shown["criterion"], shown["out"]) == ("FOUND", True, "bic", None)
     assert [row["switches"] for row in shown["by_switches"]] == [0, 1, 2, 3]
     assert shown["alternatives"][0]["sequences"] == [["rise", "fall", "rise"]]
     assert sum(row["weight"] for row in shown["alternatives"]) == pytest.approx(1.0)
     best = {row["name"]: row["value"] for row in shown["best"]["unknowns"]}
     np.testing.assert_allclose([best["a"], best["b"]], [0.7, 0.4], rtol=0.05)
-    assert (shown["out"], shown["problem_file"]) == (None, None)
 
 
 def test_options_override_the_library_of_the_file(folder, monkeypatch):
@@ -174,41 +171,13 @@ def test_options_override_the_library_of_the_file(folder, monkeypatch):
         raise ValueError("enough")
 
     monkeypatch.setattr(sf, "find_modes", find_modes)
-    run("modes", folder / "problem.toml")
+    result = run("modes", folder / "problem.toml")
+    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
     defaults = {name: p.default for name, p in inspect.signature(sf.find_modes).parameters.items()}
     file = {"first": ["rise"], "min_duration": 0.2, "successions": {"rise": ["fall", "drift"], "fall": ["rise"]}}
     assert given == {name: (defaults | file)[name] for name in given}
-    options = ("--library", "rise, fall", "--last", "fall", "--min-duration", "rise=0.3,fall=1")
-    result = run("modes", folder / "problem.toml", *options, "--criterion", "mbic", "--width", 12, "--method", "beam")
-    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
-    assert given == {
-        "library": ["rise", "fall"],
-        "first": ["rise"],
-        "last": ["fall"],
-        "min_duration": {"rise": 0.3, "fall": 1.0},
-        "successions": {"rise": ["fall", "drift"], "fall": ["rise"]},
-        "max_switches": 8,
-        "criterion": "mbic",
-        "switch_cost": None,
-        "method": "beam",
-        "width": 12,
-    }
-    run("modes", folder / "problem.toml", "--min-duration", "0.7", "--switch-cost", "5")
-    assert (given["min_duration"], given["switch_cost"]) == (0.7, 5.0)
-
-
-@pytest.mark.slow
-def test_a_mode_that_is_missing_is_exit_code_1(folder, tmp_path):
-    """Without "fall" no sequence explains the log; the best is written all the same, and the report of its fit."""
-    command = ("modes", folder / "free.toml", "--max-switches", 1, "--width", 3, "--out", tmp_path, "--full")
-    (folder / "free.toml").write_text(PROBLEM.partition("[library]")[0] + '[library]\nmodes = ["rise", "drift"]\n')
-    result = run(*command)
-    assert result.exit_code == 1
-    assert result.stdout.startswith("Not explained: no sequence explains the data.")
-    assert result.stderr.endswith("the first line of the result says why, and what to do.\n")
-    assert (tmp_path / "best.toml").exists()
-    assert "\nQuality of the fit\n" in result.stdout
-    assert run(*command[:6], "--quiet").output == ""
+    run("modes", folder / "problem.toml", "--criterion", "mbic", "--width", 12, "--method", "beam", "--switch-cost", 5)
+    assert [given[name] for name in ("criterion", "width", "method", "switch_cost")] == ["mbic", 12, "beam", 5.0]
 
 
 def test_ctrl_c_keeps_the_best(folder, tmp_path, monkeypatch):
@@ -281,9 +250,6 @@ def test_what_is_wrong_with_a_library_is_said(folder, old, new, message):
     result = run("modes", write_problem(folder, old, new))
     assert result.exit_code == 2
     assert message in result.stderr
-    wrong = run("modes", folder / "problem.toml", "--min-duration", "rise=long")
-    assert wrong.exit_code == 2
-    assert "--min-duration must be a number, or MODE=NUMBER,MODE=NUMBER; got rise=long." in wrong.stderr
 
 
 def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):
@@ -308,6 +274,9 @@ mode_sequence = ["pushed", "fall"]
 transition_times = ["2024-05-01T10:00:02Z"]
 parameter_map = { a = "a" }
 
+inputs = { file = "inputs/*.csv", time = "t", epoch = "s", columns = ["u"], kind = "linear" }
+jumps = [{ time = "2024-05-01T10:00:05Z", map = "models/model.py:drop" }]
+
 [[experiments.data]]
 file = "logs/*.csv"
 time = "t"
@@ -316,17 +285,6 @@ columns = ["T"]
 observe = "models/model.py:twice"
 sigma = 0.04
 loss = "huber"
-
-[experiments.inputs]
-file = "inputs/*.csv"
-time = "t"
-epoch = "s"
-columns = ["u"]
-kind = "linear"
-
-[[experiments.jumps]]
-time = "2024-05-01T10:00:05Z"
-map = "models/model.py:drop"
 
 [options]
 strategy = "local"
@@ -354,8 +312,7 @@ def test_paths_dates_patterns_and_models_are_kept(tmp_path):
     again = load_problem(out / "best.toml")
     problem = again.problem
     assert problem.theta_names == given.problem.theta_names
-    names = dict(zip(problem.theta_names, problem.initial_theta.tolist(), strict=True))
-    np.testing.assert_allclose(list(names.values()), estimate.theta, rtol=1e-12)
+    np.testing.assert_allclose(problem.initial_theta, estimate.theta, rtol=1e-12)
     assert problem.min_duration == given.problem.min_duration == {"fall": 0.5}
     assert again.options == {"strategy": "local"}
     for before, after in zip(given.problem.experiments, problem.experiments, strict=True):
@@ -363,9 +320,7 @@ def test_paths_dates_patterns_and_models_are_kept(tmp_path):
         np.testing.assert_array_equal(before.data[0].times, after.data[0].times)
         np.testing.assert_array_equal(before.inputs.values, after.inputs.values)
         assert before.jump_times == pytest.approx(after.jump_times)
-    fit = sf.estimate(problem, strategy="local")
-    np.testing.assert_allclose(fit.cost, estimate.cost, rtol=1e-10)
-    np.testing.assert_allclose(fit.theta, estimate.theta, rtol=1e-6)
+    np.testing.assert_allclose(sf.evaluate(problem).cost, estimate.cost, rtol=1e-10)
     first, second = tomllib.loads(text)["experiments"]
     assert first["origin"] == given.problem.experiments[0].origin.date, "from which its numbers count"
     assert second["data"][0]["file"] == "../../home/logs/1.csv"

@@ -195,22 +195,3 @@ def test_command_lines(count, folder, monkeypatch):
         assert said in "012", f"{arguments}: {said}"
         found[said] += 1
     assert found["2"] >= 0.5 * count, found
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("problem.toml", PROBLEM.replace('"log.csv"', '"/dev/zero"'), "/dev/zero is a device; name a file"),
-        ("problem.toml", PROBLEM.replace('"log.csv"', '"a\\u0000b"'), "is not a file name"),
-        ("problem.toml", PROBLEM.replace("room.py:room", "x" * 5000 + ".py:room"), "there is no file"),
-        ("log.csv", '# a\nt,T\n0,1\n\n1,"2\n2,3"\n3,a\n', "log.csv, line 6, column 'T': '22,3' is not a number"),
-    ],
-)
-def test_what_no_reader_expects(name, content, message, folder):
-    (folder / name).write_text(content)
-    for command in (("check", "problem.toml"), ("check", "problem.toml", "--no-run")):
-        result = CliRunner().invoke(cli.app, command)
-        assert result.exit_code == 2, result.exception
-        assert message in result.stderr
-        assert "Traceback" not in result.stderr
-    assert outcome("check", "/dev/zero") == "2"

@@ -4,7 +4,6 @@ One oscillator that is damped from tau on; its derivatives are checked for each 
 orders and by four methods that agree.
 """
 
-from dataclasses import replace
 from functools import cache
 
 import jax
@@ -14,11 +13,7 @@ import pytest
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.result import termination_of
 from switchfit.fit.trajectory import compare
-from switchfit.optimize import Result
-from switchfit.optimize.matrix import Curvature, Spectrum
-from switchfit.optimize.state import Finding
 from switchfit.problem.data import LOSSES, influence, robust
 from switchfit.problem.functions import use_float64
 
@@ -265,25 +260,3 @@ def test_a_logarithmic_scale_changes_the_path_and_the_intervals_alone():
     assert (bounded.theta[1], bounded.standard_errors[1]) == (2.05, 0.0)
     assert list(map(str, bounded.active)) == ["k at its upper bound 2.05"]
     assert bounded.active[0].multiplier == pytest.approx(-bounded.gradient[1], rel=1e-9)
-
-
-def test_a_line_search_that_failed_tells_of_a_delay_that_is_estimated():
-    system = sf.HybridSystem({"on": lambda t, x, p: p["k"] - x, "off": lambda t, x, p: -x}, [0.0])
-
-    def problem(delay):
-        data = sf.Measurements([1.0, 2.0], [0.5, 0.2], sigma=0.1, delay=delay)
-        unknowns = {"k": 1.0, "d": sf.Parameter(0.1, lower=0.0, upper=0.5)}
-        return sf.Problem(system, sf.Experiment(data, ("on", "off"), (1.0,), 0.0, 3.0), unknowns)
-
-    result = Result(
-        theta=np.array([1.0, 1.0, 0.1]), cost=1.0, gradient=np.zeros(3), hessian=np.eye(3), optimality=0.1,
-        iterations=1, evaluations=1, status=sf.Status.LINE_SEARCH_FAILED, active=(), multipliers=np.zeros(0), kinks=(),
-        curvature=Curvature(np.eye(3), lambda: Spectrum(np.ones(3), np.zeros(3))),
-        tolerance=1e-7, history=(), explain=lambda: Finding("jump", {"before": 1.0, "after": 2.0}, ((0, 1.5),)),
-    )  # fmt: skip
-    hint = "A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is"
-    jump = "The cost jumps from 1 to 2 where tau_1 passes 1.5. The optimiser needs a cost that is continuous there."
-    assert f"from there. {jump} {hint}" in str(termination_of(result, problem("d")))
-    assert str(termination_of(result, problem(0.1))).endswith(jump)
-    done = replace(result, status=sf.Status.CONVERGED, explain=None)
-    assert hint not in str(termination_of(done, problem("d")))

@@ -140,18 +140,6 @@ def test_a_log_that_was_given_on_the_command_line(project):
     build_again(out / "tuesday" / "estimate.json")
 
 
-def test_a_problem_that_is_built_in_a_python_file(project):
-    (project / "problem.toml").write_text('problem = "built.py:build"\n')
-    text = "from pathlib import Path\nfrom switchfit.io.problem_file import load_problem\n"
-    text += "def build():\n    return load_problem(Path(__file__).parent / 'inner.toml').problem\n"
-    (project / "built.py").write_text(text)
-    (project / "inner.toml").write_text(PROBLEM)
-    path = save(project)
-    build_again(path)
-    (project / "log.csv").write_text(log_of(3.1))
-    assert "was fitted to other values" in refuse(path)  # which no hash of a file shows
-
-
 def test_changes_of_the_model_are_listed(project):
     """Also those of a file that only the model's file imports; not those of data, whose values are compared."""
     path = project / "out" / "estimate.json"

@@ -16,12 +16,11 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
@@ -268,8 +267,6 @@ def write_file(path: Path, content: str | bytes) -> None:
         write_atomically(content, path)
 
 
-T = TypeVar("T")
-
 DOTS = 150
 """Dots per inch of a figure."""
 
@@ -307,15 +304,6 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of
 def select_given(**options: Any) -> dict[str, Any]:
     """Return the options that are given; the others are None."""
     return {name: value for name, value in options.items() if value is not None}
-
-
-def read_pairs(given: str, name: str, form: str, read: Callable[[str], T]) -> list[tuple[str, T]]:
-    """Return the pairs in ``A=0.5,B=1``; anything else in the option of a name ends the command."""
-    pairs = [[side.strip() for side in part.rpartition("=")[::2]] for part in given.split(",")]
-    with suppress(ValueError):
-        if all(key and value for key, value in pairs):
-            return [(key, read(value)) for key, value in pairs]
-    fail(f"{name} must be {form}; got {given}.")
 
 
 def print_list(title: str, entries: Sequence[object]) -> None:
