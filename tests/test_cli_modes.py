@@ -165,6 +165,7 @@ def test_json_and_verbose(folder):
 
 def test_options_override_the_library_of_the_file(folder, monkeypatch):
     given = {}
+    defaults = {name: p.default for name, p in inspect.signature(sf.find_modes).parameters.items()}
 
     def find_modes(problem, callback, **settings):
         given.update(settings)
@@ -173,7 +174,6 @@ def test_options_override_the_library_of_the_file(folder, monkeypatch):
     monkeypatch.setattr(sf, "find_modes", find_modes)
     result = run("modes", folder / "problem.toml")
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
-    defaults = {name: p.default for name, p in inspect.signature(sf.find_modes).parameters.items()}
     file = {"first": ["rise"], "min_duration": 0.2, "successions": {"rise": ["fall", "drift"], "fall": ["rise"]}}
     assert given == {name: (defaults | file)[name] for name in given}
     run("modes", folder / "problem.toml", "--criterion", "mbic", "--width", 12, "--method", "beam", "--switch-cost", 5)
@@ -240,7 +240,11 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
         ('first = "rise"', 'frist = "rise"', "unknown key 'library.frist'; did you mean 'first'?"),
         ('first = "rise"', 'first = "fall"\nlast = "fall"\nmax_switches = 0', "unknown key 'library.max_switches'"),
         ("min_duration = 0.2", "min_duration = -1", "'library.min_duration' must be greater than or equal to 0; got"),
-        ("min_duration = 0.2", "min_duration = 9", "No succession: first, last, successions and min_duration admit n"),
+        (
+            'first = "rise"',
+            'first = "drift"\nlast = "rise"',
+            "No succession: first, last, successions and min_duration admit n",
+        ),
         ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 entries; got []"),
         ("tf = 8.0", "tf = 8.0\ntransition_times = [2.0]", "transition_times belong to a mode_sequence, which is miss"),
         ("tf = 8.0", "tf = { value = 8.0, lower = 7.96, upper = 9.0 }", "find_modes needs a known tf"),
@@ -253,7 +257,7 @@ def test_what_is_wrong_with_a_library_is_said(folder, old, new, message):
 
 
 def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):
-    (folder / "python.toml").write_text('problem = "model.py:build"\n\n[library]\nmodes = "rise"\n')
+    (folder / "python.toml").write_text('problem = "model.py:build"\n\n[library]\nmodes = ["rise"]\n')
     result = run("modes", folder / "python.toml", "--out", tmp_path)
     assert result.exit_code in (0, 1)
     assert "no best.toml: " in result.stderr

@@ -452,13 +452,13 @@ def catalogue():
         "read_log": Door(
             sf.read_log,
             {"path": log_file(), "columns": ["x", "yaw"], "time": "t", "time_unit": "ms", "topic": None}
-            | {"origin": None, "range_error": None, "repair": ("sort", "unwrap:yaw")},
+            | {"origin": None, "repair": ("sort", "unwrap:yaw")},
             words={
                 "columns": ("columns", "column", "unwrap"),
                 "time": ("time must", "column"),
                 "path": ("file", "path", "folder"),
             }
-            | {"origin": ("origin", "latitude"), "range_error": ("range_error", "latitude"), "topic": ("topic",)},
+            | {"origin": ("origin", "latitude"), "topic": ("topic",)},
             inside={"origin": lambda bad: [bad, 1.0]},
         ),
         "RunningCost": Door(lambda **given: problem(experiment(sf.RunningCost(**given))), {"ell": energy}),

@@ -78,7 +78,7 @@ def test_a_log_that_is_out_of_order_is_repaired_as_the_file_says(tmp_path):
     problem = load_problem(tmp_path / "new" / "problem.toml").problem
     assert len(problem.experiments[0].data[0].times) == 150
     assert problem.experiments[0].tf == pytest.approx(14.9e-3)
-    assert problem.system.state_names == ('a "b" {c} \\d',)
+    assert problem.system.state_names == ('a "b" {c} \\d', "count")
 
 
 def test_a_large_log_is_referred_to(tmp_path, monkeypatch):
