@@ -77,6 +77,7 @@ def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
     assert "is correlated: the model is slightly wrong" in str(estimate.verdict)
 
 
+@pytest.mark.slow
 def test_husky_loses_speed_in_turns():
     """Three of the ten steps, and two others."""
     module = runpy.run_path(str(EXAMPLES / "husky" / "husky.py"))
@@ -156,6 +157,7 @@ def terrain():
     return runpy.run_path(str(EXAMPLES / "terrain" / "terrain.py"))
 
 
+@pytest.mark.slow
 def test_terrain_problem_file_ends_at_the_border():
     found = json.loads(
         CliRunner().invoke(cli.app, ["fit", str(EXAMPLES / "terrain" / "problem.toml"), "--json"]).stdout

@@ -21,7 +21,7 @@ from switchfit import cli, paper
 from switchfit.engine.native.program import drop_programs
 from switchfit.io.problem_file import tables
 
-SIZES = [pytest.param(60, id="short"), pytest.param(1200, id="long", marks=pytest.mark.fuzz)]
+SIZES = [pytest.param(40, id="short"), pytest.param(1200, id="long", marks=pytest.mark.fuzz)]
 LONGEST = 120
 """Seconds after which a command hangs."""
 
