@@ -6,6 +6,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -267,6 +269,21 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypat
     result = run("fit", folder / "problem.toml", "--out", tmp_path / "report.txt")
     assert result.exit_code == 2
     assert f"the folder {tmp_path / 'report.txt'} cannot be created" in result.stderr
+
+
+@pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.slow)])
+def test_a_reader_that_is_gone_ends_nothing(stream, folder, tmp_path, quick_processes):
+    """As `switchfit ... | head`: no traceback, all files, and the exit code as without the pipe."""
+    program = "from switchfit.cli import main; main()"
+    command = [sys.executable, "-c", program, "fit", folder / "problem.toml", "--out", tmp_path, "--no-figures"]
+    other = "stderr" if stream == "stdout" else "stdout"
+    with subprocess.Popen(command, **{stream: subprocess.PIPE, other: subprocess.PIPE}, text=True) as process:
+        getattr(process, stream).close()  # before anything is written
+        said = getattr(process, other).read()
+        assert process.wait(timeout=120) == 0
+    assert "Broken pipe" not in said
+    assert "Traceback" not in said
+    assert {path.name for path in tmp_path.iterdir()} == {"report.txt", "estimate.json"}
 
 
 # --- for scripts, and for those who watch -----------------------------------------------------------------------------
