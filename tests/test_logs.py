@@ -406,26 +406,14 @@ def test_a_dialect_in_a_problem_file(problem):
     assert problem(("sigma", "time_scale = 1\nsigma")).problem.experiments[0].tf == 800.0
 
 
-def test_times_since_1970_in_a_problem_file(problem, write):
-    """They are numbers like others there, and window and time_offset are in them; 'first' makes them begin at 0."""
-    write("Zeit;Weg\n" + "".join(f"{1700000000 + k};{k}\n" for k in range(5)))
-    (run,) = problem(("sigma", "time_offset = 1700000001\nsigma")).problem.experiments
-    np.testing.assert_array_equal(run.data[0].times, [-1, 0, 1, 2, 3])
-    window = "window = [1700000001, 1700000003]\n"
-    (run,) = problem(("sigma", f'{window}time_offset = "first"\nsigma')).problem.experiments
-    np.testing.assert_array_equal(run.data[0].times, [0, 1, 2])
-
-
 @pytest.mark.parametrize(
-    ("times", "message", "repair"),
-    [
-        ("01132", r"Measurements times must increase strictly; in .*a\.csv, line 4, 1\.0 follows 1\.0\.", "drop-dupl"),
-        ("01324", r"Measurements times must increase strictly; in .*a\.csv, line 5, 2\.0 follows 3\.0\.", "sort"),
-    ],
+    ("times", "said", "repair"),
+    [("01132", "line 4, 1.0 follows 1.0.", "drop-dupl"), ("01324", "line 5, 2.0 foll", "sort")],
 )
-def test_times_out_of_order_are_said_with_their_line(problem, write, times, message, repair):
+def test_times_out_of_order_are_said_with_their_line(problem, write, times, said, repair):
     write("Zeit;Weg\n" + "".join(f"{t};{k}\n" for k, t in enumerate(times)))
-    with pytest.raises(InputError, match=rf"experiments\[1\]\.data\[1\]: {message} repair = \['{repair}"):
+    message = rf"experiments\[1\]\.data\[1\]: .* must increase strictly; in .*{said}.* repair = \['{repair}"
+    with pytest.raises(InputError, match=message):
         problem()
     mended = problem(("sigma", 'repair = ["sort", "drop-duplicates"]\nsigma')).problem.experiments[0].data[0]
     np.testing.assert_array_equal(mended.times, sorted(map(float, set(times))))
