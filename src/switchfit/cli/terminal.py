@@ -328,30 +328,9 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
 def write_figure(result: Any, path: Path) -> None:
     """Write the figure of a result; the ending of the name is its format."""
     os.environ.setdefault("MPLBACKEND", "Agg")
-    figure, content = result.plot(), io.BytesIO()
-    if path.suffix == ".png":
-        _write_png(figure, content)
-    else:
-        figure.savefig(content, format=path.suffix[1:], dpi=DOTS)
+    content = io.BytesIO()
+    result.plot().savefig(content, format=path.suffix[1:], dpi=DOTS)
     write_file(path, content.getvalue())
-
-
-def _write_png(figure: Any, file: io.BytesIO) -> None:
-    """Write what ``savefig`` does, in three quarters of its time.
-
-    `savefig` draws a figure with a layout twice, the first time only to find the layout, which drawing once does too.
-    """
-    from matplotlib import rcParams
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.image import imsave
-
-    if rcParams["savefig.bbox"] or rcParams["savefig.transparent"] or rcParams["savefig.facecolor"] != "auto":
-        figure.savefig(file, format="png", dpi=DOTS)  # as matplotlibrc asks
-        return
-    figure.set_dpi(DOTS)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    imsave(file, canvas.buffer_rgba(), format="png", origin="upper", dpi=DOTS)
 
 
 def fail_for_refused(issues: Sequence[Issue]) -> None:
