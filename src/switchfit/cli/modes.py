@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
 from switchfit.cli import terminal
 from switchfit.cli.terminal import option, output_folder
 
@@ -36,7 +34,6 @@ Method = Annotated[
     option(help="What proposes sequences. Default: auto, the beam for data if the model has machine code."),
 ]
 Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
-Full = Annotated[bool, typer.Option("--full", help="Also print the report of the best sequence's fit, all of it.")]
 
 
 def modes(
@@ -48,7 +45,6 @@ def modes(
     method: Method = "auto",
     width: Width = 40,
     figures: terminal.FigureFormat = "png",
-    full: Full = False,
     json: terminal.Json = False,
     quiet: terminal.Quiet = False,
     verbose: terminal.Verbose = False,
@@ -75,10 +71,6 @@ def modes(
         terminal.print_list("Logs", loaded.issues)
         search = _search(loaded, loaded.library | settings)
         terminal.print_text(search)
-        if full and search.best is not None:
-            from switchfit.runtime.presentation import format_text
-
-            terminal.print_text(f"\n{format_text(search.best, full=True, files={})}")
         best = None if out is None else _write(search, loaded, out, figures)
         terminal.print_json(summarize_modes(search) | {"out": out, "problem_file": best})
         terminal.fail_for_refused(loaded.issues)
