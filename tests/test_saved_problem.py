@@ -121,9 +121,10 @@ def test_the_folder_has_moved(project, tmp_path):
     project.rename(tmp_path / "moved")
     (tmp_path / "moved" / "problem.toml").unlink()  # the text that was saved is enough
     build_again(tmp_path / "moved" / "out" / "estimate.json")
-    (tmp_path / "moved" / "log.csv").write_text(log_of(3.5))
-    said = refuse(tmp_path / "moved" / "out" / "estimate.json")  # read where it is now, not where it was
-    assert f"was fitted to other values than the files in {tmp_path / 'moved'} have now: fit them again." in said
+    for other in (log_of(3.5), log_of(3.2).replace("0.25;", "0.3;")):  # other values, another time
+        (tmp_path / "moved" / "log.csv").write_text(other)
+        said = refuse(tmp_path / "moved" / "out" / "estimate.json")  # read where it is now, not where it was
+        assert f"was fitted to other values than the files in {tmp_path / 'moved'} have now: fit them again." in said
 
 
 def test_a_log_that_was_given_on_the_command_line(project):
