@@ -1,6 +1,5 @@
 """All sides of the benchmarks compute the same thing. Nothing here looks at the clock."""
 
-import json
 import math
 import sys
 from dataclasses import replace
@@ -14,15 +13,9 @@ pytest.importorskip("casadi")
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import switchfit as sf
-from benchmarks import casadi_forms, derivatives, harm, machine, models, problems, side_by_side, vehicle
-from benchmarks.fit import CostBySciPy
-from benchmarks.modes import peers, study
-from benchmarks.modes.sets import SETS
-from benchmarks.online import drives, exact
-from benchmarks.online import side_by_side as online
+from benchmarks import casadi_forms, derivatives, models, problems, side_by_side, vehicle
+from benchmarks.online import drives
 from benchmarks.peers import casadi_collocation, casadi_horizon, casadi_shooting, scipy_differences
-from benchmarks.sharp import command as sharp_command
-from benchmarks.sharp import methods as sharp_methods
 from benchmarks.sharp import problems as sharp_problems
 from benchmarks.sharp.case import is_right
 from benchmarks.sharp.corners import find_sides, integrate
@@ -31,7 +24,8 @@ from switchfit.problem.functions import use_float64
 ROWS = 22
 
 
-@pytest.mark.parametrize("reference", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", [False, True])
 def test_casadi_and_switchfit_agree(reference):
     problem = vehicle.with_reference(ROWS - 2) if reference else vehicle.without_reference()
     evaluator = vehicle.evaluator_with(problem, ROWS - 2)
@@ -42,13 +36,6 @@ def test_casadi_and_switchfit_agree(reference):
     for name, form in casadi_forms.FORMS.items():
         program = casadi_forms.Timed(form(rows, reference))
         assert derivatives.gap(ours, *program(theta)) < 1e-10, name
-
-
-def test_cost_by_scipy_is_that_of_switchfit():
-    problem = vehicle.with_reference()
-    theta = problem.initial_theta
-    ours = vehicle.evaluator_with(problem, None)(theta).cost
-    assert CostBySciPy(problem)(theta) == pytest.approx(ours, rel=1e-6)
 
 
 def test_entrywise_models_are_those_of_switchfit():
@@ -97,22 +84,6 @@ def test_collocation_finds_the_known_optimum_of_fishing():
     np.testing.assert_allclose(found.theta, models.FISHING_BEST, atol=1e-6)
 
 
-def test_the_row_of_find_modes_shows_the_fit_that_it_returns(monkeypatch):
-    """Others get a fit from the sequence that they found; the row of a method with a fit of its own shows that."""
-    truth = peers.three_modes(0)
-    found = peers.search_ourselves(truth)
-    assert found.sequence == truth.sequence
-    assert found.fit is not None
-    assert found.times.tolist() == found.fit.transition_times[0].tolist()
-    poor = replace(found.fit, cost=found.fit.cost + 1.0)
-    rows = {}
-    for name, fit in {"own": poor, "none": None}.items():
-        monkeypatch.setattr(peers, "METHODS", {name: (lambda truth, fit=fit: found._replace(fit=fit), "modes", 1)})
-        [row] = peers.run([0])
-        rows[name] = dict(zip(peers.HEADER, row, strict=True))["criterion as good as from the truth"]
-    assert rows == {"own": 0, "none": 1}
-
-
 @pytest.mark.parametrize("name", sorted(sharp_problems.PROBLEMS))
 def test_twins_of_sharp_problems_are_the_models_that_switchfit_gets(name):
     """The entries of both are equal on all sides of all corners, and the truth fits its data as noise does."""
@@ -141,109 +112,6 @@ def test_a_state_slides_along_a_corner_and_leaves_it():
     np.testing.assert_allclose(found[-1], end, rtol=1e-12)
 
 
-def test_sharp_problems_are_fitted_judged_and_counted(tmp_path, monkeypatch, capsys):
-    """An end is judged by its J and not by what it says, an error ends nothing, and the table says all of it."""
-
-    def fail(case, start):
-        raise ValueError("no 5")
-
-    def lie(case, start):
-        return sharp_methods.End(case.truth * 1.2, 0.0, True, "CONVERGED, good")
-
-    monkeypatch.setattr(machine, "use_one_core", machine.all_cores)
-    monkeypatch.setitem(sharp_methods.METHODS, "local", lie)
-    monkeypatch.setitem(sharp_methods.METHODS, "auto", fail)
-    sharp_command.main(["--problems", "tank,table", "--starts", "1", "--folder", str(tmp_path)])
-    outcomes = json.loads((tmp_path / "sharp.json").read_text())["outcomes"]
-    assert {name: [end["right"] for end in found["scipy"]] for name, found in outcomes.items()} == {
-        "tank": [True],
-        "table": [True],
-    }
-    [row] = [line for line in (tmp_path / "sharp.md").read_text().splitlines() if line.startswith("| tank")]
-    cells = [cell.strip() for cell in row.split("|")]
-    assert [cells[k] for k in (2, 5, 6, 7, 10, 11, 12)] == ["0 of 1", "1", "0", "0 of 1", "0", "1", "1 of 1"]
-    assert "1 times ValueError: no …" in (tmp_path / "sharp.md").read_text()
-
-
-def test_harm_says_which_rules_the_default_breaks():
-    def fitted(cost, seconds):
-        return {"cost": cost, "verdict": "good", "unknowns": 3, "seconds": seconds}
-
-    local, failed = fitted(2.0, 0.5), {"error": "ValueError: no | 5", "seconds": 0.1}
-    stopped = {"error": "stopped after 60 s", "seconds": 60.0, "stopped": True}
-    assert harm.find_broken({"local": local, "auto": fitted(2.0, 10.4)}) == []
-    assert harm.find_broken({"local": local, "auto": fitted(2.0 + 1e-8, 10.6)}) == ["J", "time"]
-    assert harm.find_broken({"local": local, "auto": fitted(float("nan"), 0.1)}) == ["J"]
-    assert harm.find_broken({"local": local, "auto": failed}) == ["raises"]
-    assert harm.find_broken({"local": local, "auto": stopped}) == ["time"]
-    assert harm.find_broken({"local": failed, "auto": failed}) == []
-    assert harm.describe("a", {"local": local, "auto": failed})[-4:] == ("ValueError: no / 5", "", "0.100", "raises")
-
-
-def test_modes_count_what_is_named_and_what_is_another_sequence():
-    """Of logs whose library lacks a mode of the truth, everything that is called FOUND is wrong."""
-    truth = SETS["pendulum, a mode missing"][0](0)
-    assert not truth.is_complete
-    assert not set(truth.sequence) <= set(truth.settings["library"])
-    assert set(SETS["pendulum, angle measured"][0](0).sequence) <= {"free", "braked", "driven"}
-    common = {"right_number": dict.fromkeys(("bic", "mbic", "aicc"), True), "lateness": 0.0, "complete": True}
-    common |= {"seconds": 0.1, "wall": 0.1, "fits": 1, "evaluations": 1}
-    ends = [(True, 0.0, "FOUND"), (False, 1.9, "FOUND"), (False, -1.9, "FOUND"), (False, -2.1, "FOUND")]
-    ends += [(False, 0.0, "AMBIGUOUS"), (False, 9.0, "FOUND")]
-    outcomes = [study.Outcome(same=same, gap=gap, status=status, named=True, **common) for same, gap, status in ends]
-    row = dict(zip(study.HEADER, study.count("x", outcomes), strict=True))
-    assert (row["FOUND"], row["of these wrong"], row["of these another sequence"]) == (5, 2, 4)
-    assert (row["the truth within 2 of it"], row["the truth better by more"]) == (2, 1)
-    assert (row["AMBIGUOUS"], row["of these with the truth named"]) == (1, 1)
-
-
-def test_what_peers_of_online_estimation_say():
-    """On a drive of the vehicle both end where switchfit does: the modes in turn, mu, and when they changed."""
-    pytest.importorskip("filterpy")
-    [drive] = online.simulate_drives([0])
-    for told in (
-        *online.run_bank("positions and headings", 0.02, 0.995, [0.9], [drive])[0.9],
-        *online.run_horizon("positions and headings", [drive])["mean of 1.2 s beyond 0.6"],
-        online.follow("positions and headings", 3.0, drive),
-    ):
-        row = dict(zip(online.HEADER, online.describe("", [told], [drive]), strict=True))
-        assert (row["wrong paths"], row["early"]) == ("0", "0")
-        assert told.mu == pytest.approx(0.7, abs=0.05)
-        if told.changes is not None:
-            np.testing.assert_allclose(told.changes, drive.taus, atol=0.15)
-
-
-def test_settings_are_chosen_by_wrong_paths_then_by_delays():
-    """No wrong path comes first, however late; of two without, the sooner one; of two alike, the first."""
-    times = 0.1 * np.arange(1, 151)
-    drive = drives.Drive(np.array([6.0, 10.0]), times, np.zeros((150, 3)))
-
-    def say(slip, stick, early=False):
-        modes = ((times > slip) & (times < stick)).astype(int)
-        modes[20:25] = early
-        return [online.Told(modes, 0.7, np.zeros(150))]
-
-    tried = {"false alarm": say(6.1, 10.1, True), "late": say(7.05, 11.05), "sooner": say(6.55, 10.55)}
-    assert online.choose(tried, [drive]) == "sooner"
-    assert online.choose({**tried, "alike": say(6.55, 10.55)}, [drive]) == "sooner"
-    assert online.choose({"false alarm": tried["false alarm"], "late": tried["late"]}, [drive]) == "late"
-
-
-def test_the_exact_likelihood_ratio_is_that_of_fits():
-    """Twice by how much a fit with a change has the lower cost than one without; the grid loses little of it."""
-    [drive] = online.simulate_drives([0])
-    count = int(np.searchsorted(drive.times, drive.taus[0])) + 9
-    begun = drives.Drive(drive.taus, drive.times[:count], drive.values[:count])
-    ratios = exact.find_ratios(begun)
-    told, end = drives.build_problem("positions"), float(begun.times[-1])
-    sensor = replace(told.experiments[0].data[0], times=begun.times, values=begun.values[:, :2])
-    run = sf.Experiment(sensor, ("stick", "slip"), (end - 0.8,), 0.0, end)
-    fitted = sf.estimate(replace(told, experiments=(run,)), strategy="local")
-    away = begun.values[:, :2] - exact.simulate_slides(count)[0][exact.PARTS :: exact.PARTS]
-    assert ratios[-1] == pytest.approx(np.sum((away / drives.SIGMA) ** 2) - 2 * fitted.cost, abs=0.5)
-    assert online.find_delay(ratios > 12.0, begun, 0) == pytest.approx(0.7, abs=0.2)
-
-
 def test_a_step_of_the_peers_is_that_of_switchfit():
     filterpy_bank = pytest.importorskip("benchmarks.peers.filterpy_bank", exc_type=ImportError)
     model = replace(models.VEHICLE, p=(0.7,))
@@ -258,13 +126,3 @@ def test_a_step_of_the_peers_is_that_of_switchfit():
         bank, jacobian = steps[mode](z)
         np.testing.assert_allclose(bank, theirs.ravel(), rtol=1e-12)
         np.testing.assert_allclose(jacobian, tangent, atol=1e-12)
-
-
-def test_changes_of_a_horizon_are_where_the_shares_step():
-    shares = [np.r_[np.zeros(30 - k), np.full(k, 0.9)] for k in range(31)]
-    modes = online.declare(np.array([each[-5:].mean() for each in shares]), 0.6)
-    assert modes.tolist() == [0] * 4 + [1] * 27
-    back = shares + [1 - each for each in shares]
-    modes = online.declare(np.array([each[-5:].mean() for each in back]), 0.6)
-    found = online.find_changes(modes, 0.1 * np.arange(62), back)
-    np.testing.assert_allclose(found, [0.0, 3.1], atol=1e-9)

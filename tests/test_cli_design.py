@@ -1,6 +1,5 @@
 """`switchfit design`, and [design] in problem files."""
 
-import csv
 import json
 
 import numpy as np
@@ -55,7 +54,7 @@ criterion = "A"
 samples = { T = 3 }
 sensors = { T = 1.0, fine = 3.0 }
 budget = 2.0
-starts = 2
+starts = 0
 
 [design.names]
 k = 0.1
@@ -76,11 +75,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-def read(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_design_is_printed_and_written(folder):
     out = folder / "out" / "deep"
     result = run("design", folder / "problem.toml", "--out", out)
@@ -92,15 +86,14 @@ def test_a_design_is_printed_and_written(folder):
     problem = load_problem(folder / "problem.toml").problem
     plan = sf.design(
         problem, free={"power": [0.0, 1.5]}, names={"k": 0.1, "b": 0.5}, criterion="A", samples={"T": 3},
-        sensors={"T": 1.0, "fine": 3.0}, budget=2.0, starts=2,
+        sensors={"T": 1.0, "fine": 3.0}, budget=2.0, starts=0,
     )  # fmt: skip
     assert str(plan) == result.stdout.rstrip("\n")
-    given = read(out / "input.csv")
-    np.testing.assert_array_equal([float(row["power"]) for row in given], plan.inputs["power"])
-    np.testing.assert_array_equal([float(row["t"]) for row in given], np.linspace(0.0, 4.0, 9))
-    taken = read(out / "samples.csv")
-    assert {row["sensor"] for row in taken} == {"T"}
-    np.testing.assert_array_equal([float(row["t"]) for row in taken], plan.sample_times["T"])
+    np.testing.assert_array_equal(sf.read_log(out / "input.csv")["power"], plan.inputs["power"])
+    np.testing.assert_array_equal(sf.read_log(out / "input.csv").times, np.linspace(0.0, 4.0, 9))
+    rows = [line.split(",") for line in (out / "samples.csv").read_text().splitlines()]
+    assert {row[rows[0].index("sensor")] for row in rows[1:]} == {"T"}
+    np.testing.assert_array_equal([float(row[rows[0].index("t")]) for row in rows[1:]], plan.sample_times["T"])
     saved = json.loads((out / "design.json").read_text())["design"]
     assert saved["sample_times"]["T"] == plan.sample_times["T"].tolist()
 
@@ -113,42 +106,28 @@ def test_options_override_the_file(folder, monkeypatch):
         raise ValueError("enough")
 
     monkeypatch.setattr(sf, "design", design)
-    options = ("--criterion", "E", "--names", "k, b", "--samples", 5, "--sensors", 1, "--starts", 0, "--seed", 3)
-    result = run("design", folder / "plain.toml", *options)
+    result = run("design", folder / "plain.toml", "--criterion", "E", "--samples", 5)
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
-    assert given == {"criterion": "E", "names": ["k", "b"], "samples": 5, "sensors": 1, "starts": 0, "seed": 3}
-    given.clear()
+    assert given == {"criterion": "E", "samples": 5}
     run("design", folder / "problem.toml", "--criterion", "D")
     assert (given["criterion"], given["samples"], given["budget"]) == ("D", {"T": 3}, 2.0)
-    given.clear()
-    run("design", folder / "plain.toml")
-    assert given == {}
 
 
 def test_json_and_what_cannot_be_estimated(folder):
-    rows = [f"{t},0,0,0.0,0.0" for t in np.linspace(0.0, 4.0, 9)]
-    (folder / "plan.csv").write_text("\n".join(["t,T,fine,power,sun", *rows]) + "\n")
+    (folder / "plan.csv").write_text((folder / "plan.csv").read_text().replace("1.0,0.2", "0.0,0.0"))
     result = run("design", folder / "plain.toml", "--json")
     assert result.exit_code == 1
     assert "k, b cannot be estimated from such an experiment" in result.stderr
     shown = json.loads(result.stdout)
-    assert shown["theta_names"] == ["k", "b"]
-    assert shown["covariance"] == [[None, None], [None, None]]
-    assert shown["out"] is None
+    assert (shown["theta_names"], shown["covariance"]) == (["k", "b"], [[None, None], [None, None]])
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('criterion = "A"', 'criterion = "T"', "design.criterion"),
-        ("power = [0.0, 1.5]", "power = [0.0]", "'design.free' must have at least 2"),
         ("power = [0.0, 1.5]", "moon = [0.0, 1.5]", "free must name inputs of the run: power, sun; got 'moon'"),
-        ("power = [0.0, 1.5]", "power = [2.0, 1.5]", r"free must have (lower, upper) for power"),
         ("k = 0.1", "c = 0.1", "names has 'c', which is no unknown of the problem: k, b"),
-        ("k = 0.1", "k = 0.0", "'design.names' must be greater than 0"),
-        ("samples = { T = 3 }", "samples = { Z = 3 }", "samples names 'Z'; the sensors are T, fine"),
-        ("samples = { T = 3 }", "samples = 1.5", "design.samples"),
-        ("budget = 2.0", "", "budget and the costs of sensors belong together"),
         ("budget = 2.0", "budget = -2.0", "design.budget"),
         ("budget = 2.0", "cost = 2.0", "cost"),
     ],
@@ -158,11 +137,3 @@ def test_mistakes_in_the_file(folder, old, new, message):
     result = run("design", folder / "problem.toml")
     assert result.exit_code == 2
     assert message in result.stderr.replace("\n", " ")
-
-
-def test_a_problem_built_in_python(folder):
-    (folder / "built.py").write_text("from switchfit.models import heater_problem\n\nmake = heater_problem\n")
-    (folder / "built.toml").write_text('problem = "built.py:make"\n\n[design]\nsamples = 4\n')
-    result = run("design", folder / "built.toml")
-    assert result.exit_code == 0, result.stderr
-    assert "thermometer: 4 of 24 samples" in result.stdout

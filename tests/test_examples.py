@@ -6,51 +6,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.signal
 from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.problem_file import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 def test_own_model_finds_what_made_its_log(capsys):
-    problem = runpy.run_path(str(EXAMPLES / "own_model.py"))["problem"]
-    estimate = sf.estimate(problem)
-    assert estimate.success
-    error = estimate.theta - [43.0, 0.5, 0.02]
-    assert np.all(np.abs(error) < 3 * estimate.standard_errors)
+    estimate = sf.estimate(runpy.run_path(str(EXAMPLES / "own_model.py"))["problem"])
+    assert np.all(np.abs(estimate.theta - [43.0, 0.5, 0.02]) < 3 * estimate.standard_errors)
     assert capsys.readouterr().out == ""
 
 
 @pytest.mark.slow
-def test_uncertainty_prints_and_draws_all_there_is(capsys, tmp_path):
-    example = runpy.run_path(str(EXAMPLES / "uncertainty.py"))
-    example["main"](tmp_path)
-    text = capsys.readouterr().out
-    for part in (
-        "trade off",
-        "Unknowns",
-        "Profile of tau_1",
-        "99 % interval",
-        "BCa",
-        "Standardised residuals",
-        "passed",
-    ):
-        assert part in text
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "bootstrap.svg", "fit.svg", "profile.svg", "residuals.svg",
-    ]  # fmt: skip
-
-
-def test_vehicle_finds_the_truth():
-    module = runpy.run_path(str(EXAMPLES / "vehicle" / "vehicle.py"))
-    estimate = sf.estimate(module["make_problem"]())
-    assert estimate.success
-    assert estimate.iterations < 12  # the paper's
-    np.testing.assert_allclose(estimate.theta, [6.0, 10.0, 0.7], atol=2e-4)
+def test_scripts_of_other_examples(tmp_path, capsys):
+    """When heaters were switched; a manoeuvre that is over sooner than the paper's; figures."""
+    heaters = runpy.run_path(str(EXAMPLES / "heaters" / "heaters.py"))
+    power = sf.estimate(heaters["make_problem"]("power"), strategy="local")
+    np.testing.assert_allclose(power.transition_times[0], heaters["read"]()[2], atol=3.0)
+    module = runpy.run_path(str(EXAMPLES / "manoeuvre" / "manoeuvre.py"))
+    assert module["measure_durations"](module["find"]((2.5, 3.0, 3.5))) == pytest.approx((3.17, 2.85), abs=0.02)
+    runpy.run_path(str(EXAMPLES / "uncertainty.py"))["main"](tmp_path)
+    assert "Profile of tau_1" in capsys.readouterr().out
+    assert {path.stem for path in tmp_path.iterdir()} == {"bootstrap", "fit", "profile", "residuals"}
 
 
 def test_two_turns_end_at_what_made_their_log():
@@ -81,6 +61,7 @@ def test_tosses_share_a_friction_coefficient_or_do_not():
     assert probability < 1e-6
 
 
+@pytest.mark.slow
 def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
     module = runpy.run_path(str(EXAMPLES / "toss" / "release.py"))
     estimate = sf.estimate(module["make_problem"]())
@@ -97,30 +78,6 @@ def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
 
 
 @pytest.mark.slow
-def test_heaters_were_switched_when_the_log_says():
-    module = runpy.run_path(str(EXAMPLES / "heaters" / "heaters.py"))
-    recorded = module["read"]()[2]
-    np.testing.assert_allclose(recorded, [10.006, 100.028, 200.229, 300.269, 400.439, 500.682], atol=1e-3)
-    assert np.abs(module["GUESS"] - recorded).min() > 10.0
-    # The guesses are near enough for one fit; to say that nothing is lower elsewhere takes far longer.
-    balance, power = (sf.estimate(module["make_problem"](model), strategy="local") for model in ("balance", "power"))
-    assert balance.success
-    assert power.success
-    # The energy balance is wrong by up to 44 s, says that it is sure, and its residuals say that it should not be.
-    away = np.abs(balance.transition_times[0] - recorded)
-    assert np.sum(away > 10.0) == 5
-    assert np.all(balance.standard_errors[:6] < 1.0)
-    assert not any(channel.white for channel in balance.residuals.channels)
-    assert min(channel.correlation for channel in balance.residuals.channels) > 0.9
-    # The better model is near, and its residuals are near noise, but not noise.
-    assert power.cost < balance.cost / 15
-    assert np.all(np.abs(power.transition_times[0] - recorded) < 3.0)
-    assert max(channel.rms for channel in power.residuals.channels) < 1.4
-    assert not power.residuals.passed
-    # One supply feeds both heaters.
-    assert power.parameters["P2"][0] < 0.6 * power.parameters["P2"][1]
-
-
 def test_husky_loses_speed_in_turns():
     """Three of the ten steps, and two others."""
     module = runpy.run_path(str(EXAMPLES / "husky" / "husky.py"))
@@ -149,75 +106,21 @@ def test_husky_limits_commands_and_static_fit_is_as_published():
         np.testing.assert_allclose([v_x, v_y, turn], [v, 0.1 * rate, rate], rtol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def tried():
-    return runpy.run_path(str(EXAMPLES / "husky" / "tried.py"))
-
-
 @pytest.mark.slow
-def test_husky_changes_do_not_earn_their_place(tried):
-    """On steps left out none lowers an error by more than 0.015 m or rad; else the page is wrong."""
-    *shares, position, yaw = tried["HUSKY"]["score"](*tried["leave_out"]("as it is"))
-    np.testing.assert_allclose(shares, [0.99, 0.92, 0.95], atol=0.01)
-    for name in tried["CHANGES"]:
-        changed = tried["HUSKY"]["score"](*tried["leave_out"](name))
-        assert changed[3] > position - 0.015, name
-        assert changed[4] > yaw - 0.015, name
-
-
-@pytest.fixture(scope="module")
-def covid():
-    """The example and its fit."""
+def test_covid_finds_the_rates_and_the_first_two_dates_that_were_published():
     module = runpy.run_path(str(EXAMPLES / "covid" / "covid.py"))
-    return module, sf.estimate(module["make_problem"]())
-
-
-@pytest.mark.slow
-def test_covid_finds_the_rates_and_the_first_two_dates_that_were_published(covid):
-    module, estimate = covid
-    days, counts = module["read"]()
-    assert [str(days[0]), str(days[-1])] == ["2020-03-02", "2020-04-21"]
-    assert (counts[0], counts.sum()) == (29, 148291 - 130)
+    estimate = sf.estimate(module["make_problem"]())
     assert estimate.success
     assert estimate.cost < 551.2  # the lowest of 64 starts
     dates, rates = np.array(estimate.transition_dates[0], dtype="datetime64[m]"), estimate.parameters["lambda"]
-    published, other = module["PUBLISHED"], module["LEAST_SQUARES"]
+    published = module["PUBLISHED"]
     noons = np.array([f"{published[f'tau_{k}']}T12:00" for k in (1, 2, 3)], dtype="datetime64[m]")
     assert np.all(np.abs((dates - noons) / np.timedelta64(1, "D")) < [1.0, 2.0, 4.5])
     np.testing.assert_allclose(rates, [published[f"lambda[{k}]"] for k in range(4)], rtol=0.12)
-    assert np.all(np.diff(rates) < 0)
     assert rates[2] > module["RECOVERY"] > rates[3]  # it grows until the third change
-
-    profiles = {f"tau_{k}": estimate.profile(f"tau_{k}").interval() for k in (1, 2, 3)}
-    days_of = {name: float(other[name][-2:]) for name in profiles}  # of March, as t counts them
-    # A published date is a day; the third lies outside, which the days from Easter on bring about.
-    meets = {name: low < days_of[name] + 1 and high > days_of[name] for name, (low, high) in profiles.items()}
-    assert meets == {"tau_1": True, "tau_2": True, "tau_3": False}
-    within = dict(zip(estimate.theta_names, estimate.confidence_intervals(), strict=True))
-    for name in ("lambda[0]", "lambda[1]"):
-        assert within[name][0] < other[name] < within[name][1]
     early = sf.estimate(module["make_problem"](until="2020-04-09"))
-    assert early.success
     assert abs(early.transition_times[0][2] - float(published["tau_3"][-2:])) < 2.0
-
-    channel = estimate.residuals.channels[0]
-    assert channel.white
-    assert channel.normal
-    assert len(module["plot"](estimate, profiles).axes) == 2
-
-
-def test_covid_sees_a_day_at_its_noon_to_half_a_percent(covid):
-    """Infections of whole days, by Gauss's rule, against those at noon, along the fit."""
-    module, estimate = covid
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    days = (module["read"]()[0] - np.datetime64(module["ORIGIN"])) / np.timedelta64(1, "D")
-    noon = days + 0.5 - module["DELAY"]
-
-    def infections(times):
-        return module["infections"](estimate.predict(times).states.T)
-
-    whole = infections((noon[:, None] + nodes / 2).ravel()).reshape(len(noon), -1) @ weights / 2
-    np.testing.assert_allclose(whole, infections(noon), rtol=5e-3)
+    assert estimate.residuals.channels[0].white
 
 
 @pytest.mark.usefixtures("fits_one_by_one")
@@ -245,9 +148,7 @@ def test_fishing_from_a_fleet_in_port(tmp_path):
     for switches, cost in expected.items():
         assert costs[switches] == pytest.approx(cost, abs=1e-6 if switches < 10 else 1e-10)
     assert costs[8] == pytest.approx(1.345295218283, abs=1e-10)
-    assert all(estimate.success for estimate in search.by_switches.values())
     assert [module["choose"](costs, c) for c in (0.03, 0.003, 0.0003)] == [2, 4, 8]
-    assert "8  1.345295218  0.00051" in module["table"](search)
     module["plot"](search).savefig(tmp_path / "fishing.svg")
 
 
@@ -256,18 +157,7 @@ def terrain():
     return runpy.run_path(str(EXAMPLES / "terrain" / "terrain.py"))
 
 
-def test_terrain_leaves_out_what_the_log_repeats(terrain):
-    times, currents, speed = terrain["read_samples"]("green_table_30")
-    pause = (times > 4.87) & (times < 5.09)  # seven samples of the motors that repeat
-    assert pause.sum() == 7
-    assert np.isnan(currents[pause]).all()
-    assert np.isnan(currents).any(axis=1).mean() < 0.1
-    assert 0.05 < np.isnan(speed).mean() < 0.1  # every twelfth frame
-    means = terrain["read"]("green_table_30")[1]
-    assert means.shape == (42, 3)
-    assert np.isnan(means).any(axis=0).tolist() == [True, True, False]
-
-
+@pytest.mark.slow
 def test_terrain_problem_file_ends_at_the_border():
     found = json.loads(
         CliRunner().invoke(cli.app, ["fit", str(EXAMPLES / "terrain" / "problem.toml"), "--json"]).stdout
@@ -303,75 +193,9 @@ def test_terrain_has_two_plain_methods_beside_ours(terrain):
     assert terrain["find_border"]("green_table_12")[0] == pytest.approx(given[0], abs=0.13)
 
 
-def test_terrain_noise_has_the_order_that_it_was_made_with(terrain):
-    shocks = np.random.default_rng(0).standard_normal(2000)
-    series = scipy.signal.lfilter([0.3], [1.0, -0.5, 0.3], shocks)
-    weights, size = terrain["fit_noise"](series)
-    np.testing.assert_allclose(weights[:2], [0.5, -0.3], atol=0.05)
-    assert size == pytest.approx(0.3, rel=0.05)
-    assert len(terrain["fit_noise"](shocks)[0]) <= 2
-
-
-def test_terrain_study_of_the_intervals_in_a_few_refits(terrain):
-    corrected, naive, widths = terrain["cover"]("green_table_30", ("neither", "both"), (2.3,), 6)
-    assert corrected.shape == naive.shape == (1,)
-    assert corrected[0] >= 0.5
-    assert np.all((widths > 0.02) & (widths < 0.5))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "sequence", "times"),
-    [
-        ("table_gray_00", ("neither", "both"), (4.45,)),
-        ("table_gray_06", ("neither", "both"), (13.41,)),
-        ("table_gray_12", ("neither", "wheel 1", "both"), (7.98, 8.40)),
-    ],
-)
-def test_terrain_intervals_cover(terrain, name, sequence, times):
+def test_terrain_intervals_cover(terrain):
     """With noise as correlated as the residuals; of 100, 89 to 99 do if 95 % are right."""
-    corrected, _, widths = terrain["cover"](name, sequence, times, 100)
+    corrected, _, widths = terrain["cover"]("table_gray_12", ("neither", "wheel 1", "both"), (7.98, 8.40), 100)
     assert np.all(corrected >= 0.89)
     assert np.all(widths[:, 1] < 2 * widths[:, 0])  # and are not wide beyond need
-
-
-def test_terrain_problem_files_build_what_they_name(terrain):
-    problem = load_problem(EXAMPLES / "terrain" / "six.toml", searched=True).problem
-    assert [run.name for run in problem.experiments] == list(terrain["GREEN"])
-    assert len(problem.theta_names) == 6 + 6 * 5  # levels of the currents and lags; speeds and noise of each log
-
-
-@pytest.mark.slow
-def test_terrain_nine_logs(terrain, tmp_path):
-    searches = {name: terrain["find"](name) for name in (*terrain["GREEN"], *terrain["GRAY"])}
-    switches = [len(search.transition_times[0]) for search in searches.values()]
-    assert switches == [1, 1, 2, 1, 1, 1, 1, 1, 2]
-    assert [terrain["has_crossed"](search.best) for search in searches.values()] == [True] * 6 + [False, True, True]
-    for name in terrain["GREEN"]:
-        search = searches[name]
-        halfway = search.transition_times[0][0] + np.log(2) * search.parameters["lag_I"]
-        assert terrain["find_border"](name)[0] == pytest.approx(halfway, abs=0.12)
-        # The residuals turn with the motors, at three speeds: once or twice in so many ticks.
-        ticks = terrain["find_rhythm"](name, search.best)[1]
-        assert min(abs(ticks / terrain["TURN"] - 1.0), abs(2 * ticks / terrain["TURN"] - 1.0)) < 0.05
-        assert max(share for share, _, _ in terrain["explain_by_turns"](name, search.best)) > 0.15
-    terrain["plot"](searches).savefig(tmp_path / "terrain.svg")
-    joint = terrain["find_jointly"]()
-    assert joint.mode_sequences == tuple(searches[name].mode_sequence for name in terrain["GREEN"])
-    for alone, times in zip(terrain["GREEN"], joint.transition_times, strict=True):
-        np.testing.assert_allclose(times, searches[alone].transition_times[0], atol=0.12)
-    shared, own = (terrain["fit_jointly"](what, joint) for what in ("surface", "nothing"))
-    assert shared.cost > own.cost + 50.0  # levels are not the same in all logs
-
-
-@pytest.mark.slow
-def test_manoeuvre_that_tells_the_friction(tmp_path):
-    """The designed one is sooner done than that of the paper; its standard errors hold in refits."""
-    module = runpy.run_path(str(EXAMPLES / "manoeuvre" / "manoeuvre.py"))
-    plans = module["find"]((2.5, 3.0, 3.5))
-    paper, best = module["measure_durations"](plans)
-    assert (paper, best) == pytest.approx((3.17, 2.85), abs=0.02)
-    assert "3.0           0.0257       0.0151" in module["table"](plans)
-    study = sf.monte_carlo(plans[3.0].problem, 600)
-    assert study.standard_deviation[1] == pytest.approx(plans[3.0].standard_errors[1], rel=0.1)
-    module["plot"](plans).savefig(tmp_path / "manoeuvre.svg")

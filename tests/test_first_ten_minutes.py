@@ -63,7 +63,7 @@ def words_of(line):
 def run(command):
     """Run a line of the shell; return what it prints.
 
-    After the first one, commands of switchfit run in this process; test_cli_pipe.py has them in processes of their own.
+    After the first one, commands of switchfit run in this process; test_cli.py has one in a process of its own.
     """
     name, *arguments = shlex.split(command)
     if name == "switchfit" and arguments != ["--version"]:

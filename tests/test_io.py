@@ -146,13 +146,6 @@ def test_short_forms_and_defaults(folder):
     assert loaded.problem.rtol == sf.Problem.rtol
 
 
-def test_fixed_values_stay_out_of_theta(folder):
-    loaded = changed(
-        folder, ("cooling = 0.05", "cooling = { value = 0.05, fixed = true }"), ("upper = 5.0 }", "fixed = true }")
-    )
-    assert loaded.problem.theta_names == ("heating",)
-
-
 def test_a_horizon_of_which_one_end_is_left_out(folder):
     problem = changed(folder, ("t0 = 0.0\ntf = 6.0\n", "tf = 7.5\n"), ("sigma = 0.1\n", "delay = 0.25\n")).problem
     assert (problem.experiments[0].t0, problem.experiments[0].tf) == (-0.25, 7.5)
@@ -165,30 +158,20 @@ def test_window_offset_and_scale(folder):
     data = changed(folder, change).problem.experiments[0].data[0]
     np.testing.assert_array_equal(data.times, [1, 2, 3, 4, 5, 6])
     np.testing.assert_array_equal(data.values[:, 0], [3000.5, 4000.5, 5000.5, 6000.5, 7000.5, 8000.5])
-
-
-def test_sigma_from_a_column(folder):
-    data = changed(folder, ("sigma = 0.1", 'sigma = ["sd"]')).problem.experiments[0].data[0]
-    np.testing.assert_array_equal(data.sigma[:, 0], [0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])
-
-
-def test_sigma_from_parameters(folder):
-    sigma = ("cooling = 0.05", "cooling = 0.05\ns = { value = 0.1, scale = 'log' }")
-    for given in ('"s"', '["s"]'):
-        data = changed(folder, sigma, ("sigma = 0.1", f"sigma = {given}")).problem.experiments[0].data[0]
-        assert data.sigma == ("s",)
+    change = ('time = "t"', 'time = "t"\nwindow = [3000, 8000]\ntime_offset = "first"\ntime_scale = 1e-3')
+    np.testing.assert_array_equal(changed(folder, change).problem.experiments[0].data[0].times, [0, 1, 2, 3, 4, 5])
 
 
 def test_loss_delay_priors_and_scales(folder):
     problem = changed(
         folder,
-        ("sigma = 0.1", 'sigma = 0.1\nloss = "huber"\nloss_scale = 1.5\ndelay = "d"\nwindow = [1, 5]'),
+        ("sigma = 0.1", 'sigma = "cooling"\nloss = "huber"\nloss_scale = 1.5\ndelay = "d"\nwindow = [1, 5]'),
         ("cooling = 0.05", 'd = { value = 0.1, lower = 0.0, upper = 0.5 }\ncooling = { value = 0.05, scale = "log" }'),
         ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.0, prior = { mean = 0.4, sd = 0.1 }"),
         ("value = 3.0, lower = 1.0", "value = 3.0, prior = { median = 3.0, log_sd = 0.2 }, lower = 1.0"),
     ).problem
     data = problem.experiments[0].data[0]
-    assert (data.loss, data.loss_scale, data.delay) == ("huber", 1.5, "d")
+    assert (data.sigma, data.loss, data.loss_scale, data.delay) == (("cooling",), "huber", 1.5, "d")
     names = problem.theta_names
     priors = dict(zip(names, problem.unknowns.priors.texts(), strict=True))
     assert priors == {"tau_1": "log-normal(3, 0.2)", "heating": "normal(0.4, 0.1)", "d": "", "cooling": ""}
@@ -200,44 +183,34 @@ def test_loss_delay_priors_and_scales(folder):
     assert "(log scale)" in text
 
 
-def test_observe_by_a_function(folder):
-    data = changed(folder, ('observe = ["T"]', 'observe = "room.py:fahrenheit"')).problem.experiments[0].data[0]
-    assert data.observe(0.0, np.array([10.0]), {}) == 50.0
+INPUTS = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = ["u"] }'
 
 
-def test_reference_signal(folder):
-    change = ("sigma = 0.1", 'kind = "reference"\nlowpass_hz = 0.2\nweights = [2.0]')
-    data = changed(folder, change).problem.experiments[0].data[0]
-    assert isinstance(data, sf.ReferenceSignal)
-    np.testing.assert_array_equal(data.weights, [[2.0]])
+@pytest.mark.parametrize(
+    ("old", "new", "find", "expected"),
+    [
+        ("sigma = 0.1", 'sigma = ["sd"]', lambda run: run.data[0].sigma[:3, 0].tolist(), [0.1, 0.1, 0.2]),
+        ('["T"]\nsigma', '"room.py:fahrenheit"\nsigma', lambda run: run.data[0].observe(0.0, 10.0, {}), 50.0),
+        ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda run: run.data[0].weights.tolist(), [[2.0]]),
+        ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda run: run.initial_state, [17.0]),
+        ("t0 = 0.0", INPUTS, lambda run: (run.inputs.kind, *run.inputs.values[2:5]), ("hold", 1, 1, 0)),
+    ],
+)
+def test_forms_of_keys(folder, old, new, find, expected):
+    (folder / "room.py").write_text(ROOM.replace("(t, x, p)", "(t, x, p, u)") if new.endswith(INPUTS) else ROOM)
+    assert find(changed(folder, (old, new)).problem.experiments[0]) == expected
 
 
-def test_inputs(folder):
-    (folder / "room.py").write_text(
-        "import switchfit as sf\n"
-        "room = sf.HybridSystem({'on': lambda t, x, p, u: p['heating'] * u - p['cooling'] * x,"
-        " 'off': lambda t, x, p, u: -p['cooling'] * x}, [15.0], state_names=('T',))\n"
-    )
-    table = '[experiments.inputs]\nfile = "log.csv"\ntime = "t"\ncolumns = ["u"]\n'
-    inputs = changed(folder, ("[[experiments.data]]", table + "\n[[experiments.data]]")).problem.experiments[0].inputs
-    assert inputs.kind == "hold"
-    np.testing.assert_array_equal(inputs.values, [1, 1, 1, 1, 0, 0, 0])
-    refused(
-        folder, r"experiments\[1\]\.inputs: Input kind|'experiments\[1\]\.inputs\.kind' must be 'hold', 'linear' or",
-        ("[[experiments.data]]", table + 'kind = "step"\n[[experiments.data]]'),
-    )  # fmt: skip
+@pytest.mark.parametrize(
+    ("model", "start"), [('{ name = "room.py:make", arguments = { start = 18.0 } }', 18.0), ('"room.py:make"', 15.0)]
+)
+def test_models_by_functions(folder, model, start):
+    assert changed(folder, ('"room.py:room"', model)).problem.system.initial_state == [start]
 
 
-def test_model_arguments_and_factories(folder):
-    changed_model = ('model = "room.py:room"', 'model = { name = "room.py:make", arguments = { start = 18.0 } }')
-    assert changed(folder, changed_model).problem.system.initial_state == [18.0]
-    system = changed(folder, ('"room.py:room"', '"room.py:make"')).problem.system
-    assert system.initial_state == [15.0]
-
-
-def test_initial_state_of_an_experiment(folder):
-    problem = changed(folder, ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]")).problem
-    assert problem.experiments[0].initial_state == [17.0]
+def test_a_transition_time_on_a_logarithmic_scale(folder):
+    changes = (("value = 3.0,", 'value = 3.0, scale = "log",'), ("min_duration = 0.5\n", ""))
+    assert changed(folder, *changes).problem.unknowns.log_names == ("tau_1",)
 
 
 def test_problem_built_in_python(folder):
@@ -268,48 +241,29 @@ def test_examples_load(path):
     ("old", "new", "message"),
     [
         ("tf = 6.0", "t_f = 6.0", r"unknown key 'experiments\[1\]\.t_f'; did you mean 'tf'\?"),
-        ("tf = 6.0", "qqq = 6.0", r"unknown key 'experiments\[1\]\.qqq'; known here are mode_sequence, "),
         ("tf = 6.0", 'tf = "six"', r"'experiments\[1\]\.tf\.value' must be a number or a date such as .*; got 'six' "),
-        ("tf = 6.0", "tf = true", r"'experiments\[1\]\.tf\.value' must be a number or a date such as .*; got True"),
         ("upper = 5.0 }", "uper = 5.0 }", r"'experiments\[1\]\.transition_times\[1\]\.uper'; did you mean 'upper'\?"),
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", '"three"', r"\[1\]\.value' must be a number or a date .*'three'"),
-        ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "7.0", r"experiments\[1\]: transition_times must increase .*\[7"),
-        ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "", r"experiments\[1\]: transition_times must be one fewer"),
-        ('mode_sequence = ["on", "off"]', "", r"experiments\[1\]: the key 'mode_sequence' is missing: name the"),
-        ('["on", "off"]', "[]", r"mode_sequence' must have at least 1 entries; got \[\]"),
         ('["on", "off"]', '["on", "of"]', r"mode_sequence names the unknown mode 'of'; the modes are on, off"),
-        ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.4", r"parameters\.heating: .* lies outside its bounds"),
-        ("cooling = 0.05", 'cooling = "little"', r"'parameters\.cooling\.value' must be a number; got 'little'"),
-        ("cooling = 0.05", "cooling = { val = 1 }", r"unknown key 'parameters\.cooling\.val'; did you mean 'value'\?"),
-        ("cooling = 0.05", "", r"reads the parameter 'cooling', which the problem lacks"),
         ('columns = ["T"]', 'columns = ["temp"]', r"log\.csv has no column 'temp'; its columns are t, T, sd, u"),
-        ('"log.csv"', '"lgo.csv"', r"There is no file .*lgo\.csv"),
         ('time = "t"', 'time = "T"', r"log\.csv, column 'T': the time of sample 3 is missing"),
-        ('time = "t"', 'time = "u"', r"experiments\[1\]\.data\[1\]: Measurements times must increase strictly"),
         ('time = "t"', 'time = "t"\nwindow = [10, 20]', r"no time in column 't' lies in the window \[10\.0, 20\.0\]; "),
-        ('time = "t"', 'time = "t"\nwindow = [10]', r"\.window' must have at least 2 entries; got \[10\]"),
-        ('time = "t"', 'time = "t"\ntime_offset = 3', r"Measurements times must lie inside \[t0, tf\] = \[0\.0"),
         ('observe = ["T"]', 'observe = ["x"]', r"data\[1\]: observe names the unknown state 'x'; the states are T"),
-        ('observe = ["T"]', 'observe = ["T", "T"]', r"observe must name one state for each of the 1 columns; got"),
         ('observe = ["T"]', 'observe = "room.py:seven"', r"observe 'room.py:seven' must be a function h\(t, x, p\);"),
         ('observe = ["T"]', 'observe = "T"', r"data\[1\]\.observe must be given as 'file\.py:object'; got 'T'"),
-        ("sigma = 0.1", "sigma = -0.1", r"experiments\[1\]\.data\[1\]: sigma must be positive and finite; got .*-0\.1"),
-        ("sigma = 0.1", "lowpass_hz = 1.0", r"lowpass_hz does not belong to kind = 'measurements': meas"),
         ("sigma = 0.1", 'sigma = 0.1\nkind = "reference"', r"sigma does not belong to kind = 'reference': meas"),
-        ("sigma = 0.1", 'loss = "huber"\nkind = "reference"', "loss does not belong to kind = 'reference'"),
         ("sigma = 0.1", 'delay = 0.1\nkind = "reference"', "delay does not belong to kind = 'reference'"),
         ("sigma = 0.1", 'sigma = ["sd", 0.1]', r"sigma must name columns of the file alone, or parameters and numb"),
-        ("sigma = 0.1", 'loss = "L1"', r"\.loss' must be 'linear', 'soft_l1', 'huber' or 'cauchy'; got 'L1'"),
         ("value = 0.3,", "value = 0.3, prior = { mean = 1.0 },", r"prior needs mean and sd \(normal\), or median"),
-        ("value = 0.3,", "value = 0.3, prior = { mena = 1.0 },", r"heating\.prior\.mena'; did you mean 'mean'\?"),
-        ("sigma = 0.1", 'kind = "samples"', r"kind' must be 'measurements' or 'reference'; got 'samples'"),
         ("[options]", "[option]", r"unknown key 'option'; did you mean 'options'\?"),
+        ("value = 3.0,", 'value = 3.0, scale = "ln",', r"transition_times\[1\]\.scale' must be"),
+        ("t0 = 0.0", INPUTS.replace(" }", ', kind = "step" }'), r"inputs\.kind' must be 'hold', 'linear' or"),
+        ('"log.csv"', r'"a\u0000b"', "is not a file name"),
+        ("room.py:room", "x" * 5000 + ".py:room", "there is no file"),
         ("rtol = 1e-7", "rtol = -1.0", r"'options\.rtol' must be greater than 0; got -1\.0"),
         ("rtol = 1e-7", 'hessian = "newton"', r"'options\.hessian' must be 'auto', 'exact', 'descent-first'"),
-        ("min_duration = 0.5", "min_duration = 4.0", r"min_duration is 4\.0 s, but the guess gives mode 1"),
         ("[parameters]", "[parameters", r"is not valid TOML: .*line 4"),
         ('model = "room.py:room"', "", r"the key 'model' is missing; name one of skid_steer, sliding_block, magic"),
-        ('model = "room.py:room"', "model = 3", r"'model\.name' must be a string; got 3 \(a built-in model"),
         ("room.py:room", "room", r"model 'room' is not known; the built-in models are skid_steer, sliding"),
         ("room.py:room", "rom.py:room", r"model 'rom\.py:room': there is no file .*rom\.py"),
         ("room.py:room", "room.py", r"model must be given as 'file\.py:object'; got 'room\.py'"),
@@ -320,7 +274,6 @@ def test_examples_load(path):
         ("room.py:room", "room.py:nameless", r"observe names states, but the model has no state_names; add them"),
         ('"room.py:room"', '{ name = "room.py:room", arguments = { a = 1 } }', "is not a function; leave out its arg"),
         ('"room.py:room"', '{ name = "room.py:make", arguments = { a = 1 } }', "argument 'a'; it takes start"),
-        ('"room.py:room"', '{ name = "skid_steer", arguments = { restick = "x" } }', "failed: ValueError: restick"),
         ('model = "room.py:room"', 'problem = "room.py:seven"', r"leave out parameters and experiments"),
     ],
 )  # fmt: skip
@@ -330,53 +283,35 @@ def test_what_is_wrong_is_said(folder, old, new, message):
     assert "\n" not in said  # in one sentence
 
 
-def test_no_experiments(folder):
-    (folder / "problem.toml").write_text('model = "skid_steer"\n')
-    with pytest.raises(InputError, match=r"\[\[experiments\]\] is missing; give at least one"):
-        load_problem(folder / "problem.toml")
-
-
 def test_several_mistakes_are_listed(folder):
-    said = refused(
-        folder, r"unknown key 'experiments\[1\]\.t_f'", ("tf = 6.0", "t_f = 6.0"), ("sigma = 0.1", "sigma = true")
-    )
+    said = refused(folder, r"unknown key 'experiments", ("tf = 6.0", "t_f = 6.0"), ("sigma = 0.1", "sigma = true"))
     assert "Also wrong: 'experiments[1].data[1].sigma'" in said
 
 
-def test_problem_file_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match=r"There is no problem file .*none\.toml"):
-        load_problem(tmp_path / "none.toml")
-    with pytest.raises(InputError, match=r" is a folder; name the problem file in it"):
-        load_problem(tmp_path)
-    (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match=r"a\.toml is not valid TOML: [^:]*: invalid start byte\.$"):
-        load_problem(tmp_path / "a.toml")
-
-
-@pytest.mark.parametrize(("name", "content"), [("log.csv", b"t,x\n0,1\n"), ("log.mat", b"\xff\xfe")])
-def test_a_log_in_place_of_a_problem_file(name, content, tmp_path):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(
-        InputError, match=rf"{name} is not valid TOML: .* begin with: switchfit init NAME --from .*{name}$"
-    ):
-        load_problem(tmp_path / name)
+BEGIN = r" is not valid TOML: .* begin with: switchfit init NAME --from .*"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("name", "content", "message"),
     [
-        ('problem = "room.py:seven"', r"must be an sf\.Problem or a function that returns one; got int"),
-        (
-            'problem = "room.py:seven"\n[options]\nrtol = 1e-6',
-            r"with 'problem', rtol is set where the sf\.Problem is b",
-        ),
-        ('problem = "seven"', r"problem must be given as 'file\.py:object'; got 'seven'"),
+        ("none.toml", None, r"There is no problem file .*none\.toml"),
+        ("", None, " is a folder; name the problem file in it"),
+        ("a.toml", b"\xff\xfe", r"a\.toml is not valid TOML: [^:]*: invalid start byte\.$"),
+        ("a.toml", b"a = " + b"[" * 5000, r"a\.toml is not valid TOML: brackets are nested too deep"),
+        ("a.toml", b"a = 1" + b"0" * 5000, r"a\.toml is not valid TOML: Exceeds the limit"),
+        ("log.csv", b"t,x\n0,1\n", rf"log\.csv{BEGIN}log\.csv$"),
+        ("log.mat", b"\xff\xfe", rf"log\.mat{BEGIN}log\.mat$"),
+        ("a.toml", b'model = "skid_steer"\n', r"\[\[experiments\]\] is missing; give at least one"),
+        ("a.toml", b'problem = "room.py:seven"', r"must be an sf\.Problem or a function that returns one; got int"),
+        ("a.toml", b'problem = "room.py:seven"\n[options]\nrtol = 1', r"with 'problem', rtol is set where the sf\.Pro"),
+        ("a.toml", b'problem = "seven"', r"problem must be given as 'file\.py:object'; got 'seven'"),
     ],
 )
-def test_problem_built_in_python_refuses(folder, text, message):
-    (folder / "problem.toml").write_text(text)
+def test_files_that_hold_no_problem(folder, name, content, message):
+    if content:
+        (folder / name).write_bytes(content)
     with pytest.raises(InputError, match=message):
-        load_problem(folder / "problem.toml")
+        load_problem(folder / name)
 
 
 # --- Python files -----------------------------------------------------------------------------------------------------
@@ -388,19 +323,14 @@ def test_problem_built_in_python_refuses(folder, text, message):
         ("x = 1\ny = x +\n", r"Running .*m\.py failed: .*m\.py, line 2: SyntaxError: invalid syntax"),
         ("def f():\n    return 1 / 0\n\nx = f()\n", r"m\.py, line 2, in f: ZeroDivisionError: division by zero"),
         ("import nowhere_to_be_found\n", r"m\.py, line 1: ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
-        ("raise SystemExit('bye')\n", r"m\.py, line 1: SystemExit: bye"),
+        ("raise SystemExit('bye.')\n", r"^Running m\.py failed: m\.py, line 1: SystemExit: bye\.$"),
     ],
 )
-def test_python_file_that_fails(tmp_path, text, message):
+def test_python_file_that_fails(tmp_path, text, message, monkeypatch):
+    """It is named as the user named it."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "m.py").write_text(text)
     with pytest.raises(InputError, match=message):
-        load_object("m.py:x", tmp_path, "model")
-
-
-def test_python_file_is_named_as_the_user_named_it(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "m.py").write_text("raise ValueError('no.')\n")
-    with pytest.raises(InputError, match=r"^Running m\.py failed: m\.py, line 1: ValueError: no\.$"):
         load_object("m.py:x", Path(), "model")
 
 

@@ -60,19 +60,16 @@ def test_origin_and_columns_of_a_table(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("t,gps_lat,gps_lon,HDOP\n0,48,11,1.5\n1,,,\n2,48.001,11,2\n")
     assert sf.read_log(path).channels == ("gps_lat", "gps_lon", "HDOP")  # nothing is computed that is not asked for
-    log = sf.read_log(path, origin=[48.001, 11], range_error=4)
+    log = sf.read_log(path, origin=[48.001, 11])
     np.testing.assert_allclose(log["north"], [-111.2, np.nan, 0], atol=0.1)
-    np.testing.assert_allclose(log["sigma_east"], np.array([1.5, np.nan, 2]) * 4 / np.sqrt(2))
     assert "up" not in log
-    assert sf.read_log(path, columns=["sigma_north"], range_error=4).channels == ("sigma_north",)
+    assert sf.read_log(path, columns=["north"]).channels == ("north",)
     for text, options, message in (
         ("t,lat,lon\n0,480000000,110000000\n1,1,1\n", {"origin": [0, 0]}, "lat and lon must be in degrees; some"),
         ("t,lat,lon\n0,,\n1,,\n", {"origin": [0, 0]}, "has no position: all of lat and lon are missing"),
         ("t,x,y\n0,1,2\n1,1,1\n", {"origin": [0, 0]}, "has no latitude and longitude; its columns are x, y"),
         ("t,lat,lon\n0,1,1\n1,1,1\n", {"origin": [0, 95, 1, 1]}, r"origin must be \[latitude, longitude\] in degrees"),
         ("t,lat,lon\n0,1,1\n1,1,1\n", {"origin": [95, 0]}, r"origin must be \[latitude, longitude\] in degrees, or wi"),
-        ("t,lat,lon\n0,1,1\n1,1,1\n", {"range_error": 3}, "has no channel hdop, of which range_error makes a sigma"),
-        ("t,lat,lon\n0,1,1\n1,1,1\n", {"range_error": 0}, "range_error must be positive"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -82,41 +79,28 @@ def test_origin_and_columns_of_a_table(tmp_path):
 # --- GPX and NMEA -----------------------------------------------------------------------------------------------------
 
 
-def write_gpx(path, **changes):
+def write_gpx(path):
     gpx = gpxpy.gpx.GPX()
     gpx.tracks.append(gpxpy.gpx.GPXTrack())
     gpx.tracks[0].segments.append(gpxpy.gpx.GPXTrackSegment())
     for t, x in zip(TIMES, X, strict=True):
         latitude, longitude, altitude = globe(x, 2 * x)
-        time = changes.get("time", START + timedelta(seconds=t))
+        time = START + timedelta(seconds=t)
         point = gpxpy.gpx.GPXTrackPoint(latitude, longitude, altitude, time, horizontal_dilution=1.2)
         gpx.tracks[0].segments[0].points.append(point)
-    latitude, longitude, _ = globe(0, 0)
-    place = gpxpy.gpx.GPXWaypoint(latitude, longitude, time=START + timedelta(seconds=0.5), name="gate")
-    gpx.waypoints.append(place)
+    gpx.waypoints.append(gpxpy.gpx.GPXWaypoint(*ORIGIN[:2], time=START + timedelta(seconds=0.5), name="gate"))
     path.write_text(gpx.to_xml())
     return path
 
 
 def test_gpx(tmp_path):
-    log = sf.read_log(write_gpx(tmp_path / "a.gpx"), range_error=5)
+    log = sf.read_log(write_gpx(tmp_path / "a.gpx"))
     np.testing.assert_array_equal(log.times, TIMES)
     assert (log.start, log.time_unit) == (START, "s")
     np.testing.assert_allclose(log[["east", "north"]], np.stack([X, 2 * X], axis=1), atol=1e-5)
-    np.testing.assert_allclose(log["sigma_north"], 1.2 * 5 / np.sqrt(2))
+    np.testing.assert_array_equal(log["hdop"], 1.2)
     np.testing.assert_allclose(log.origin, ORIGIN, atol=1e-8)
     assert log.events == ((0.5, "waypoint", "gate"),)
-    assert "  origin: latitude 48.10000000, longitude 11.60000000, altitude 520.00 m\n" in str(log)
-    elsewhere = sf.read_log(tmp_path / "a.gpx", origin=globe(100, 0), columns=["east"])
-    np.testing.assert_allclose(elsewhere["east"], X - 100, atol=1e-2)
-
-
-def test_gpx_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"a\.gpx has no track with times: of 4 points, none has a time"):
-        sf.read_log(write_gpx(tmp_path / "a.gpx", time=None))
-    (tmp_path / "a.gpx").write_text("<gpx><trk>")
-    with pytest.raises(InputError, match=r"a\.gpx is no GPX file: "):
-        sf.read_log(tmp_path / "a.gpx")
 
 
 def degrees(value, width):
@@ -162,9 +146,6 @@ def test_nmea_with_damage_and_without_a_fix(tmp_path):
     np.testing.assert_array_equal(log["sigma_east"], [0.25, 0.25, np.nan])
     said = [str(issue) for issue in log.issues if issue.kind == "log: damaged sentences"]
     assert "a.nmea, line 8 (and 1 more): no sentence, or with a wrong checksum; left out." in said[0]
-    (tmp_path / "a.nmea").write_text("\n".join(str(s) for s in sentences(0, 0, "0", "V")))
-    with pytest.raises(InputError, match=r"a\.nmea has no GGA, RMC or GNS sentence with a position"):
-        sf.read_log(tmp_path / "a.nmea")
 
 
 def test_nmea_over_midnight_without_a_date(tmp_path):
@@ -173,8 +154,8 @@ def test_nmea_over_midnight_without_a_date(tmp_path):
     log = sf.read_log(tmp_path / "a.nmea")
     np.testing.assert_array_equal(log.times, [86399, 86400, 86401])
     assert log.start is None
-    dated = [str(sentences(12 * 3600 + t, t)[k]) for t, k in ((-1, 0), (0, 1), (1, 0))]
-    (tmp_path / "a.nmea").write_text("\n".join(dated))
+    lines[1] = str(sentences(12 * 3600, 0)[1])  # with a date
+    (tmp_path / "a.nmea").write_text("\n".join(lines))
     log = sf.read_log(tmp_path / "a.nmea")
     np.testing.assert_array_equal(log.times, [0, 1, 2])
     assert log.start == START + timedelta(seconds=12 * 3600 - 1)
@@ -189,65 +170,63 @@ class Messages:
     def __init__(self, store, first):
         self.store = get_typestore(store)
         self.first = first  # ROS 1 counts headers
-        self.types = self.store.types
 
     def make(self, kind, *fields):
-        return self.types[kind](*fields)
+        package, name = kind.split("/")
+        return self.store.types[f"{package}/msg/{name}"](*fields)
+
+    def pose_of(self, position, yaw):
+        turn = self.make("geometry_msgs/Quaternion", 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+        return self.make("geometry_msgs/Pose", self.make("geometry_msgs/Point", *map(float, position)), turn)
+
+    def pair(self, name, linear, angular):
+        """A twist or a wrench."""
+        return self.make(f"geometry_msgs/{name}", self.vector(*linear), self.vector(*angular))
 
     def header(self, t):
         nanoseconds = EPOCH * 10**9 + round(t * 1e9)
-        stamp = self.make("builtin_interfaces/msg/Time", *divmod(nanoseconds, 10**9))
-        return self.make("std_msgs/msg/Header", *self.first, stamp, "map")
-
-    def turn(self, yaw):
-        return self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
-
-    def point(self, *values):
-        return self.make("geometry_msgs/msg/Point", *map(float, values))
+        stamp = self.make("builtin_interfaces/Time", *divmod(nanoseconds, 10**9))
+        return self.make("std_msgs/Header", *self.first, stamp, "map")
 
     def vector(self, *values):
-        return self.make("geometry_msgs/msg/Vector3", *map(float, values))
+        return self.make("geometry_msgs/Vector3", *map(float, values))
 
     def fix(self, t, x, status=0):
         c = np.diag([0.04, 0.09, 0.25]).ravel()
-        state = self.make("sensor_msgs/msg/NavSatStatus", status, 1)
-        return self.make("sensor_msgs/msg/NavSatFix", self.header(t), state, *globe(x, 2 * x), c, 2)
+        state = self.make("sensor_msgs/NavSatStatus", status, 1)
+        return self.make("sensor_msgs/NavSatFix", self.header(t), state, *globe(x, 2 * x), c, 2)
 
     def odometry(self, t, x):
-        pose = self.make("geometry_msgs/msg/Pose", self.point(x, 0, 0), self.turn(0.1 * x))
-        twist = self.make("geometry_msgs/msg/Twist", self.vector(x, 0, 0), self.vector(0, 0, 2 * x))
-        c, none = np.diag([0.01, 0.04, 0, 0, 0, 0.0025]).ravel(), np.zeros(36)
-        return self.make(
-            "nav_msgs/msg/Odometry",
-            self.header(t),
-            "base",
-            self.make("geometry_msgs/msg/PoseWithCovariance", pose, c),
-            self.make("geometry_msgs/msg/TwistWithCovariance", twist, none),
-        )
+        c = np.diag([0.01, 0.04, 0, 0, 0, 0.0025]).ravel()
+        pose = self.make("geometry_msgs/PoseWithCovariance", self.pose_of((x, 0, 0), 0.1 * x), c)
+        speed = self.pair("Twist", (x, 0, 0), (0, 0, 2 * x))
+        twist = self.make("geometry_msgs/TwistWithCovariance", speed, np.zeros(36))
+        return self.make("nav_msgs/Odometry", self.header(t), "base", pose, twist)
 
     def pose(self, t, x):
-        pose = self.make("geometry_msgs/msg/Pose", self.point(x, 1, 2), self.turn(3.0))
-        return self.make("geometry_msgs/msg/PoseStamped", self.header(t), pose)
-
-    def twist_stamped(self, t, x):
-        return self.make("geometry_msgs/msg/TwistStamped", self.header(t), self.twist(t, x))
+        return self.make("geometry_msgs/PoseStamped", self.header(t), self.pose_of((x, 1, 2), 3.0))
 
     def twist(self, t, x):
-        return self.make("geometry_msgs/msg/Twist", self.vector(x, 0, 0), self.vector(0, 0, -x))
+        return self.pair("Twist", (x, 0, 0), (0, 0, -x))
+
+    def twist_stamped(self, t, x):
+        return self.make("geometry_msgs/TwistStamped", self.header(t), self.twist(t, x))
+
+    def wrench(self, t, x):
+        return self.make("geometry_msgs/WrenchStamped", self.header(t), self.pair("Wrench", (x, 0, 0), (0, 0, 0)))
 
     def imu(self, t, x):
         known, unknown = np.zeros(9), np.r_[-1.0, np.zeros(8)]
-        fields = (self.turn(0.5), known if x else unknown, self.vector(0, 0, x), known, self.vector(x, 0, 9.81), known)
-        return self.make("sensor_msgs/msg/Imu", self.header(t), *fields)
+        turn = self.pose_of((0, 0, 0), 0.5).orientation
+        fields = (turn, known if x else unknown, self.vector(0, 0, x), known, self.vector(x, 0, 9.81), known)
+        return self.make("sensor_msgs/Imu", self.header(t), *fields)
 
     def joints(self, t, x):
-        names, none = ["hip", "knee"], np.zeros(0)
-        return self.make(
-            "sensor_msgs/msg/JointState", self.header(t), names, np.array([x, -x]), np.array([1.0, x]), none
-        )
+        values = (np.array([x, -x]), np.array([1.0, x]), np.zeros(0))
+        return self.make("sensor_msgs/JointState", self.header(t), ["hip", "knee"], *values)
 
     def text(self, t, x):
-        return self.make("std_msgs/msg/String", f"at {x:g}")
+        return self.make("std_msgs/String", f"at {x:g}")
 
 
 ROS1 = Messages(Stores.ROS1_NOETIC, (7,))
@@ -258,6 +237,7 @@ TOPICS = {
     "/pose": ("geometry_msgs/msg/PoseStamped", "pose"),
     "/twist": ("geometry_msgs/msg/TwistStamped", "twist_stamped"),
     "/cmd_vel": ("geometry_msgs/msg/Twist", "twist"),
+    "/force": ("geometry_msgs/msg/WrenchStamped", "wrench"),
     "/imu": ("sensor_msgs/msg/Imu", "imu"),
     "/joints": ("sensor_msgs/msg/JointState", "joints"),
     "/log": ("std_msgs/msg/String", "text"),
@@ -320,6 +300,9 @@ def test_poses_twists_and_others(bag):
     assert joints.channels == ("hip.position", "knee.position", "hip.velocity", "knee.velocity")
     np.testing.assert_array_equal(joints["knee.position"], -X)
     assert joints.units["knee.velocity"] == "rad/s"
+    force = sf.read_log(bag, topic="/force")  # a type that is not known: every number by its name in the message
+    assert force.channels == tuple(f"wrench.{what}.{axis}" for what in ("force", "torque") for axis in "xyz")
+    np.testing.assert_array_equal(force["wrench.force.x"], X)
 
 
 def test_messages_without_stamps(bag):
@@ -328,20 +311,6 @@ def test_messages_without_stamps(bag):
     assert any("messages of /cmd_vel have no stamps; the times are those of the rec" in str(i) for i in log.issues)
     text = sf.read_log(bag, topic="/log")
     assert [event.text for event in text.events] == ["at 0", "at 1", "at 3", "at 6"]
-
-
-def test_types_that_are_not_known(tmp_path):
-    """Every number by its name in the message."""
-
-    class More(Messages):
-        def wrench(self, t, x):
-            wrench = self.make("geometry_msgs/msg/Wrench", self.vector(x, 0, 0), self.vector(0, 0, 0))
-            return self.make("geometry_msgs/msg/WrenchStamped", self.header(t), wrench)
-
-    topics = {"/force": ("geometry_msgs/msg/WrenchStamped", "wrench")}
-    log = sf.read_log(write_bag(tmp_path / "a", "mcap", topics, More(Stores.ROS2_HUMBLE, ())))
-    assert log.channels == tuple(f"wrench.{what}.{axis}" for what in ("force", "torque") for axis in "xyz")
-    np.testing.assert_array_equal(log["wrench.force.x"], X)
 
 
 def test_topics(bag, tmp_path):
@@ -359,22 +328,14 @@ def test_no_fix_and_the_clock_of_a_simulation(tmp_path):
             return super().fix(t, x, status=-1 if x == 1.0 else 0)
 
         def header(self, t):
-            stamp = self.make("builtin_interfaces/msg/Time", *divmod(round(t * 1e9), 10**9))
-            return self.make("std_msgs/msg/Header", stamp, "map")
+            stamp = self.make("builtin_interfaces/Time", *divmod(round(t * 1e9), 10**9))
+            return self.make("std_msgs/Header", stamp, "map")
 
     topics, ros = {"/fix": TOPICS["/fix"]}, Lost(Stores.ROS2_HUMBLE, ())
     log = sf.read_log(write_bag(tmp_path / "a", "ros2", topics, ros))
     np.testing.assert_allclose(log["east"], [0, np.nan, 3, 6], atol=1e-5)
     np.testing.assert_array_equal(log.times, TIMES)
     assert log.start is None
-
-
-def test_bags_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"There is no file .*a\.mcap; check the name"):
-        sf.read_log(tmp_path / "a.mcap")
-    (tmp_path / "a.mcap").write_bytes(b"no bag")
-    with pytest.raises(InputError, match=r"a\.mcap cannot be read as a ROS bag: "):
-        sf.read_log(tmp_path / "a.mcap")
 
 
 # --- MATLAB and Parquet -----------------------------------------------------------------------------------------------
@@ -451,40 +412,28 @@ def test_structs(write_mat):
     assert log.source.endswith("a.mat (drive)")
     with pytest.raises(InputError, match=r"has no struct 'dive' with times; those that have are drive, still"):
         sf.read_log(path, topic="dive")
-
-
-def test_mat_files_that_cannot_be_read(write_mat, tmp_path):
     with pytest.raises(InputError, match=r"a\.mat has no vector of times; its variables are x, y\. Name the one with"):
         sf.read_log(write_mat(x=X, y=X))
-    np.testing.assert_array_equal(sf.read_log(tmp_path / "a.mat", time="x")["y"], X)
-    (tmp_path / "a.mat").write_bytes(b"x" * 700)
-    with pytest.raises(InputError, match=r"a\.mat cannot be read as a \.mat file: "):
-        sf.read_log(tmp_path / "a.mat")
+    np.testing.assert_array_equal(sf.read_log(path, time="x")["y"], X)
 
 
-@pytest.mark.parametrize("add_object", [add_object_5, add_object_73])
-def test_what_to_do_with_objects_of_matlab_is_said(tmp_path, add_object):
+@pytest.mark.parametrize(("write", "add_object"), [(savemat, add_object_5), (write_73, add_object_73)])
+def test_objects_of_matlab(tmp_path, write, add_object):
+    """They are passed over beside a log; where there is no other, the way to save them as numbers is said."""
     path = tmp_path / "a.mat"
-    (savemat if add_object is add_object_5 else write_73)(path, {"gain": 3.0})
-    add_object(path, "ts", "timeseries")
-    remedy = re.escape(r"s = struct('t', ts.Time, 'y', ts.Data); save('log.mat', '-struct', 's')")
-    with pytest.raises(InputError, match=rf"a\.mat has no vector of times; .* only MATLAB reads.*: {remedy}"):
-        sf.read_log(path)
-    with pytest.raises(InputError, match=rf"a\.mat has no struct 'ts' with times; .* only MATLAB reads.*: {remedy}"):
-        sf.read_log(path, topic="ts")
-
-
-@pytest.mark.parametrize("add_object", [add_object_5, add_object_73])
-def test_objects_of_matlab_beside_a_log_are_passed_over(tmp_path, add_object):
-    path = tmp_path / "a.mat"
-    (savemat if add_object is add_object_5 else write_73)(path, {"t": TIMES, "x": X})
+    write(path, {"t": TIMES, "x": X})
     add_object(path, "first", "timeseries")
     add_object(path, "second", "string")
     log = sf.read_log(path)
     np.testing.assert_array_equal(log["x"], X)
     assert log.channels == ("x",)
-    with pytest.raises(InputError, match=r"has no struct 'second' with times; .* Objects, .* only MATLAB reads"):
-        sf.read_log(path, topic="second")
+    remedy = re.escape(r"s = struct('t', ts.Time, 'y', ts.Data); save('log.mat', '-struct', 's')")
+    with pytest.raises(InputError, match=rf"has no struct 'first' with times; .* only MATLAB reads.*: {remedy}"):
+        sf.read_log(path, topic="first")
+    write(path, {"gain": 3.0})
+    add_object(path, "ts", "timeseries")
+    with pytest.raises(InputError, match=rf"a\.mat has no vector of times; .* only MATLAB reads.*: {remedy}"):
+        sf.read_log(path)
 
 
 def test_parquet(tmp_path):
@@ -516,37 +465,54 @@ def test_parquet_of_pandas(tmp_path):
     assert (log.start, log.units) == (START, {"x": "m"})
     sf.read_log(path).to_pandas().to_parquet(path)
     np.testing.assert_array_equal(sf.read_log(path, time="time (s)")["x"], X)
-    (tmp_path / "b.parquet").write_bytes(b"PAR1")
-    with pytest.raises(InputError, match=r"b\.parquet cannot be read as a Parquet file: "):
-        sf.read_log(tmp_path / "b.parquet")
 
 
-@pytest.mark.parametrize("path", ["a.gpx", "a.nmea", "a.bag", "a.mat", "a.parquet"])
-def test_a_library_that_is_missing(path, tmp_path, monkeypatch):
-    extra = {"a.gpx": "gps", "a.nmea": "gps", "a.bag": "ros", "a.mat": "matlab", "a.parquet": "parquet"}[path]
-    (tmp_path / path).write_bytes(b"\x89HDF\r\n\x1a\n" if extra == "matlab" else b"$")
-    for name in ("gpxpy", "pynmea2", "rosbags.highlevel", "h5py", "pyarrow.parquet"):
-        monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(InputError, match=rf"{path}: .* cannot be imported \(.*\): pip install 'switchfit\[{extra}\]'"):
-        sf.read_log(tmp_path / path)
+# --- what cannot be read ----------------------------------------------------------------------------------------------
+
+NO_FIX = "\n".join(str(s) for s in sentences(0, 0, "0", "V")).encode()
+NO_TIMES = b'<gpx version="1.1" creator="a"><trk><trkseg><trkpt lat="1" lon="2"/></trkseg></trk></gpx>'
 
 
-def test_options_that_mean_nothing(tmp_path):
-    write_gpx(tmp_path / "a.gpx")
-    (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
-    (tmp_path / "a.nmea").write_text("")
-    pq.write_table(pa.table({"t": [0.0, 1.0], "x": [0.0, 1.0]}), tmp_path / "a.parquet")
-    for name, form, option in (
-        ("a.gpx", "a GPX track", "time"),
-        ("a.nmea", "an NMEA 0183 log", "topic"),
-        ("a.csv", "a table of text", "topic"),
-        ("a.parquet", "a Parquet file", "topic"),
-        ("a.bag", "a ROS bag", "time"),
-    ):
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.gpx", NO_TIMES, "has no track with times: of 1 points, none has a time"),
+        ("a.gpx", b"<gpx><trk>", "is no GPX file: "),
+        ("a.nmea", NO_FIX, "has no GGA, RMC or GNS sentence with a position"),
+        ("a.mcap", b"no bag", "cannot be read as a ROS bag: "),
+        ("a.mat", b"x" * 700, r"cannot be read as a \.mat file: "),
+        ("a.parquet", b"PAR1", "cannot be read as a Parquet file: "),
+    ],
+)
+def test_files_that_are_no_logs(name, content, message, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=f"{name} {message}"):
+        sf.read_log(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "extra", "option", "form"),
+    [
+        ("a.gpx", "gps", "time", "a GPX track"),
+        ("a.nmea", "gps", "topic", "an NMEA 0183 log"),
+        ("a.csv", None, "topic", "a table of text"),
+        ("a.parquet", "parquet", "topic", "a Parquet file"),
+        ("a.bag", "ros", "time", "a ROS bag"),
+        ("a.mat", "matlab", None, ""),
+    ],
+)
+def test_options_that_mean_nothing_and_libraries_that_are_missing(name, extra, option, form, tmp_path, monkeypatch):
+    (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n" if extra == "matlab" else b"$")
+    if option:
         with pytest.raises(
             InputError, match=rf"{name} is {form}, for which {option} means nothing; leave out {option}"
         ):
             sf.read_log(tmp_path / name, **{option: "x"})
+    for module in ("gpxpy", "pynmea2", "rosbags.highlevel", "h5py", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, module, None)
+    if extra:
+        with pytest.raises(InputError, match=rf"{name}: .* cannot be imported \(.*\): pip install 'switchfit\[{extra}"):
+            sf.read_log(tmp_path / name)
 
 
 def test_a_sigma_that_is_missing_with_its_value():

@@ -10,11 +10,8 @@ from derivatives import differentiate
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import _to_variables
-from switchfit.io.command_line import describe
-from switchfit.io.problem_file import load_problem
 from switchfit.optimize.arrow import Arrow
 from switchfit.problem.unknowns import Variables
-from switchfit.runtime.errors import InputError
 from switchfit.strategy.starts import draw_starts
 
 TRUTH, RATES = (0.03, 4.0), (20.0, 0.3, 0.002)
@@ -92,18 +89,12 @@ def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
     np.testing.assert_allclose(np.column_stack([found.hessian @ e for e in np.eye(3)]), expected[1], rtol=1e-12)
 
 
-@pytest.mark.parametrize("t0", [0.0, 7.0])
-@pytest.mark.parametrize("guess", [(0.03, 4.0), (1.0, 30.0), (10.0, 300.0)])
+@pytest.mark.parametrize(("guess", "t0"), [((0.03, 4.0), 0.0), ((10.0, 300.0), 0.0), ((10.0, 300.0), 7.0)])
 def test_times_are_found_from_guesses_decades_away(guess, t0):
     fit = sf.estimate(relaxation(guess, t0=t0), strategy="local")
     assert fit.success
     np.testing.assert_allclose(fit.theta - [t0, t0, 0, 0, 0], BEST, rtol=1e-6)
     assert fit.log_scaled == ("tau_1", "tau_2", "k[0]", "k[1]", "k[2]")
-
-
-def test_steps_on_a_linear_scale_do_not_get_there():
-    fit = sf.estimate(relaxation((10.0, 300.0), "linear"), strategy="local")
-    assert not fit.success
 
 
 def test_all_that_is_returned_is_that_of_the_times_themselves():
@@ -150,49 +141,25 @@ LEAP = np.where(HOURS < 1.6, 0.5 * HOURS**2, 1.28 + 1.6 * (HOURS - 1.6) + 0.1)
 """Push for 1.6, then leap ahead and roll: what would have to slide forward slides back."""
 
 
-def constrained(sequence, values, guesses, fixed, scale):
-    """Modes in an order that the data do not have: one of them lasts no time."""
-    data = sf.Measurements(3.0 + HOURS, values, observe=lambda t, x, p: x[:1], sigma=0.1)
+def constrained(guesses, fixed, scale):
+    """A mode that the data do not have: it lasts no time."""
+    data = sf.Measurements(3.0 + HOURS, LEAP, observe=lambda t, x, p: x[:1], sigma=0.1)
     taus = [sf.Parameter(3.0 + g, scale=scale, fixed=f) for g, f in zip(guesses, fixed, strict=True)]
-    return sf.Problem(PUSHED, sf.Experiment(data, sequence, taus, 3.0, 7.0))
+    return sf.Problem(PUSHED, sf.Experiment(data, ("push", "slide back", "roll"), taus, 3.0, 7.0))
 
 
 @pytest.mark.parametrize(
-    ("sequence", "values", "guesses", "fixed"),
-    [
-        (("push", "slide back", "roll"), LEAP, [1.5, 1.7], [False, False]),
-        (("push", "slide back", "roll"), LEAP, [1.0, 1.4], [False, True]),
-        (("push", "slide back", "roll"), LEAP, [1.6, 2.5], [True, False]),
-        (("roll", "push", "slide back", "roll"), LEAP, [0.01, 1.5, 1.7], [True, False, False]),
-    ],
-    ids=["between two", "before a fixed time", "after a fixed time", "after a fixed time, between two"],
+    ("guesses", "fixed"),
+    [([1.5, 1.7], [False, False]), ([1.0, 1.4], [False, True]), ([1.6, 2.5], [True, False])],
+    ids=["between two", "before a fixed time", "after a fixed time"],
 )
-def test_active_constraints_and_multipliers_are_those_of_the_linear_scale(sequence, values, guesses, fixed):
-    linear, log = (
-        sf.estimate(constrained(sequence, values, guesses, fixed, scale), strategy="local")
-        for scale in ("linear", "log")
-    )
+def test_active_constraints_and_multipliers_are_those_of_the_linear_scale(guesses, fixed):
+    linear, log = (sf.estimate(constrained(guesses, fixed, scale), strategy="local") for scale in ("linear", "log"))
     assert log.status.successful
     np.testing.assert_allclose(log.theta, linear.theta, rtol=1e-7)
     assert [(c.kind, c.mode, c.position) for c in log.active] == [(c.kind, c.mode, c.position) for c in linear.active]
     assert log.active[0].multiplier > 0.01
     assert log.active[0].multiplier == pytest.approx(linear.active[0].multiplier, rel=1e-5)
-
-
-def test_a_mode_that_should_not_be_there_becomes_short_at_t0_but_does_not_vanish():
-    """The logarithm of no time is minus infinity."""
-    fit = sf.estimate(
-        constrained(("slide back", "push"), 0.5 * HOURS**2 + 0.01, [0.5], [False], "log"), strategy="local"
-    )
-    assert 3.0 < fit.theta[0] < 3.01
-
-
-def test_bounds_hold():
-    fit = sf.estimate(ramp(1, "log", upper=3.1), strategy="local")
-    assert fit.theta[0] == 3.1
-    assert fit.active[0].kind == "upper bound"
-    linear = sf.estimate(ramp(1, "linear", upper=3.1), strategy="local")
-    assert fit.active[0].multiplier == pytest.approx(linear.active[0].multiplier, rel=1e-6)
 
 
 # Uncertainty
@@ -247,16 +214,10 @@ def test_strategies_find_the_times_from_where_one_fit_does_not():
 @pytest.mark.parametrize(
     ("build", "said"),
     [
-        (
-            lambda: relaxation((sf.Parameter(0.03), 4.0)),
-            r"must be on one scale.*got \['linear', 'log'\].*all of them, or",
-        ),
+        (lambda: relaxation((sf.Parameter(0.03), 4.0)), r"must be on one scale.*got \['linear', 'log'\].*all of them"),
         (lambda: relaxation((0.03, 4.0), tf=sf.Parameter(1000.0, lower=1000, upper=2000.0)), "must be on one scale"),
         (lambda: relaxation((-0.03, 4.0)), "Parameter with scale='log' must be positive"),
-        (
-            lambda: sf.Problem(RAMP, ramp(0, "log").experiments, {"v": 2.0}, min_duration=0.1),
-            "min_duration must be 0 where transition times are on a logarithmic scale.*got 0.1",
-        ),
+        (lambda: replace(ramp(0, "log"), min_duration=0.1), "min_duration must be 0 where transition times are on a l"),
     ],
 )
 def test_what_does_not_go_together_is_said(build, said):
@@ -268,23 +229,3 @@ def test_a_fixed_time_may_have_any_scale():
     problem = relaxation((0.03, sf.Parameter(4.0, fixed=True)))
     assert problem.theta_names[0] == "tau_1"
     assert problem.unknowns.log_times.tolist() == [True, False, False, False]
-
-
-def test_problem_files(tmp_path):
-    (tmp_path / "log.csv").write_text("t,x\n0.001,1\n0.01,0.8\n1,0.4\n100,0.3\n")
-    (tmp_path / "m.py").write_text(
-        "import switchfit as sf\n"
-        "model = sf.HybridSystem({'a': lambda t, x, p: -p['k'] * x, 'b': lambda t, x, p: 0 * x}, [1.0])\n"
-    )
-    text = (
-        'model = "m.py:model"\nparameters = {{ k = 1.0 }}\n[[experiments]]\nmode_sequence = ["a", "b"]\n'
-        'transition_times = [{{ value = 0.1, scale = "{}" }}]\n'
-        'data = {{ file = "log.csv", time = "t", columns = ["x"] }}\n'
-    )
-    (tmp_path / "p.toml").write_text(text.format("log"))
-    problem = load_problem(tmp_path / "p.toml").problem
-    assert problem.unknowns.log_names == ("tau_1",)
-    assert "(log scale)" in describe(problem)
-    (tmp_path / "p.toml").write_text(text.format("ln"))
-    with pytest.raises(InputError, match=r"transition_times\[1\]\.scale"):
-        load_problem(tmp_path / "p.toml")

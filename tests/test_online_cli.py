@@ -1,7 +1,6 @@
 """`switchfit online`: samples from logs and from stdin, states and journals, Ctrl-C, kill, and the live page."""
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -10,7 +9,6 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +18,6 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.command_line import read_sample
 from switchfit.io.problem_file import load_problem
 from switchfit.report.html.live import KEPT, LivePage
 from switchfit.runtime.errors import InputError
@@ -81,9 +78,6 @@ def test_a_line_of_json_for_each_sample(replayed, folder):
         for alarm in log.alarms
     ]
     assert [line["retracted"] for line in lines if line["retracted"]] == [each._asdict() for each in log.retracted]
-
-
-def test_figure_and_table(replayed, folder):
     out = folder / "out" / "deep"
     assert replayed.stderr == f"written to {out}\n"
     assert sorted(path.name for path in out.iterdir()) == ["online.png", "online.txt"]
@@ -124,13 +118,9 @@ BAD = {
     "garbage": "a sample is one line of JSON",
     "[" * 5000: "a sample is one line of JSON",
     "\xff": "a sample is one line of JSON",
-    "[1.2, 3.4]": "a sample has the keys t, y and u",
     '{"y": [1.0]}': "a sample has the keys t, y and u",
     '{"t": 1.0, "z": [1.0]}': "a sample has the keys t, y and u",
-    '{"t": "noon", "y": [1.0]}': "t must be a number",
     '{"t": null, "y": [1.0]}': "t must be",
-    '{"t": 1e999, "y": [1.0]}': "t must be finite",
-    '{"t": 1.4, "y": [1.0, 2.0]}': "y must have 1 values",
     '{"t": 1.4, "y": {"Q": 1.0}}': "y has 'Q', which is no channel; there are: T",
     '{"t": 1.4, "y": "warm"}': "must be a number or an array of numbers",
     '{"t": 1.4, "y": [1.0], "u": 2.0}': "u was given, but the experiment has no inputs",
@@ -159,26 +149,22 @@ def test_missing_values_and_mere_time(folder):
 
 
 def test_inputs_hold_from_their_sample_on(tmp_path):
+    """As in the replay of the log, and without a log, where the first sample has the input alone."""
     (tmp_path / "model.py").write_text(MODEL)
-    inputs = '[experiments.inputs]\nfile = "log.csv"\ntime = "t"\ncolumns = ["u"]\n'
     text = PROBLEM.split("[library]")[0].replace("model.py:system", "model.py:driven").replace("c = 0.1\n", "")
-    text = text.replace("t0 = 0.0\ntf = 8.0", 'mode_sequence = ["pushed"]')
-    (tmp_path / "problem.toml").write_text(text + inputs)
-    write_log(tmp_path / "log.csv", VALUES, np.full(60, 3.0), names=("T", "u"))
-    driven = [json.dumps(json.loads(line) | {"u": 3.0}) for line in LINES[:20]]
-    result = feed(tmp_path, driven)
-    assert result.exit_code == 0, result.stderr
-    replayed = read(run("online", tmp_path / "problem.toml"))[:20]
-    text = (text + inputs).replace('file = "log.csv"\n', "").replace("mode_sequence", "t0 = 0.0\nmode_sequence")
+    text = text.replace("tf = 8.0", 'mode_sequence = ["pushed"]')
+    text += '[experiments.inputs]\nfile = "log.csv"\ntime = "t"\ncolumns = ["u"]\n'
     (tmp_path / "problem.toml").write_text(text)
-    without_log = feed(tmp_path, ['{"t": 0.0, "u": 3.0}', *driven])
-    assert without_log.exit_code == 0, without_log.stderr
-    for given, own in zip(read(result), replayed, strict=True):
-        assert given["mode"] == own["mode"]
-        assert given["parameters"]["a"] == pytest.approx(own["parameters"]["a"], rel=1e-9)
-    last = read(without_log)[-1]
-    assert last["mode"] == replayed[-1]["mode"]
-    assert last["parameters"]["a"] == pytest.approx(replayed[-1]["parameters"]["a"], rel=1e-4)
+    times, values = np.r_[0.0, TIMES], np.r_[np.nan, VALUES]
+    write_log(tmp_path / "log.csv", values, np.full(61, 3.0), times=times, names=("T", "u"))
+    replayed = read(run("online", tmp_path / "problem.toml"))[20]
+    (tmp_path / "problem.toml").write_text(text.replace('file = "log.csv"\n', ""))
+    driven = [json.dumps(json.loads(line) | {"u": 3.0}) for line in LINES[:20]]
+    result = feed(tmp_path, ['{"t": 0.0, "u": 3.0}', *driven])
+    assert result.exit_code == 0, result.stderr
+    last = read(result)[-1]
+    assert (last["t"], last["mode"]) == (replayed["t"], replayed["mode"])
+    assert last["parameters"]["a"] == pytest.approx(replayed["parameters"]["a"], rel=1e-4)
 
 
 def test_dates(tmp_path):
@@ -188,16 +174,11 @@ def test_dates(tmp_path):
     write_log(tmp_path / "log.csv", VALUES)
     result = feed(tmp_path, ['{"t": "2024-05-01T12:00:00.5Z", "y": [0.9]}', '{"t": 0.6, "y": [1.0]}'])
     assert result.exit_code == 0, result.stderr
-    assert [(line["t"], line["date"][:23]) for line in read(result)] == [
-        (0.5, "2024-05-01T12:00:00.500"),
-        (0.6, "2024-05-01T12:00:00.600"),
-    ]
-    (experiment,) = load_problem(tmp_path / "problem.toml", searched=True).problem.experiments
-    with pytest.raises(ValueError, match="a number or a date"):
-        read_sample(b'{"t": "tomorrow"}', experiment)
+    assert [(line["t"], line["date"][17:23]) for line in read(result)] == [(0.5, "00.500"), (0.6, "00.600")]
+    assert "a number or a date" in feed(tmp_path, ['{"t": "tomorrow"}']).stderr
 
 
-def test_options_are_those_of_the_estimator(folder, monkeypatch):
+def test_options_are_those_of_the_estimator_and_come_before_the_file(folder, tmp_path, monkeypatch):
     given = {}
 
     def build(problem, **settings):
@@ -208,53 +189,21 @@ def test_options_are_those_of_the_estimator(folder, monkeypatch):
     options = ("--window", 2, "--threshold", 9, "--max-switches", 3, "--budget", 0.1)
     result = run("online", folder / "problem.toml", *options)
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
-    assert given == {
-        "window": 2.0,
-        "threshold": 9.0,
-        "false_alarms": None,
-        "max_switches": 3,
-        "budget": 0.1,
-        "capacity": 4096,
-        "successions": {"rise": ["fall", "drift"], "fall": ["rise"]},
-        "min_duration": 0.2,
-    }
-
-
-def test_parameters_that_change(folder, tmp_path, monkeypatch):
-    """The options come before the [online] of the file."""
-    given = {}
-
-    def build(problem, **settings):
-        given.update(settings)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(sf, "OnlineEstimator", build)
+    said = {"window": 2.0, "threshold": 9.0, "false_alarms": None, "max_switches": 3, "budget": 0.1, "capacity": 4096}
+    assert given == said | {"successions": {"rise": ["fall", "drift"], "fall": ["rise"]}, "min_duration": 0.2}
     for name in ("model.py", "log.csv"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     online = '[online]\nwindow = 3.0\nrenews = { rise = "a" }\ndrift = { c = 0.1 }\n'
     (tmp_path / "problem.toml").write_text(PROBLEM + online)
     run("online", tmp_path / "problem.toml")
     assert (given["window"], given["renews"], given["drift"]) == (3.0, {"rise": ["a"]}, {"c": 0.1})
-    options = ("--renews", "rise=b, rise=a,fall=b", "--drift", "a=0.1,b = 0.2", "--window", 2)
-    run("online", tmp_path / "problem.toml", *options)
-    assert (given["window"], given["renews"]) == (2.0, {"rise": ["b", "a"], "fall": ["b"]})
-    assert given["drift"] == {"a": 0.1, "b": 0.2}
-
-
-def test_a_value_that_is_new_with_its_mode(folder, replayed):
-    """What is known of a from before is forgotten when it rises again: the standard error is then larger."""
-    last = read(run("online", folder / "problem.toml", "--renews", "rise=a"))[-1]
-    assert last["mode_sequence"] == ["rise", "fall", "rise"]
-    assert last["standard_errors"]["a"] > 1.2 * read(replayed)[-1]["standard_errors"]["a"]
-    assert abs(last["parameters"]["a"] - 0.7) < 4 * last["standard_errors"]["a"]
+    run("online", tmp_path / "problem.toml", "--window", 2)
+    assert given["window"] == 2.0
 
 
 def test_modes_that_the_library_leaves_out_never_follow(folder, tmp_path):
-    for name in ("model.py", "log.csv"):
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    text = PROBLEM.split("[library]")[0]
-    (tmp_path / "problem.toml").write_text(f'{text}[library]\nfirst = "rise"\nmodes = ["rise", "drift"]\n')
-    assert {line["mode"] for line in read(run("online", tmp_path / "problem.toml"))} == {"rise", "drift"}
+    (tmp_path / "model.py").write_text(MODEL)
+    text = PROBLEM.split("[library]")[0].replace('file = "log.csv"\n', "")
     (tmp_path / "problem.toml").write_text(f'{text}[library]\nmodes = ["rise"]\n')
     result = feed(tmp_path, LINES[:45])
     assert {line["mode"] for line in read(result)} == {"rise"}
@@ -269,25 +218,19 @@ def test_the_threshold_for_a_rate_of_false_alarms_is_named(folder, monkeypatch):
     result = feed(folder, LINES[:3], "--false-alarms", 0.2)
     assert (result.exit_code, result.stderr) == (0, "threshold 20\n")
     assert {line["threshold"] for line in read(result)} == {20.0}
+    quiet = feed(folder, LINES[:3], "--quiet")
+    assert (quiet.exit_code, quiet.output) == (0, "")
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (("--stdin", "--replay", "log.csv"), "--replay and --stdin contradict each other; give one of them."),
-        (
-            ("--threshold", 5, "--false-alarms", 1),
-            "give threshold or false_alarms, not both: one follows from the other.",
-        ),
+        (("--threshold", 5, "--false-alarms", 1), "give threshold or false_alarms, not both: one follows from the ot"),
         (("--stdin",), "there were no samples."),
         (("--window", -1), "window must be positive; got -1.0."),
         (("--live", 99999), "the page cannot be served on port 99999: "),
         (("--replay", "missing.csv"), "missing.csv"),
-        (("--drift", "a"), "--drift must be PARAMETER=NUMBER,PARAMETER=NUMBER; got a."),
-        (("--drift", "a=x"), "--drift must be PARAMETER=NUMBER,PARAMETER=NUMBER; got a=x."),
-        (("--renews", "rise="), "--renews must be MODE=PARAMETER,MODE=PARAMETER; got rise=."),
-        (("--renews", "climb=a"), "renews has 'climb', which is no mode of the system; there are: rise, fall, drift."),
-        (("--drift", "a=0.1"), "drift acts on what is known from before the window: set window=."),
     ],
 )
 def test_wrong_input(folder, options, message):
@@ -295,11 +238,6 @@ def test_wrong_input(folder, options, message):
     assert result.exit_code == 2
     assert message in result.stderr
     assert result.stdout == ""
-
-
-def test_quiet(folder):
-    result = feed(folder, LINES[:3], "--quiet")
-    assert (result.exit_code, result.stdout, result.stderr) == (0, "", "")
 
 
 # --- states and journals ----------------------------------------------------------------------------------------------
@@ -355,21 +293,36 @@ def write_and_read(process, lines):
     return found
 
 
-@pytest.mark.parametrize("cut", [0, 7], ids=["between lines", "inside a line"])
-def test_kill_9_loses_nothing_that_was_answered(folder, replayed, tmp_path, quick_processes, cut):
+def test_kill_9_loses_nothing_that_was_answered(folder, replayed, tmp_path, quick_processes):
     """A line of the journal that was cut off, as where the machine lost its power, is left out, and does no harm."""
     journal = tmp_path / "journal"
     with start(folder, "--journal", journal) as process:
         write_and_read(process, LINES[:30])
         process.send_signal(signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
-    if cut:
-        with journal.open("ab") as file:
-            file.write(journal.read_bytes().splitlines()[-1][:cut])
+    with journal.open("ab") as file:
+        file.write(journal.read_bytes().splitlines()[-1][:7])
     result = feed(folder, LINES[30:40], "--journal", journal)
     assert result.exit_code == 0, result.stderr
     assert read(result) == read(replayed)[30:40]
     assert read(feed(folder, LINES[40:], "--journal", journal)) == read(replayed)[40:]
+
+
+def test_a_reader_that_is_gone_ends_nothing_and_the_page_stays(folder, tmp_path, quick_processes):
+    with start(folder, "--out", tmp_path, "--live", 0) as process:
+        address = process.stderr.readline().removeprefix("live at ").strip()
+        write_and_read(process, LINES[:2])
+        process.stdout.close()
+        process.stdin.write("\n".join(LINES[2:20]))
+        process.stdin.close()
+        said = [process.stderr.readline() for _ in range(2)]
+        assert said == [f"written to {tmp_path}\n", "the samples have ended; Ctrl-C ends the page\n"]
+        with urllib.request.urlopen(address) as answer:
+            assert answer.status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
+        assert "Traceback" not in process.stderr.read()
+    assert "20 updates" in (tmp_path / "online.txt").read_text()
 
 
 def test_ctrl_c_while_it_waits_keeps_what_there_is(folder, tmp_path, quick_processes):
@@ -388,40 +341,6 @@ def test_ctrl_c_while_it_waits_keeps_what_there_is(folder, tmp_path, quick_proce
     assert (out / "online.txt").read_text().startswith("rise since 0 s")
     assert "12 updates" in (out / "online.txt").read_text()
     assert read(feed(folder, LINES[12:14], "--state", state))[0]["t"] == TIMES[12]
-
-
-def test_ctrl_c_before_the_first_sample(folder, quick_processes):
-    with start(folder, "--live", 0) as process:
-        process.stderr.readline()
-        time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
-        rest = process.stderr.read()
-        assert process.wait(timeout=60) == 2
-    assert "there were no samples" in rest
-
-
-def test_the_page_stays_when_the_samples_have_ended(folder, quick_processes):
-    with start(folder, "--live", 0) as process:
-        address = process.stderr.readline().removeprefix("live at ").strip()
-        write_and_read(process, LINES[:3])
-        process.stdin.close()
-        assert process.stderr.readline() == "the samples have ended; Ctrl-C ends the page\n"
-        with urllib.request.urlopen(address) as answer:
-            assert answer.status == 200
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
-
-
-def test_a_reader_that_is_gone_ends_nothing(folder, tmp_path, quick_processes):
-    with start(folder, "--out", tmp_path) as process:
-        write_and_read(process, LINES[:2])
-        process.stdout.close()
-        for line in LINES[2:20]:
-            process.stdin.write(f"{line}\n")
-        process.stdin.close()
-        assert process.wait(timeout=60) == 0
-        assert "Traceback" not in process.stderr.read()
-    assert "20 updates" in (tmp_path / "online.txt").read_text()
 
 
 # --- the live page ----------------------------------------------------------------------------------------------------
@@ -455,15 +374,9 @@ def test_readers_get_what_is_new(page):
     assert found["head"]["units"] == {"a": "1/s", "b": "", "c": ""}
     assert list(found["head"]["colours"]) == ["rise", "fall", "drift"]
     assert (found["count"], [line["k"] for line in found["lines"]]) == (5, [0, 1, 2, 3, 4])
-    for after, expected in {
-        "3": [3, 4],
-        "5": [],
-        "99": [0, 1, 2, 3, 4],
-        "x": [0, 1, 2, 3, 4],
-        "9" * 5000: None,
-    }.items():
+    for after, expected in {"3": [3, 4], "5": [], "99": [0, 1, 2, 3, 4], "9" * 5000: [0, 1, 2, 3, 4]}.items():
         lines = json.loads(get(page, f"/now.json?after={after}")[1])["lines"]
-        assert expected is None or [line["k"] for line in lines] == expected
+        assert [line["k"] for line in lines] == expected
     for k in range(5, KEPT + 100):
         page.show(json.dumps({"k": k}))
     found = json.loads(get(page, "/now.json?after=10")[1])
@@ -482,45 +395,28 @@ def test_a_port_that_is_taken(page, folder):
     port = int(page.address.rpartition(":")[2])
     with pytest.raises(InputError, match=f"the page cannot be served on port {port}: .*; name another with --live"):
         LivePage("problem.toml", load_problem(folder / "problem.toml", searched=True).problem, port)
-    with pytest.raises(ConnectionRefusedError), socket.create_connection((own_address(), port), timeout=5):
-        pass
-
-
-def own_address():
-    """An address of this machine that is not that of the page; the whole net 127.0.0.0/8 is this machine."""
-    return "127.0.0.2"
+    with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.2", port), timeout=5):
+        pass  # an address of this machine that is not that of the page
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-def test_the_page_in_a_browser(page, replayed, tmp_path, dark):
+def test_the_page_in_a_browser(page, replayed, tmp_path):
     """It draws what has come, without an error, and asks nothing of any other machine."""
     from browser import Browser, find_browser
 
     if find_browser() is None:
         pytest.skip("no Chromium on this machine")
-    lines = replayed.stdout.splitlines()
-    for line in lines[:30]:
-        page.show(line)
     browser = Browser(tmp_path)
     try:
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        browser.call("Emulation.setEmulatedMedia", features=scheme)
         browser.call("Page.navigate", url=page.address)
-        browser.wait("document.getElementById('mode')?.textContent === 'fall'")
-        for line in lines[30:]:
+        for line in replayed.stdout.splitlines():
             page.show(line)
-        browser.wait("document.getElementById('mode').textContent === 'rise'")
+        browser.wait("document.getElementById('mode')?.textContent === 'rise'")
         assert browser.evaluate("document.querySelectorAll('.chart').length") == 6, "mode, statistic, a, b, c, time"
         assert browser.evaluate("document.getElementById('parameters').textContent").startswith("a0.694")
         assert browser.evaluate("document.querySelectorAll('.alarm').length") == 2
-        assert "since 5.48" in browser.evaluate("document.getElementById('since').textContent")
         assert browser.errors == []
-        assert {url.removeprefix(page.address)[:9] for url in browser.requests if url.startswith("http")} <= {
-            "/",
-            "/now.json",
-        }
-        if os.environ.get("PICTURES"):
-            browser.screenshot(Path(os.environ["PICTURES"]) / f"live-{dark}.png", whole=True)
+        asked = {url.removeprefix(page.address)[:9] for url in browser.requests if url.startswith("http")}
+        assert asked <= {"/", "/now.json"}
     finally:
         browser.close()

@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import tarfile
-import time
 import tomllib
 import zipfile
 from pathlib import Path
@@ -27,7 +26,7 @@ FIT = """
 from importlib.metadata import version
 from pathlib import Path
 
-import jax, switchfit as sf
+import switchfit as sf
 from switchfit.models import heater_problem
 
 assert Path(sf.__file__).is_relative_to({prefix!r}), sf.__file__
@@ -36,7 +35,6 @@ assert sf.__version__ == version("switchfit")
 estimate = sf.estimate(heater_problem())
 assert estimate.success and estimate.engine.name == "native", estimate
 assert abs(estimate.theta - [2.5, 0.4]).max() < 0.1, estimate.theta
-print(jax.__version__, estimate.theta)
 """
 
 
@@ -96,57 +94,34 @@ def test_what_the_distributions_hold(distributions):
     assert wheel.name == f"{name}-py3-none-any.whl"
     packed = set(zipfile.ZipFile(wheel).namelist())
     library = {p.relative_to(ROOT / "src").as_posix() for p in (ROOT / "src").rglob("*") if p.is_file()}
-    library = {path for path in library if "__pycache__" not in path}
-    assert "switchfit/py.typed" in library
-    assert library <= packed, "files of the library that the wheel lacks"
+    assert {path for path in library if "__pycache__" not in path} <= packed, "files that the wheel lacks"
     assert {path.partition("/")[0] for path in packed} == {"switchfit", f"{name}.dist-info"}
-    assert f"{name}.dist-info/licenses/LICENSE" in packed
+    assert {f"{name}.dist-info/licenses/LICENSE", "switchfit/examples/toss/problem.toml"} <= packed
     with tarfile.open(source) as archive:
         sources = {path.removeprefix(f"{name}/") for path in archive.getnames()}
-    assert {
-        "LICENSE",
-        "CITATION.cff",
-        "CHANGELOG.md",
-        "README.md",
-        "pyproject.toml",
-        "tests/test_release.py",
-    } <= sources
+    assert {"LICENSE", "CITATION.cff", "CHANGELOG.md", "README.md", "tests/test_release.py"} <= sources
     assert wheel.stat().st_size < 2e6, "the wheel has something large in it"
     assert source.stat().st_size < 5e6, "the source distribution has something large in it"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("python", "constraints"),
-    [
-        pytest.param(OLDEST, read_lowest(), id="oldest Python, lowest dependencies"),
-        pytest.param(OLDEST, [], id="oldest Python, newest dependencies"),
-        pytest.param(NEWEST, [one for one in read_lowest() if one.startswith("jax==")], id="newest Python, lowest JAX"),
-        pytest.param(NEWEST, [], id="newest Python, newest dependencies"),
-    ],
+    ("python", "lowest"),
+    [(OLDEST, ""), (OLDEST, None), (NEWEST, "jax=="), (NEWEST, None)],
+    ids=["oldest, lowest dependencies", "oldest, newest dependencies", "newest, lowest JAX", "newest, newest"],
 )
-def test_a_fresh_installation_fits(python, constraints, distributions, tmp_path):
-    """Install the wheel into a new environment, fit, run the command; print how long and how large it is."""
-    assert sum(one.startswith("jax==") for one in read_lowest()) == 1
+def test_a_fresh_installation_fits(python, lowest, distributions, tmp_path):
+    """Install the wheel into a new environment, fit, run the command."""
+    constraints = [one for one in read_lowest() if lowest is not None and one.startswith(lowest)]
     environment = tmp_path / "env"
     run(find_python(python), "-m", "venv", environment, check=True)
     (tmp_path / "constraints.txt").write_text("\n".join(constraints))
     pip = [environment / "bin" / "python", "-m", "pip", "--disable-pip-version-check", "--quiet", "install"]
-    before, began = measure(environment), time.monotonic()
     run(*pip, "-c", tmp_path / "constraints.txt", distributions[0], check=True)
-    seconds, size = time.monotonic() - began, measure(environment) - before
     script = FIT.format(prefix=str(environment.resolve()))
-    fitted = run(environment / "bin" / "python", "-W", "error", "-c", script, folder=tmp_path, check=True)
+    run(environment / "bin" / "python", "-W", "error", "-c", script, folder=tmp_path, check=True)
     shutil.copytree(ROOT / "examples" / "toss", tmp_path / "toss")
     command = environment / "bin" / "switchfit"
     done = run(command, "fit", tmp_path / "toss" / "problem.toml", "--out", tmp_path / "out", check=True)
     assert re.search(r"^ *mu +0\.\d+", done.stdout, re.M), done.stdout
     assert (tmp_path / "out" / "estimate.json").exists()
-    shown = run(command, "--version", check=True).stdout
-    assert shown == f"switchfit {PROJECT['version']}\n"
-    print(f"\nPython {python}: pip install took {seconds:.0f} s and {size / 1e6:.0f} MB; jax {fitted.stdout.strip()}")
-
-
-def measure(folder):
-    """Return the size of a folder in bytes."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink())

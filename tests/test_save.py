@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
+import random
 import re
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from models import RAMP
@@ -68,8 +68,8 @@ def assert_same(a, b, where=""):
         assert a == b, where
 
 
-def round_trip(fit: Fit, folder: Path, certificate: Certificate = CERTIFICATE) -> tuple[Fit, Certificate]:
-    save_fit(fit, certificate, folder / "fit.json")
+def round_trip(fit: Fit, folder: Path) -> tuple[Fit, Certificate]:
+    save_fit(fit, CERTIFICATE, folder / "fit.json")
     return load_saved(folder / "fit.json")[:2]
 
 
@@ -110,14 +110,10 @@ def test_loading_gives_the_same_fit(fit, tmp_path):
     assert_same(CERTIFICATE, certificate)
 
 
-@pytest.mark.parametrize("status", Status)
-def test_every_status_is_kept(status, tmp_path):
-    assert round_trip(made(status=status), tmp_path)[0].status is status
-
-
 FLOATS = st.floats(allow_nan=False) | st.just(np.nan)
 
 
+@settings(max_examples=30)
 @given(
     numbers=hnp.arrays(np.float64, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4), elements=FLOATS),
     labels=hnp.arrays("<U4", st.integers(1, 5), elements=st.text(alphabet='aé"\\\n', max_size=4)),
@@ -163,7 +159,6 @@ def test_a_real_fit_comes_back(tmp_path):
     with pytest.raises(ValueError, match=r"loaded without its model: load it with Estimate.load\(path, problem="):
         loaded.profile("v")
     with_model = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
-    assert with_model.evaluator_at_solution() is with_model.evaluator_at_solution(), "its meshes are refined anew"
     np.testing.assert_allclose(with_model.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
     other = sf.Problem(RAMP, problem.experiments[0], {"v": sf.Parameter(2.0, fixed=True)})
     with pytest.raises(ValueError, match="holds the unknowns tau_1, v, the problem has tau_1: it is the fit of"):
@@ -184,32 +179,6 @@ def test_a_file_in_the_repository_prints_the_same_report_as_ever():
     )
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_file_is_replaced_whole_and_nothing_is_left_beside_it(tmp_path):
-    path = tmp_path / "fit.json"
-    path.write_text("x" * 10_000_000)
-    save_fit(made(), CERTIFICATE, path)
-    assert load_saved(path).fit.cost == 28.0
-    assert os.listdir(tmp_path) == ["fit.json"]
-
-
-def test_a_failure_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "fit.json"
-    save_fit(made(), CERTIFICATE, path)
-    before = path.read_bytes()
-
-    def full(handle):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        save_fit(made(cost=1.0), CERTIFICATE, path)
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["fit.json"]
-
-
 def test_a_link_stays_one(tmp_path):
     (tmp_path / "link.json").symlink_to(tmp_path / "fit.json")
     save_fit(made(), CERTIFICATE, tmp_path / "link.json")
@@ -217,35 +186,17 @@ def test_a_link_stays_one(tmp_path):
     assert load_saved(tmp_path / "fit.json").fit.cost == 28.0
 
 
-def test_a_new_file_has_the_usual_permissions(tmp_path):
-    save_fit(made(), CERTIFICATE, tmp_path / "fit.json")
-    (tmp_path / "usual").touch()
-    assert (tmp_path / "fit.json").stat().st_mode == (tmp_path / "usual").stat().st_mode
-
-
-# --- what cannot be read ----------------------------------------------------------------------------------------------
-
-
-def test_a_folder_that_is_not_there(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        save_fit(made(), CERTIFICATE, tmp_path / "nowhere" / "fit.json")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (b"", "not valid JSON"),
-        (b"PK\x03\x04\xff\xfe", "not valid JSON"),
-        (b'{"format": "switchfit fit", "version": 4, "fit"', "not valid JSON"),
-        (b'{"format": "switchfit fit", "version": NaN}', "of version nan; this switchfit reads"),
         (b"[" * 100_000, "not valid JSON"),
-        (b'{"format": "switchfit fit", "version": 2, "version": 2}', "of version 2; this switchfit reads version 9"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
         (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 9"),
         (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 9"),
+        (b'{"format": "switchfit fit", "version": NaN}', "of version nan; this switchfit reads"),
         (b'{"format": "switchfit fit", "version": 9}', "is damaged: its content is not what was written"),
-        (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):
@@ -258,60 +209,75 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
 BOUND = to_json(ActiveConstraint("lower bound", 0.05, "mu"), ActiveConstraint)
 
 
-def array(dtype, shape, values):
-    return {"dtype": dtype, "shape": shape, "values": values}
-
-
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        (("fit", "cost"), None, "fit.cost is not what was written; got null"),
-        (("fit", "cost"), True, "fit.cost is not what was written; got true"),
-        (("fit", "cost"), "12.5", 'fit.cost is not what was written; got "12.5"'),
-        (("fit", "theta"), "abc", "fit.theta is not what was written"),
-        (("fit", "hessian"), [[1.0], [2.0, 3.0]], "fit.hessian is not what was written"),
-        (("fit", "theta"), {"values": []}, "fit.theta is not what was written"),
-        (("fit", "theta"), {"dtype": "O", "shape": [0], "values": []}, "fit.theta is not what was written"),
-        (("fit", "theta"), {"dtype": "<f8", "shape": [2], "values": []}, "fit.theta is not what was written"),
-        (("fit", "theta"), {"dtype": "<i8", "shape": [1], "values": [1]}, "fit.theta is not what was written"),
-        (("fit", "status"), "FINE", "fit.status is not what was written"),
-        (("fit", "iterations"), 2.5, "fit.iterations is not what was written; got 2.5"),
-        (("fit", "sigma_known"), 1, "fit.sigma_known is not what was written; got 1"),
-        (("fit", "hessian_kind"), ["a"], 'fit.hessian_kind is not what was written; got ["a"]'),
-        (("fit", "active"), "abc", "fit.active is not what was written"),
-        (("fit", "kinks"), [["tau_1", 1.0]], 'fit.kinks[0] is not what was written; got ["tau_1", 1.0]'),
-        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0] is not what was written"),
-        (("fit", "parameters"), [], "fit.parameters is not what was written; got []"),
-        (("fit", "history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
-        (("fit", "trajectories", 0, "modes"), 3, "fit.trajectories[0].modes is not what was written; got 3"),
-        (("fit", "comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind is not what was written; got null"),
-        (("fit", "colour"), "red", "fit.colour is unknown"),
-        (("certificate",), {}, "certificate.optimality is missing"),
-        (("fit", "hessian_kind"), "\ud800", "fit.hessian_kind is not what was written"),
-        (("fit", "active"), [BOUND | {"kind": "bound"}], 'fit.active[0].kind is not what was written; got "bound"'),
-        (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects is not what was"),
-        (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
+        (("cost",), True, "fit.cost is not what was written; got true"),
+        (("theta",), "abc", "fit.theta is not what was written"),
+        (("theta",), {"dtype": "O", "shape": [0], "values": []}, "fit.theta is not what was written"),
+        (("theta",), {"dtype": "<i8", "shape": [1], "values": [1]}, "fit.theta is not what was written"),
+        (("status",), "FINE", "fit.status is not what was written"),
+        (("iterations",), 2.5, "fit.iterations is not what was written; got 2.5"),
+        (("sigma_known",), 1, "fit.sigma_known is not what was written; got 1"),
+        (("kinks",), [["tau_1", 1.0]], 'fit.kinks[0] is not what was written; got ["tau_1", 1.0]'),
+        (("history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
+        (("colour",), "red", "fit.colour is unknown"),
+        (("hessian_kind",), "\ud800", "fit.hessian_kind is not what was written"),
+        (("active",), [BOUND | {"kind": "bound"}], 'fit.active[0].kind is not what was written; got "bound"'),
+        (("reason",), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects is not what was"),
+        (("reason",), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
     ],
 )
 def test_what_is_no_field(place, value, message):
-    content = {"fit": to_json(made(), Fit), "certificate": to_json(CERTIFICATE, Certificate)}
-    inner = content
+    content = inner = to_json(made(), Fit)
     for key in place[:-1]:
         inner = inner[key]
     inner[place[-1]] = value
     with pytest.raises(ValueError, match=re.escape(message)):
-        from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")
+        from_json(Fit, content, "fit")
+
+
+@pytest.mark.parametrize("count", [50, pytest.param(12_000, marks=pytest.mark.fuzz)])
+def test_a_file_with_damaged_bytes_is_refused_or_the_same(count, tmp_path):
+    """Cut off, bits that flipped, pieces that were written twice or moved."""
+    save_fit(made(), CERTIFICATE, tmp_path / "whole.json")
+    whole, path = (tmp_path / "whole.json").read_bytes(), tmp_path / "fit.json"
+    for number in range(count):
+        rng = random.Random(number)
+        data = bytearray(whole)
+        a, b = sorted(rng.sample(range(len(data)), 2))
+        near = min(b, a + 50)
+        damages = {
+            "cut": (b, len(data), b""),
+            "flip": (a, a + 1, bytes([data[a] ^ 1 << rng.randrange(8)])),
+            "repeat": (b, b, data[a:near]),
+            "remove": (a, near, b""),
+            "zeros": (a, b, bytes(b - a)),
+        }
+        begin, end, new = damages[rng.choice(list(damages))]
+        data[begin:end] = new
+        path.write_bytes(data)
+        if (refusal := refusal_of(path)) is None:
+            assert_same(made(), load_saved(path).fit)
+        else:
+            assert refusal.startswith(f"{path} is "), f"damage {number}"
+
+
+def refusal_of(path):
+    """Why a file cannot be loaded; None if it can."""
+    try:
+        load_saved(path)
+    except ValueError as error:
+        return str(error)
+    return None
 
 
 @pytest.mark.parametrize(
     "change",
     [
         lambda content: content["fit"].update(cost=28.000000001),
-        lambda content: content["fit"].update(colour="red"),
-        lambda content: content["fit"]["theta"].pop(),
         lambda content: content["certificate"].update(kinks=[]),
         lambda content: content.update(fit=None),
-        lambda content: content.update(seal=None),
         lambda content: content.pop("seal"),
     ],
 )

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from test_cli import PROBLEM, ROOM
 from test_many_logs import log_of, run
-from test_save import SAVED
 
 import switchfit as sf
 from switchfit.estimation.saved import describe_python_problem
@@ -55,11 +54,11 @@ def project(saved_project, tmp_path):
     sys.modules.pop("losses", None)
 
 
-def change(path, edit):
-    """A JSON file with its content edited in place."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    edit(content)
-    path.write_text(json.dumps(content), encoding="utf-8")
+def refuse(path, folder=None):
+    """The message of a problem that cannot be built again."""
+    with pytest.raises(InputError) as error:
+        build_again(path, folder)
+    return str(error.value)
 
 
 def build_again(path, folder=None):
@@ -68,13 +67,6 @@ def build_again(path, folder=None):
     estimate, loaded = load_with_problem(path, folder)
     assert sf.evaluate(loaded.problem, estimate.theta).cost == pytest.approx(estimate.cost, rel=1e-9)
     return loaded
-
-
-def refuse(path, folder=None):
-    """The message of a problem that cannot be built again."""
-    with pytest.raises(InputError) as error:
-        build_again(path, folder)
-    return str(error.value)
 
 
 # --- what is saved ----------------------------------------------------------------------------------------------------
@@ -90,13 +82,11 @@ def test_the_file_holds_the_problem_hashes_and_versions(project):
     }
     assert content["options"] == {"strategy": "local"}
     assert content["versions"]["switchfit"] == sf.__version__
-    assert content["versions"]["numpy"] == np.__version__
     assert content["versions"]["Python"].count(".") == 2
-    found = sf.Estimate.load(project / "out" / "estimate.json").provenance
-    assert found.folder == str(project)
-    values = sf.Estimate.load(project / "out" / "estimate.json").comparisons[0][0]
+    found = sf.Estimate.load(project / "out" / "estimate.json")
+    values = found.comparisons[0][0]
     raw = np.column_stack([values.times, values.measured]).astype("<f8").tobytes()
-    assert [digest.sha256 for digest in found.data] == [hashlib.sha256(raw).hexdigest()]
+    assert [digest.sha256 for digest in found.provenance.data] == [hashlib.sha256(raw).hexdigest()]
 
 
 def test_an_estimate_of_python_keeps_the_hash_of_its_data_and_versions(tmp_path):
@@ -110,25 +100,17 @@ def test_an_estimate_of_python_keeps_the_hash_of_its_data_and_versions(tmp_path)
     assert "does not have its problem, which was built in Python: functions are not saved" in said
 
 
-def test_an_estimate_of_python_can_say_which_problem_file_it_is_of(project):
+def test_an_estimate_of_python_can_say_which_problem_file_it_is_of(project, tmp_path):
+    """And keeps it when it is saved elsewhere."""
     loaded = load_problem(project / "problem.toml")
     sf.estimate(loaded.problem, **loaded.options).save(project / "fit.json", provenance=loaded.provenance)
-    build_again(project / "fit.json")
-    with pytest.raises(TypeError, match="provenance must be the provenance of a problem file; got str"):
-        sf.estimate(loaded.problem).save(project / "fit.json", provenance="problem.toml")
-
-
-def test_a_loaded_estimate_keeps_its_provenance_when_it_is_saved_elsewhere(project, tmp_path):
-    loaded = sf.Estimate.load(project / "out" / "estimate.json")
-    loaded.save(tmp_path / "fit.json")
-    content = json.loads((tmp_path / "fit.json").read_text())["provenance"]
-    assert content["folder"] == "project"
-    assert sf.Estimate.load(tmp_path / "fit.json").provenance == loaded.provenance
+    first = sf.Estimate.load(project / "fit.json")
+    first.save(tmp_path / "fit.json")
+    assert json.loads((tmp_path / "fit.json").read_text())["provenance"]["folder"] == "project"
+    assert sf.Estimate.load(tmp_path / "fit.json").provenance == first.provenance
     build_again(tmp_path / "fit.json")
-    earlier = sf.Estimate.load(SAVED)
-    assert earlier.provenance is None
-    earlier.save(tmp_path / "earlier.json")
-    assert "provenance" not in json.loads((tmp_path / "earlier.json").read_text())
+    with pytest.raises(TypeError, match="provenance must be the provenance of a problem file; got str"):
+        first.save(project / "fit.json", provenance="problem.toml")
 
 
 # --- the problem again ------------------------------------------------------------------------------------------------
@@ -137,17 +119,12 @@ def test_a_loaded_estimate_keeps_its_provenance_when_it_is_saved_elsewhere(proje
 def test_the_folder_has_moved(project, tmp_path):
     build_again(project / "out" / "estimate.json")
     project.rename(tmp_path / "moved")
+    (tmp_path / "moved" / "problem.toml").unlink()  # the text that was saved is enough
     build_again(tmp_path / "moved" / "out" / "estimate.json")
-    (tmp_path / "moved" / "log.csv").write_text(log_of(3.5))
-    said = refuse(tmp_path / "moved" / "out" / "estimate.json")  # read where it is now, not where it was
-    assert f"was fitted to other values than the files in {tmp_path / 'moved'} have now: fit them again." in said
-
-
-def test_the_problem_is_the_one_that_was_saved(project):
-    (project / "problem.toml").write_text("not even TOML")
-    build_again(project / "out" / "estimate.json")
-    (project / "problem.toml").unlink()
-    build_again(project / "out" / "estimate.json")
+    for other in (log_of(3.5), log_of(3.2).replace("0.25;", "0.3;")):  # other values, another time
+        (tmp_path / "moved" / "log.csv").write_text(other)
+        said = refuse(tmp_path / "moved" / "out" / "estimate.json")  # read where it is now, not where it was
+        assert f"was fitted to other values than the files in {tmp_path / 'moved'} have now: fit them again." in said
 
 
 def test_a_log_that_was_given_on_the_command_line(project):
@@ -162,18 +139,6 @@ def test_a_log_that_was_given_on_the_command_line(project):
     assert "log.csv" not in [digest["name"] for digest in content["files"]]
     assert content["options"] == {"strategy": "local", "hessian": "exact"}
     build_again(out / "tuesday" / "estimate.json")
-
-
-def test_a_problem_that_is_built_in_a_python_file(project):
-    (project / "problem.toml").write_text('problem = "built.py:build"\n')
-    text = "from pathlib import Path\nfrom switchfit.io.problem_file import load_problem\n"
-    text += "def build():\n    return load_problem(Path(__file__).parent / 'inner.toml').problem\n"
-    (project / "built.py").write_text(text)
-    (project / "inner.toml").write_text(PROBLEM)
-    path = save(project)
-    build_again(path)
-    (project / "log.csv").write_text(log_of(3.1))
-    assert "was fitted to other values" in refuse(path)  # which no hash of a file shows
 
 
 def test_changes_of_the_model_are_listed(project):
@@ -210,37 +175,19 @@ def test_files_that_are_not_there(project, tmp_path):
     assert f"{path} was made from log.csv, which is not in {project}" in refuse(path, project)
 
 
-def test_a_file_that_is_wrong_now(project):
-    (project / "log.csv").write_text("t;T\n0;1\n1;cold\n")
-    assert "log.csv, line 3, column 'T': 'cold' is not a number" in refuse(project / "out" / "estimate.json")
-
-
-def test_files_that_are_no_saved_estimates(project, tmp_path):
-    for path, said in (
-        (tmp_path / "none.json", "There is no saved estimate"),
-        (project, "is a folder; name the estimate.json in it"),
-        (project / "log.csv", "log.csv is not a saved estimate: it is not valid JSON"),
-        (SAVED, "does not say what it was made from: fit its problem file again"),
-    ):
-        result = run("validate", path, project / "log.csv")
-        assert result.exit_code == 2
-        assert said in result.stderr
-
-
 DAMAGES = [
     (lambda p: p.pop("text"), "provenance.text is missing"),
-    (lambda p: p.update(colour="red"), "provenance.colour is unknown"),
-    (lambda p: p.update(text=3), "provenance.text is not what was written; got 3"),
-    (lambda p: p.update(files={"a": 1}), "provenance.files is not what was written"),
     (lambda p: p["files"][0].update(size="big"), "provenance.files[0].size is not what was written"),
     (lambda p: p.update(versions=[]), "provenance.versions is not what was written"),
     (lambda p: p.update(folder="a\0b"), "provenance.folder has a null character"),
 ]
 
 
-@pytest.mark.parametrize(("edit", "message"), DAMAGES, ids=[message[:40] for _, message in DAMAGES])
+@pytest.mark.parametrize(("edit", "message"), DAMAGES)
 def test_provenance_that_is_damaged(project, edit, message):
     path = project / "out" / "estimate.json"
-    change(path, lambda content: edit(content["provenance"]))
+    content = json.loads(path.read_text(encoding="utf-8"))
+    edit(content["provenance"])
+    path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(ValueError, match=re.escape(f"{path} is damaged: {message}")):
         sf.Estimate.load(path)

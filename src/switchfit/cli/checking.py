@@ -162,22 +162,14 @@ Criterion = Annotated[
         "eigenvalue."
     ),
 ]
-Names = Annotated[str | None, option(metavar="A,B", help="Unknowns that count. Default: all.")]
 Samples = Annotated[int | None, option(metavar="COUNT", help="Most samples of each sensor. Default: all of the file.")]
-Sensors = Annotated[int | None, option(metavar="COUNT", help="Most sensors. Default: all of the file.")]
-Starts = Annotated[int | None, option(metavar="COUNT", help="Inputs at random to begin from. Default: 8.")]
-Seed = Annotated[int | None, option(metavar="NUMBER", help="Of these. Default: 0.")]
 
 
 def design(
     problem: terminal.ProblemPath,
     out: OutputFolder = None,
     criterion: Criterion = None,
-    names: Names = None,
     samples: Samples = None,
-    sensors: Sensors = None,
-    starts: Starts = None,
-    seed: Seed = None,
     figures: terminal.FigureFormat = "png",
     json: terminal.Json = False,
     quiet: terminal.Quiet = False,
@@ -201,11 +193,9 @@ def design(
 
         terminal.make_folder(out)
         terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
-        listed = None if names is None else [name.strip() for name in names.split(",")]
-        numbers = {"samples": samples, "sensors": sensors, "starts": starts, "seed": seed}
         table = loaded.contents.design
         settings = {} if table is None else table.model_dump(exclude_none=True)
-        settings |= terminal.select_given(criterion=criterion, names=listed, **numbers)
+        settings |= terminal.select_given(criterion=criterion, samples=samples)
         plan = sf.design(loaded.problem, **settings)
         terminal.print_text(plan)
         terminal.print_json(summarize_design(plan) | {"out": out})

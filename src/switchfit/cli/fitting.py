@@ -43,15 +43,10 @@ Strategy = Annotated[
         "strategies."
     ),
 ]
-TimeBudget = Annotated[
-    float | None,
-    option(metavar="SECONDS", help="After so long strategies end. Default: no limit."),
-]
 HessianKind = Annotated[
     Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
     option(help="Quadratic term of the optimizer. Default: auto, the exact Hessian in a trust region."),
 ]
-Tolerance = Annotated[float | None, option(metavar="NUMBER", help="Optimality at which to stop. Default: 1e-7.")]
 MaxIterations = Annotated[int | None, option(metavar="COUNT", help="Most iterations of a fit. Default: 200.")]
 NoFigures = Annotated[
     bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
@@ -68,9 +63,7 @@ def fit(
     model: ProblemForLogs = None,
     table: LogTable = None,
     strategy: Strategy = None,
-    time_budget: TimeBudget = None,
     hessian: HessianKind = None,
-    tolerance: Tolerance = None,
     max_iterations: MaxIterations = None,
     figures: terminal.FigureFormat = "png",
     no_figures: NoFigures = False,
@@ -93,13 +86,7 @@ def fit(
     folder stands for the logs in it. A log that cannot be used is reported, and the next one is fitted; the exit code
     is that of the worst.
     """
-    overrides = terminal.select_given(
-        strategy=strategy,
-        time_budget=time_budget,
-        hessian=hessian,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-    )
+    overrides = terminal.select_given(strategy=strategy, hessian=hessian, max_iterations=max_iterations)
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
     if model is not None:

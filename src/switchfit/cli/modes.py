@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import typer
 
 from switchfit.cli import terminal
 from switchfit.cli.terminal import option, output_folder
@@ -37,14 +34,6 @@ Method = Annotated[
     option(help="What proposes sequences. Default: auto, the beam for data if the model has machine code."),
 ]
 Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
-LibraryModes = Annotated[str | None, option(metavar="A,B", help="Modes that may occur. Default: all of the model.")]
-FirstModes = Annotated[str | None, option(metavar="A,B", help="Modes with which a sequence may begin. Default: any.")]
-LastModes = Annotated[str | None, option(metavar="A,B", help="Modes with which a sequence may end. Default: any.")]
-MinDuration = Annotated[
-    str | None,
-    option(metavar="TIME", help="Shortest time that a mode lasts; or A=TIME,B=TIME. Default: that of the file."),
-]
-Full = Annotated[bool, typer.Option("--full", help="Also print the report of the best sequence's fit, all of it.")]
 
 
 def modes(
@@ -55,12 +44,7 @@ def modes(
     switch_cost: SwitchCost = None,
     method: Method = "auto",
     width: Width = 40,
-    library: LibraryModes = None,
-    first: FirstModes = None,
-    last: LastModes = None,
-    min_duration: MinDuration = None,
     figures: terminal.FigureFormat = "png",
-    full: Full = False,
     json: terminal.Json = False,
     quiet: terminal.Quiet = False,
     verbose: terminal.Verbose = False,
@@ -69,15 +53,13 @@ def modes(
     """Find which modes were active, in which order, and when.
 
     Fits mode sequences of the model to the data, and prints the best with a table by number of switches. The [library]
-    of the problem file says which sequences there may be; options override it. Ctrl-C ends the search after the current
-    fit and keeps the best so far.
+    of the problem file says which sequences there may be. Ctrl-C ends the search after the current fit and keeps the
+    best so far.
 
     Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
     fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        shortest = None if min_duration is None else _read_duration(min_duration)
-        given = {"library": _split(library), "first": _split(first), "last": _split(last), "min_duration": shortest}
         settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
         settings |= {"criterion": criterion, "switch_cost": switch_cost}
         from switchfit.io.problem_file import load_problem
@@ -87,12 +69,8 @@ def modes(
 
         terminal.make_folder(out)
         terminal.print_list("Logs", loaded.issues)
-        search = _search(loaded, loaded.library | terminal.select_given(**given) | settings)
+        search = _search(loaded, loaded.library | settings)
         terminal.print_text(search)
-        if full and search.best is not None:
-            from switchfit.runtime.presentation import format_text
-
-            terminal.print_text(f"\n{format_text(search.best, full=True, files={})}")
         best = None if out is None else _write(search, loaded, out, figures)
         terminal.print_json(summarize_modes(search) | {"out": out, "problem_file": best})
         terminal.fail_for_refused(loaded.issues)
@@ -102,18 +80,6 @@ def modes(
             terminal.end_unreliable(
                 "no mode sequence to rely on; the first line of the result says why, and what to do."
             )
-
-
-def _split(given: str | None) -> list[str] | None:
-    """Return the names in ``A,B``."""
-    return None if given is None else [name.strip() for name in given.split(",") if name.strip()]
-
-
-def _read_duration(given: str) -> float | dict[str, float]:
-    """Return a number, or those in ``A=0.5,B=1``."""
-    with suppress(ValueError):
-        return float(given)
-    return dict(terminal.read_pairs(given, "--min-duration", "a number, or MODE=NUMBER,MODE=NUMBER", float))
 
 
 def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:

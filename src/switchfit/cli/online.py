@@ -40,17 +40,6 @@ Window = Annotated[
     float | None,
     option(metavar="TIME", help="How long samples are kept. Default: that of the file, or all, up to 4096."),
 ]
-Renews = Annotated[
-    str | None,
-    option(metavar="A=P,B=Q", help="Parameters with a new value whenever a mode begins. Default: those of the file."),
-]
-Drift = Annotated[
-    str | None,
-    option(
-        metavar="P=SD,Q=SD",
-        help="Parameters that drift: standard deviation after a time unit. Default: those of the file.",
-    ),
-]
 FalseAlarms = Annotated[
     float | None,
     option(metavar="RATE", help="False alarms per time unit: finds the threshold by simulation, for a minute or so."),
@@ -83,8 +72,6 @@ def online(
     threshold: Threshold = None,
     max_switches: MaxSwitches = 8,
     budget: Budget = None,
-    renews: Renews = None,
-    drift: Drift = None,
     state: StateFile = None,
     journal: JournalFile = None,
     live: Live = None,
@@ -106,7 +93,6 @@ def online(
     with terminal.report_errors(debug, json=not quiet, quiet=quiet, verbose=verbose):
         if stdin and replay is not None:
             terminal.fail("--replay and --stdin contradict each other; give one of them.")
-        given = terminal.select_given(window=window, renews=_read_renewed(renews), drift=_read_drift(drift))
         from switchfit.io.problem_file import load_problem
 
         loaded = load_problem(problem, replay, searched=True, streamed=stdin)
@@ -121,7 +107,7 @@ def online(
             file.parent.mkdir(parents=True, exist_ok=True)
         sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
         room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
-        settings = loaded.contents.online.model_dump(exclude_none=True) | given
+        settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
         settings |= {"max_switches": max_switches, "budget": budget, "capacity": room} | _read_library(loaded)
         estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
         with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
@@ -141,22 +127,6 @@ def online(
             terminal.fail(f"{format_count(len(course.refused), 'line')} of stdin could not be used.")
         if estimator.now.status.name == "LOST":
             terminal.end_unreliable(f"{estimator.now.status.value}.")
-
-
-def _read_drift(given: str | None) -> dict[str, float] | None:
-    """Return the numbers in ``mu=0.1,c=0.2``."""
-    form = "PARAMETER=NUMBER,PARAMETER=NUMBER"
-    return None if given is None else dict(terminal.read_pairs(given, "--drift", form, float))
-
-
-def _read_renewed(given: str | None) -> dict[str, list[str]] | None:
-    """Return the parameters of each mode in ``slip=mu,slip=c``."""
-    if given is None:
-        return None
-    found: dict[str, list[str]] = {}
-    for mode, name in terminal.read_pairs(given, "--renews", "MODE=PARAMETER,MODE=PARAMETER", str):
-        found.setdefault(mode, []).append(name)
-    return found
 
 
 def _read_library(loaded: ProblemFile) -> dict[str, Any]:

@@ -16,12 +16,11 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
@@ -268,8 +267,6 @@ def write_file(path: Path, content: str | bytes) -> None:
         write_atomically(content, path)
 
 
-T = TypeVar("T")
-
 DOTS = 150
 """Dots per inch of a figure."""
 
@@ -309,15 +306,6 @@ def select_given(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def read_pairs(given: str, name: str, form: str, read: Callable[[str], T]) -> list[tuple[str, T]]:
-    """Return the pairs in ``A=0.5,B=1``; anything else in the option of a name ends the command."""
-    pairs = [[side.strip() for side in part.rpartition("=")[::2]] for part in given.split(",")]
-    with suppress(ValueError):
-        if all(key and value for key, value in pairs):
-            return [(key, read(value)) for key, value in pairs]
-    fail(f"{name} must be {form}; got {given}.")
-
-
 def print_list(title: str, entries: Sequence[object]) -> None:
     """Print a title and a line for each entry, such as what is odd about logs; nothing without entries."""
     if entries:
@@ -340,30 +328,9 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
 def write_figure(result: Any, path: Path) -> None:
     """Write the figure of a result; the ending of the name is its format."""
     os.environ.setdefault("MPLBACKEND", "Agg")
-    figure, content = result.plot(), io.BytesIO()
-    if path.suffix == ".png":
-        _write_png(figure, content)
-    else:
-        figure.savefig(content, format=path.suffix[1:], dpi=DOTS)
+    content = io.BytesIO()
+    result.plot().savefig(content, format=path.suffix[1:], dpi=DOTS)
     write_file(path, content.getvalue())
-
-
-def _write_png(figure: Any, file: io.BytesIO) -> None:
-    """Write what ``savefig`` does, in three quarters of its time.
-
-    `savefig` draws a figure with a layout twice, the first time only to find the layout, which drawing once does too.
-    """
-    from matplotlib import rcParams
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.image import imsave
-
-    if rcParams["savefig.bbox"] or rcParams["savefig.transparent"] or rcParams["savefig.facecolor"] != "auto":
-        figure.savefig(file, format="png", dpi=DOTS)  # as matplotlibrc asks
-        return
-    figure.set_dpi(DOTS)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    imsave(file, canvas.buffer_rgba(), format="png", origin="upper", dpi=DOTS)
 
 
 def fail_for_refused(issues: Sequence[Issue]) -> None:

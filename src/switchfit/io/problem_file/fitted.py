@@ -36,14 +36,8 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     ------
     InputError
         If the problem is built in Python.
-    ValueError
-        If the estimate was loaded without its problem.
     """
-    contents, problem = loaded.contents, estimate.problem
-    if problem is None:
-        raise ValueError(
-            "the estimate was loaded without its problem: load it with Estimate.load(path, problem=problem)."
-        )
+    contents, problem = loaded.contents, estimate.evaluator_at_solution().problem
     if contents.problem is not None:
         raise InputError(
             f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
