@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_protocol as protocol
 from derivatives import differentiate
 from models import decay
 
@@ -55,48 +56,19 @@ def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     np.testing.assert_allclose(found.hessian, expected[2], rtol=0, atol=1e-8)
 
 
-def swing(t, x, p, u):
-    return jnp.stack([x[1], -jnp.sin(x[0]) * (1 + 0.3 * jnp.sin(t)) - p["c"] * x[1] + u])
-
-
-def drift(t, x, p, u):
-    return jnp.stack([x[1] * jnp.cos(t * x[0]), p["q"] * x[0] * x[1] - u * t])
-
-
-def kick(t, x, p):
-    return jnp.stack([x[0] + 0.1 * p["q"] * t, 0.5 * x[1] * x[0]])
-
-
 def hard_problem(tf=2.4, **settings):
-    """Two transitions, one with a reset map and one with a guard, an input, a reference signal, samples and costs of
-    every kind, all of them nonlinear and dependent on time."""
-    times = np.linspace(0.0, 4.0, 33)
-    rng = np.random.default_rng(3)
-    signal = sf.ReferenceSignal.from_samples(times, rng.normal(size=(33, 1)), observe=lambda t, x, p: x[:1] * x[1] ** 2)
-    samples = sf.Measurements(times[1:12], rng.normal(size=(11, 1)), lambda t, x, p: x[1:] + p["c"] * t, sigma=0.7)
+    """Two transitions, one with a reset map and one with a guard, a reference signal, samples and costs of every kind,
+    all of them nonlinear and dependent on time."""
     costs = [
-        samples,
-        signal,
-        sf.RunningCost(lambda t, x, p: jnp.cos(x[0] * t) * p["c"] + x[1] ** 3),
-        sf.TransitionCost(lambda t, x, p: t * x[0] ** 2, before="drift", after="swing"),
-        sf.TerminalCost(lambda x, p: jnp.exp(0.3 * x[0]) * p["q"] * x[1]),
-        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["c"], x[1] ** 2])),
+        sf.Measurements(protocol.TIMES[1:9], protocol.VALUES[1:9], sigma=0.7),
+        *protocol.DATA["transitions, end"][1:],
+        *protocol.DATA["reference, running"][:2],
+        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["k"], x[1] ** 2])),
     ]
-    system = sf.HybridSystem(
-        {"swing": swing, "drift": drift},
-        lambda p: jnp.stack([0.4 + 0 * p["c"], p["c"]]),
-        reset_maps={("swing", "drift"): kick},
-        guards={("drift", "swing"): lambda t, x, p: x[0] ** 2 - 0.3 * t * p["q"]},
-    )
-    run = sf.Experiment(
-        costs,
-        ("swing", "drift", "swing"),
-        (0.83, 1.57),
-        0.0,
-        sf.Parameter(tf, lower=1.6, upper=4.0),
-        inputs=sf.Input(times, np.sin(2 * times), kind="cubic"),
-    )
-    return sf.Problem(system, run, {"c": 0.3, "q": -0.4}, **settings)
+    system = sf.HybridSystem(protocol.MODES, [0.4, 0.1], protocol.BOUNCE, guards=protocol.GUARDS)
+    tf = sf.Parameter(tf, lower=1.6, upper=3.0)
+    run = sf.Experiment(costs, ("swing", "fall", "swing"), (0.83, 1.57), 0.0, tf)
+    return sf.Problem(system, run, protocol.PARAMETERS, **settings)
 
 
 @pytest.mark.slow

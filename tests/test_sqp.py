@@ -146,17 +146,6 @@ def test_rate_is_quadratic_on_a_face_although_the_full_hessian_is_indefinite():
     assert result.smallest_eigenvalue == pytest.approx(1.0, rel=1e-9)
 
 
-def test_block_diagonal_and_gauss_newton():
-    H = np.array([[2.0, 0.9, 0.1], [0.9, 2.0, 0.2], [0.1, 0.2, 1.0]])
-    evaluate = quadratic(H, np.array([1.0, -1.0, 0.5]))
-    exact = minimize(evaluate, np.zeros(3), constraints=free(3), hessian="gauss-newton")
-    blocks = minimize(evaluate, np.zeros(3), constraints=free(3), hessian="block-diagonal", blocks=[0, 0, 1])
-    assert exact.iterations == 1
-    assert 1 < blocks.iterations < 20
-    np.testing.assert_allclose(blocks.theta, exact.theta, atol=1e-7)
-    np.testing.assert_array_equal(blocks.hessian, H)
-
-
 # --- constraints ------------------------------------------------------------------------------------------------------
 
 
