@@ -10,7 +10,7 @@ import pytest
 import scipy.optimize
 
 from switchfit.optimize import LinearConstraints, Status, minimize
-from switchfit.optimize.composite import Equalities, Rows, find_normal_step, solve_composite
+from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
 from switchfit.optimize.qp import Room
 from switchfit.problem.functions import use_float64
 
@@ -133,14 +133,6 @@ def test_a_published_problem_with_bounds_and_an_inequality():
     assert found.cost == pytest.approx(17.0140173, rel=1e-8)
     assert set(found.active) == {"theta[0] at lower bound", "theta[4] at lower bound"}
     assert found.free_basis.shape == (5, 1)
-    # g + A' lam is what the bounds push back with.
-    x = found.theta
-    product = np.prod(x[:4])
-    A = np.array([[*(product / x[:4]), -1.0], [*(2 * x[:4]), 0.0]])
-    pushed = found.gradient + A.T @ [multiplier for _, _, multiplier in found.equalities]
-    lower = found.multipliers[:5]
-    np.testing.assert_allclose(pushed, lower, atol=1e-7)
-    assert np.all(lower >= 0.0)
 
 
 def test_multipliers_hessian_and_free_directions_in_closed_form():
@@ -360,19 +352,6 @@ def test_points_where_constraints_are_not_finite_are_avoided():
 
 
 # --- the composite step -----------------------------------------------------------------------------------------------
-
-
-def test_factorised_rows_solve_and_project_like_lstsq():
-    rng = np.random.default_rng(0)
-    for k, d, copies in ((2, 5, 0), (5, 5, 0), (3, 5, 2), (7, 4, 0)):
-        A = rng.normal(size=(k, d))
-        A = np.vstack([A, A[:copies]])
-        c, g = rng.normal(size=len(A)), rng.normal(size=d)
-        rows = Rows.of(A)
-        assert rows.rank == np.linalg.matrix_rank(A)
-        np.testing.assert_allclose(A @ rows.null, 0.0, atol=1e-13)
-        np.testing.assert_allclose(rows.solve(c), -np.linalg.lstsq(A, c, rcond=1e-10)[0], atol=1e-12)
-        np.testing.assert_allclose(rows.multipliers(g), -np.linalg.lstsq(A.T, g, rcond=1e-10)[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -11,7 +11,6 @@ from models import decay
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
-from switchfit.io.problem_file import load_problem
 from switchfit.strategy.starts import is_minimum_time
 
 METHODS = ("auto", "forward", "autodiff", "adjoint")
@@ -363,27 +362,7 @@ def test_a_guard_before_a_free_tf():
     assert fit.trajectory.states[-1, 0] == pytest.approx(0.25, rel=1e-8)
 
 
-# --- problem files and errors -----------------------------------------------------------------------------------------
-
-
-def test_a_problem_file_has_a_free_tf(tmp_path):
-    (tmp_path / "room.py").write_text(
-        "import switchfit as sf\nroom = sf.HybridSystem({'cools': lambda t, x, p: -p['k'] * x}, [1.0])\n"
-    )
-    rows = "".join(f"{t},{v}\n" for t, v in zip(TIMES.tolist(), np.exp(-RATE * TIMES).tolist(), strict=True))
-    (tmp_path / "log.csv").write_text("t,x\n" + rows)
-    (tmp_path / "problem.toml").write_text(
-        'model = "room.py:room"\n[parameters]\nk = 0.6\n[[experiments]]\nmode_sequence = ["cools"]\n'
-        "transition_times = []\nt0 = 0.0\n"
-        "tf = { value = 3.0, lower = 2.0, upper = 9.0, prior = { mean = 3.5, sd = 0.5 } }\n"
-        '[[experiments.data]]\nfile = "log.csv"\ntime = "t"\ncolumns = ["x"]\nsigma = 0.01\n'
-    )
-    loaded = load_problem(tmp_path / "problem.toml").problem
-    tf = loaded.experiments[0].tf
-    assert (float(tf.value), float(tf.lower), float(tf.upper)) == (3.0, 2.0, 9.0)
-    fit = sf.estimate(loaded)
-    assert fit.theta == pytest.approx([3.5, RATE], rel=1e-6)
-    assert fit.standard_errors[0] == pytest.approx(0.5, rel=1e-6)
+# --- errors -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -330,7 +330,7 @@ c = 0.2
 [[experiments]]
 mode_sequence = ["fall"]
 transition_times = []
-tf = 4.0
+tf = { value = 3.0, lower = 2.0, upper = 9.0, prior = { mean = 3.5, sd = 0.5 } }
 initial_state = [{ value = 1.5, lower = 0.0, upper = 9.0, unit = "cm" }, { value = 3.5, fixed = true }]
 parameter_map = { r = "c" }
 data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
@@ -351,7 +351,9 @@ def folder(tmp_path):
 
 def test_problem_files_say_it_too(folder):
     problem = load_problem(folder / "p.toml").problem
-    assert problem.theta_names == ("c", "h(t0)")
+    tf = problem.experiments[0].tf
+    assert (float(tf.value), float(tf.lower), float(tf.upper), tf.prior.mean, tf.prior.sd) == (3.0, 2.0, 9.0, 3.5, 0.5)
+    assert problem.theta_names == ("tf", "c", "h(t0)")
     assert problem.unknowns.units[-1] == "cm"
     assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1], problem.initial_theta[-1]) == (0.0, 9.0, 1.5)
     assert problem.experiments[0].parameter_map == {"r": "c"}
