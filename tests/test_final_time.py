@@ -56,10 +56,10 @@ def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
 
 
 def hard_problem(tf=2.4, **settings):
-    """Two transitions, one with a reset map and one with a guard, a reference signal, samples and costs of every kind,
-    all of them nonlinear and dependent on time."""
+    """Two transitions, one with a reset map and one with a guard, a reference signal, late samples and costs of every
+    kind, all of them nonlinear and dependent on time."""
     costs = [
-        sf.Measurements(protocol.TIMES[1:9], protocol.VALUES[1:9], sigma=0.7),
+        sf.Measurements(protocol.TIMES[2:8], protocol.VALUES[2:8], sigma="s", delay="d"),
         *protocol.DATA["transitions, end"][1:],
         *protocol.DATA["reference, running"][:2],
         sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["k"], x[1] ** 2])),
@@ -67,7 +67,7 @@ def hard_problem(tf=2.4, **settings):
     system = sf.HybridSystem(protocol.MODES, [0.4, 0.1], protocol.BOUNCE, guards=protocol.GUARDS)
     tf = sf.Parameter(tf, lower=1.6, upper=3.0)
     run = sf.Experiment(costs, ("swing", "fall", "swing"), (0.83, 1.57), 0.0, tf)
-    return sf.Problem(system, run, protocol.PARAMETERS, **settings)
+    return sf.Problem(system, run, protocol.PARAMETERS | protocol.MORE, **settings)
 
 
 @pytest.mark.slow
@@ -365,17 +365,6 @@ def test_a_guard_before_a_free_tf():
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_a_delay_must_leave_all_samples_before_the_lower_bound_of_tf():
-    data = sf.Measurements(TIMES + 1.0, np.exp(-RATE * TIMES), sigma=0.01, delay="lag")
-    run = sf.Experiment(data, ("cools",), (), 0.0, sf.Parameter(3.0, lower=2.5, upper=5.0))
-    system = sf.HybridSystem({"cools": decay}, [1.0])
-    parameters = {"k": 0.5, "lag": sf.Parameter(0.6, lower=0.5, upper=1.05)}
-    assert sf.check_derivatives(sf.Problem(system, run, parameters)).passed
-    with pytest.raises(ValueError, match=r"only from 0.5 to 1.1 s are all samples .* = \(0.0, 2.5\)"):
-        sf.Problem(system, run, parameters | {"lag": sf.Parameter(0.6, lower=0.4, upper=1.05)})
-
-
 GRID = np.linspace(0.0, 4.0, 9)
 SIGNAL = sf.ReferenceSignal.from_samples(GRID, GRID[:, None])
 LONG = sf.ReferenceSignal.from_samples(np.linspace(0.0, 5.0, 21), np.exp(-RATE * np.linspace(0.0, 5.0, 21))[:, None])
@@ -383,6 +372,13 @@ LONG = sf.ReferenceSignal.from_samples(np.linspace(0.0, 5.0, 21), np.exp(-RATE *
 
 def cool(data=SIGNAL, sequence=("cools",), times=(), **given):
     return sf.Experiment(data, sequence, times, 0.0, sf.Parameter(3.0, lower=2.0, upper=5.0), **given)
+
+
+def cool_late(lower):
+    """Samples from 1.1 to 3 s that are late by at least `lower`."""
+    late = sf.Measurements(TIMES + 1.0, np.exp(-RATE * TIMES), sigma=0.01, delay="lag")
+    lag = sf.Parameter(0.6, lower=lower, upper=1.05)
+    return sf.Problem(sf.HybridSystem({"cools": decay}, [1.0]), cool(late), {"k": 0.5, "lag": lag})
 
 
 @pytest.mark.parametrize(
@@ -422,6 +418,7 @@ def cool(data=SIGNAL, sequence=("cools",), times=(), **given):
             lambda fit: sf.monte_carlo(cooling(cool(LONG)), runs=2),
             "or after the lower bound of a free tf, cannot be simulated",
         ),
+        (lambda fit: cool_late(0.4), r"only from 1.0 to 1.1 s are all samples .* = \(0.0, 2.0\)"),
         (lambda fit: fit.profile("tf"), "a profile does not support guards and terminal constraints"),
         (lambda fit: fit.predict([fit.final_times[0] + 1e-3]), "times must not lie after tf where tf is estimated"),
     ],
