@@ -230,19 +230,19 @@ def test_evidence_is_the_curvature_of_the_data_alone():
     np.testing.assert_allclose(proposal.evidence.Q, expected, rtol=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("changes", "engine", "reason"),
-    [
-        ({"tf": sf.Parameter(11.0, lower=10.0, upper=12.0)}, "auto", "the experiment has a free tf: give tf a number"),
-        ({"data": sf.RunningCost(lambda t, x, p: x[0] ** 2)}, "auto", "there are no data to follow"),
-        ({}, "jax", "a beam needs machine code, but engine='jax' is set. Use method='insertion'"),
-        ({"data": [MEASURED, sf.TerminalConstraint(lambda x, p: x[0])]}, "auto", "has terminal constraints: leave"),
-    ],
-)
-def test_where_no_beam_applies_it_says_why(changes, engine, reason):
+NO_BEAM = {
+    "the experiment has a free tf: give tf a number": {"tf": sf.Parameter(11.0, lower=10.0, upper=12.0)},
+    "there are no data to follow": {"data": sf.RunningCost(lambda t, x, p: x[0] ** 2)},
+    "has terminal constraints: leave": {"data": [MEASURED, sf.TerminalConstraint(lambda x, p: x[0])]},
+    "a beam needs machine code, but engine='jax' is set. Use method='insertion'": {},
+}
+
+
+@pytest.mark.parametrize("reason", NO_BEAM)
+def test_where_no_beam_applies_it_says_why(reason):
     given = {"data": MEASURED, "mode_sequence": SEQUENCE, "transition_times": FAR, "t0": 0.0, "tf": 10.0}
-    problem = sf.Problem(ROOM, sf.Experiment(**given | changes), GUESS, engine=engine)
-    assert reason in explain_no_beam(problem)
+    run = sf.Experiment(**given | NO_BEAM[reason])
+    assert reason in explain_no_beam(sf.Problem(ROOM, run, GUESS, engine="jax" if "jax" in reason else "auto"))
 
 
 def pose_one_switch(values):

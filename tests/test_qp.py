@@ -61,27 +61,22 @@ def test_where_daqp_fails_the_step_is_none_and_the_residual_the_whole_gradient(m
     assert kkt_residual(g, g, np.eye(2))[0] == pytest.approx(np.sqrt(5.0))
 
 
-INDEFINITE = np.diag([1.0, -1.0]), np.array([[1.0, 2.0], [2.0, 1.0]])
+ONE, TWO, NO_ROWS = np.ones(1), np.ones(2), (np.zeros((0, 2)), np.zeros(0))
+WRONG = {
+    "row 1": lambda: solve_qp(TWO, np.eye(2), np.eye(2), np.array([0.0, 0.1])),
+    "is not positive definite": lambda: solve_qp(TWO, np.diag([1.0, -1.0]), *NO_ROWS),
+    "not positive definite; convexify": lambda: solve_qp(TWO, np.array([[1.0, 2.0], [2.0, 1.0]]), *NO_ROWS),
+    "shapes of the constraints disagree": lambda: LinearConstraints(np.ones((1, 3)), ONE, 0 * TWO, TWO, ("a",) * 5),
+    "got 1 names": lambda: LinearConstraints(np.ones((1, 2)), ONE, 0 * TWO, TWO, ("a",)),
+    "must be finite": lambda: LinearConstraints([[np.nan]], ONE, 0 * ONE, ONE, tuple("abc")),
+    "mu at lower bound": lambda: LinearConstraints.box([2.0], [1.0], unknowns=["mu"]),
+}
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: solve_qp(np.ones(2), np.eye(2), np.eye(2), np.array([0.0, 0.1])), "row 1"),
-        (lambda: solve_qp(np.ones(2), INDEFINITE[0], np.zeros((0, 2)), np.zeros(0)), "not positive definite"),
-        (lambda: solve_qp(np.ones(2), INDEFINITE[1], np.zeros((0, 2)), np.zeros(0)), "not positive definite"),
-        (
-            lambda: LinearConstraints(np.ones((1, 3)), np.zeros(1), np.zeros(2), np.ones(2), ("a",) * 5),
-            "shapes of the constraints disagree",
-        ),
-        (lambda: LinearConstraints(np.ones((1, 2)), np.zeros(1), np.zeros(2), np.ones(2), ("a",)), "got 1 names"),
-        (lambda: LinearConstraints([[np.nan]], np.zeros(1), np.zeros(1), np.ones(1), tuple("abc")), "must be finite"),
-        (lambda: LinearConstraints.box([2.0], [1.0], unknowns=["mu"]), "mu at lower bound"),
-    ],
-)
-def test_bad_input_is_named(call, message):
+@pytest.mark.parametrize("message", WRONG)
+def test_bad_input_is_named(message):
     with pytest.raises(ValueError, match=message):
-        call()
+        WRONG[message]()
 
 
 @settings(max_examples=60, deadline=None)

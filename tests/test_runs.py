@@ -144,49 +144,33 @@ def test_a_function_that_takes_p_as_a_whole_sees_what_is_its_own(whole):
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
+def pose(*runs, **guess):
+    return sf.Problem(SWING, list(runs), guess or GUESS)
+
+
 THREE = [sf.Parameter(1.0), 2.0, 3.0]
+UNEQUAL = {"k": [0.8, 0.5], "k_2": [0.7, 0.6]}
+WRONG = {
+    "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'": lambda: pose(
+        run(), run(parameter_map={"k": "k_3"})
+    ),
+    "the parameter 'b', which the problem lacks; it has k": lambda: pose(run(parameter_map={"k": "k_2"}), **UNEQUAL),
+    "mode 'swing': .* raised IndexError": lambda: pose(run(parameter_map={"k": "b"})),
+    "must be a number or an sf.Parameter; got 'v'": lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
+    r"got an entry of shape \(2,\)": lambda: run(initial_state=[sf.Parameter([1.0, 2.0]), 0.0]),
+    r"must have shape \(n,\), one entry for each": lambda: sf.HybridSystem({"swing": swing}, sf.Parameter(1.0)),
+    "experiment 2 must have 2 entries, as the system's": lambda: pose(run(), run(initial_state=THREE)),
+    "one entry for each of the 3 states": lambda: sf.HybridSystem({"swing": swing}, THREE, state_names=("q", "v")),
+    r"share a name: q\(t0\)": lambda: pose(run(initial_state=[UNKNOWN[0], 0.9]), **GUESS | {"q(t0)": 1.0}),
+    "must be a dict of the model's name": lambda: run(parameter_map=["k"]),
+    "parameter_map must be a dict": lambda: run(parameter_map={"k": 1}),
+}
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (
-            lambda: sf.Problem(SWING, [run(), run(parameter_map={"k": "k_3"})], GUESS),
-            "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'; the problem has",
-        ),
-        (
-            lambda: sf.Problem(SWING, run(parameter_map={"k": "k_2"}), {"k": [0.8, 0.5], "k_2": [0.7, 0.6]}),
-            "reads the parameter 'b', which the problem lacks; it has k",
-        ),
-        (lambda: sf.Problem(SWING, run(parameter_map={"k": "b"}), GUESS), "mode 'swing': .* raised IndexError"),
-        (
-            lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
-            "each entry of initial_state must be a number or an sf.Parameter; got 'v'",
-        ),
-        (
-            lambda: run(initial_state=[sf.Parameter([1.0, 2.0]), 0.0]),
-            r"one sf.Parameter of one number for each state; got an entry of shape \(2,\)",
-        ),
-        (lambda: sf.HybridSystem({"swing": swing}, sf.Parameter(1.0)), r"must have shape \(n,\), one entry for each"),
-        (
-            lambda: sf.Problem(SWING, [run(), run(initial_state=THREE)], GUESS),
-            "initial_state of experiment 2 must have 2 entries, as the system's has; got 3",
-        ),
-        (
-            lambda: sf.HybridSystem({"swing": swing}, THREE, state_names=("q", "v")),
-            "state_names must have one entry for each of the 3 states",
-        ),
-        (
-            lambda: sf.Problem(SWING, run(initial_state=[UNKNOWN[0], 0.9]), GUESS | {"q(t0)": 1.0}),
-            r"Two unknowns share a name: q\(t0\)",
-        ),
-        (lambda: run(parameter_map=["k"]), "parameter_map must be a dict of the model's name -> the problem's name"),
-        (lambda: run(parameter_map={"k": 1}), "parameter_map must be a dict of the model's name -> the problem's name"),
-    ],
-)
-def test_what_is_wrong_is_said(build, message):
+@pytest.mark.parametrize("message", WRONG)
+def test_what_is_wrong_is_said(message):
     with pytest.raises((ValueError, TypeError), match=message):
-        build()
+        WRONG[message]()
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------

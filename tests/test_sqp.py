@@ -619,17 +619,17 @@ def test_iterations_the_callback_and_ctrl_c_end_it():
 # --- contracts --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("theta", "settings", "message"),
-    [
-        ([np.nan, 0.0], {}, "theta0 is not finite"),
-        ([1.0, 0.0], {"constraints": rows([[-1.0, 1.0]], [0.0])}, r"row 0 \(by 1\); start at a feasible"),
-        ([1.0, 0.0], {"breakpoints": [[1.0, 1.0], []]}, "strictly increasing"),
-    ],
-)
-def test_bad_input_is_named(theta, settings, message):
+WRONG = {
+    "theta0 is not finite": {"theta0": [np.nan, 0.0]},
+    r"row 0 \(by 1\); start at a feasible": {"constraints": rows([[-1.0, 1.0]], [0.0])},
+    "strictly increasing": {"breakpoints": [[1.0, 1.0], []]},
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_bad_input_is_named(message):
     with pytest.raises(ValueError, match=message):
-        minimize(smooth(rosenbrock), theta, **{"constraints": free(2)} | settings)
+        minimize(smooth(rosenbrock), **{"theta0": [1.0, 0.0], "constraints": free(2)} | WRONG[message])
 
 
 @settings(max_examples=60, deadline=None)
