@@ -344,24 +344,6 @@ def test_a_last_mode_that_vanishes_is_reported_as_collapsed():
     assert [(c.kind, c.mode, c.position) for c in fit.active] == [("collapsed", "slow", 1)]
 
 
-def test_a_guard_before_a_free_tf():
-    """A ball falls from 1 m, bounces with e = 1/2 and rises until it stands still: both times are known."""
-    g = 9.81
-    fall = lambda t, x, p: jnp.stack([x[1], -g * jnp.ones(())])  # noqa: E731
-    system = sf.HybridSystem(
-        {"falls": fall, "rises": fall},
-        [1.0, 0.0],
-        reset_maps={("falls", "rises"): lambda t, x, p: jnp.stack([x[0], -0.5 * x[1]])},
-        guards={("falls", "rises"): lambda t, x, p: x[0]},
-    )
-    costs = [sf.TerminalCost(lambda x, p: 0.0 * x[0]), sf.TerminalConstraint(lambda x, p: x[1])]
-    problem = sf.Problem(system, sf.Experiment(costs, ("falls", "rises"), (0.4,), 0.0, sf.Parameter(0.7, upper=2.0)))
-    fit = sf.estimate(problem)
-    hits = np.sqrt(2 / g)
-    np.testing.assert_allclose(fit.theta, [hits, 1.5 * hits], rtol=1e-8)
-    assert fit.trajectory.states[-1, 0] == pytest.approx(0.25, rel=1e-8)
-
-
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 

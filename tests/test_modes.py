@@ -165,24 +165,19 @@ def test_another_sequence_and_another_log_compile_nothing():
 
 
 @pytest.mark.slow
-def test_without_machine_code_the_sequence_is_found_without_the_beam():
-    """Derivatives are matched where the whole state is measured, else all short sequences are simulated."""
-
+def test_without_machine_code_the_sequence_is_found_by_insertion():
     def spin(t, x, p):
         rates = jnp.linalg.eigvalsh(jnp.array([[0.0, 1.0], [1.0, 0.0]]) * p["rate"])
         return rates[1] * jnp.stack([-x[1], x[0]])
 
-    system = sf.HybridSystem({"rise": rise, "turn": spin, "fall": fall}, [0.2, 1.0])
-    run = make_run()
-    alone = replace(run, data=sf.Measurements(TIMES, run.data[0].values[:, :1], lambda t, x, p: x[:1], sigma=SIGMA))
-    for given, used in ((run, "matching"), (alone, "exhaustive")):
-        seen = []
-        found = sf.find_modes(sf.Problem(system, given, FREE), max_switches=3, callback=seen.append)
-        assert found.status is sf.ModeStatus.FOUND
-        assert found.mode_sequence == SEQUENCE
-        np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.1)
-        assert {"matching", "exhaustive"} & {each.stage for each in seen} == {used}
-        assert "mode 'turn' calls jnp.linalg.eigvalsh" in str(found.best.engine)
+    stages, system = [], sf.HybridSystem({"rise": rise, "turn": spin, "fall": fall}, [0.2, 1.0])
+    found = sf.find_modes(make_problem(system=system), max_switches=3, callback=lambda now: stages.append(now.stage))
+    assert found.status is sf.ModeStatus.FOUND
+    assert found.mode_sequence == SEQUENCE
+    np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.1)
+    assert "insertion" in stages
+    assert "beam" not in stages
+    assert "mode 'turn' calls jnp.linalg.eigvalsh" in str(found.best.engine)
 
 
 # --- how a search ends ------------------------------------------------------------------------------------------------
