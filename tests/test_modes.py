@@ -707,9 +707,6 @@ def test_a_mode_that_leaves_no_trace_is_a_warning():
     assert (untraced.mode, untraced.end) in (("fill", 20.0), ("closed", 20.0))
     assert 9.0 < untraced.begin < 11.0
     assert f"{untraced.mode} from" in str(untraced)
-    alone = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed"))
-    assert alone.status is sf.ModeStatus.FOUND
-    assert not kinds_of(alone.warnings, "no trace")
 
 
 def test_all_neighbours_of_what_is_found_are_fitted():
