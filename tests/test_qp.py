@@ -61,6 +61,14 @@ def test_where_daqp_fails_the_step_is_none_and_the_residual_the_whole_gradient(m
     assert kkt_residual(g, g, np.eye(2))[0] == pytest.approx(np.sqrt(5.0))
 
 
+def test_bounded_step_has_the_multipliers_of_the_closed_form():
+    g, B = np.array([-3.0, 5.0]), np.array([[2.0, 0.0], [0.0, 1e-8]])
+    C, c = np.vstack([np.eye(2), -np.eye(2)]), np.array([-np.inf, -7.0, -1.0, -np.inf])
+    solution = solve_qp(g, B, C, c)
+    np.testing.assert_allclose(solution.step, [1.0, -7.0], rtol=1e-15)
+    np.testing.assert_allclose(solution.multipliers, [0.0, 5.0 - 7e-8, 1.0, 0.0], rtol=1e-14)
+
+
 ONE, TWO, NO_ROWS = np.ones(1), np.ones(2), (np.zeros((0, 2)), np.zeros(0))
 WRONG = {
     "row 1": lambda: solve_qp(TWO, np.eye(2), np.eye(2), np.array([0.0, 0.1])),
