@@ -114,7 +114,7 @@ def fishing(times: Any = EIGHT_SWITCHES, **settings: Any) -> sf.Problem:
     It has many local minima, most with collapsed modes.
     """
     cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
-    sequence = (("idle", "fishing") * len(times))[: len(times) + 1]
+    sequence = (("idle", "fishing") * (len(times) + 1))[: len(times) + 1]
     return sf.Problem(FISHING, sf.Experiment(cost, sequence, times, 0.0, 12.0), **settings)
 
 
@@ -125,7 +125,7 @@ LINEAR = sf.HybridSystem({"A1": lambda t, x, p: A1 @ x, "A2": lambda t, x, p: A2
 
 def linear(times: Any = FIVE_SWITCHES, **settings: Any) -> sf.Problem:
     """J is the integral of x'x over one time unit; five switches unless told."""
-    sequence = (("A1", "A2") * len(times))[: len(times) + 1]
+    sequence = (("A1", "A2") * (len(times) + 1))[: len(times) + 1]
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 0.0, 1.0)
     return sf.Problem(LINEAR, run, **settings)
 

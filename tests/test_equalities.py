@@ -10,7 +10,7 @@ import pytest
 import scipy.optimize
 
 from switchfit.optimize import LinearConstraints, Status, minimize
-from switchfit.optimize.composite import Equalities, Rows, find_normal_step, solve_composite
+from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
 from switchfit.optimize.qp import Room
 from switchfit.problem.functions import use_float64
 
@@ -133,14 +133,6 @@ def test_a_published_problem_with_bounds_and_an_inequality():
     assert found.cost == pytest.approx(17.0140173, rel=1e-8)
     assert set(found.active) == {"theta[0] at lower bound", "theta[4] at lower bound"}
     assert found.free_basis.shape == (5, 1)
-    # g + A' lam is what the bounds push back with.
-    x = found.theta
-    product = np.prod(x[:4])
-    A = np.array([[*(product / x[:4]), -1.0], [*(2 * x[:4]), 0.0]])
-    pushed = found.gradient + A.T @ [multiplier for _, _, multiplier in found.equalities]
-    lower = found.multipliers[:5]
-    np.testing.assert_allclose(pushed, lower, atol=1e-7)
-    assert np.all(lower >= 0.0)
 
 
 def test_multipliers_hessian_and_free_directions_in_closed_form():
@@ -157,49 +149,31 @@ def test_multipliers_hessian_and_free_directions_in_closed_form():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_random_problems_end_where_trust_constr_ends(seed):
-    """A convex cost, a bent surface, an order and a bound."""
+def test_random_problems_end_at_a_minimum(seed):
+    """A convex cost on bent surfaces, with an order and bounds: the conditions of Karush, Kuhn and Tucker hold."""
     rng = np.random.default_rng(seed)
-    d, k = 5, 2
-    root, g = rng.normal(size=(d, d)), rng.normal(size=d)
-    B = root @ root.T + np.eye(d)
-    rows, bend, point = rng.normal(size=(k, d)), 0.1 * rng.normal(size=(k, d)), 0.5 + rng.random(d)
+    root, g = rng.normal(size=(5, 5)), rng.normal(size=5)
+    B = root @ root.T + np.eye(5)
+    rows, bend, point = rng.normal(size=(2, 5)), 0.1 * rng.normal(size=(2, 5)), np.sort(0.5 + rng.random(5))
     level = np.asarray(rows @ point + bend @ point**2)
     order = np.array([[-1.0, 1.0, 0.0, 0.0, 0.0]])
-    lower = np.full(d, -3.0)
-
-    def cost(x):
-        return g @ x + 0.5 * x @ (B @ x)
-
-    def constraints(x):
-        return [rows[i] @ x + bend[i] @ x**2 - level[i] for i in range(k)]
-
-    point = np.sort(point)
-    names = ("order", *(f"lower {i}" for i in range(d)), *(f"upper {i}" for i in range(d)))
-    linear = LinearConstraints(order, np.zeros(1), lower, np.full(d, 3.0), names)
-    found = solve(cost, constraints, point, linear)
-    assert found.status.successful
-    expected = scipy.optimize.minimize(
-        lambda x: float(cost(x)),
-        found.theta + 1e-2,
-        jac=lambda x: g + B @ x,
-        hess=lambda x: B,
-        method="trust-constr",
-        constraints=[
-            scipy.optimize.NonlinearConstraint(
-                lambda x: np.array(constraints(x)),
-                0,
-                0,
-                jac=lambda x: rows + 2 * bend * x,
-                hess=lambda x, v: np.diag(2 * v @ bend),
-            ),
-            scipy.optimize.LinearConstraint(order, 0, np.inf),
-        ],
-        bounds=[(-3, 3)] * d,
-        options={"gtol": 1e-10, "xtol": 1e-12, "barrier_tol": 1e-10, "maxiter": 2000},
+    linear = LinearConstraints(order, np.zeros(1), np.full(5, -3.0), np.full(5, 3.0), range(11))
+    found = solve(
+        lambda x: g @ x + 0.5 * x @ (B @ x),
+        lambda x: [rows[i] @ x + bend[i] @ x**2 - level[i] for i in range(2)],
+        point,
+        linear,
     )
-    assert found.cost <= expected.fun + 1e-6 * abs(expected.fun)
-    assert found.cost == pytest.approx(expected.fun, rel=1e-5)
+    assert found.status.successful
+    x, lam = found.theta, np.array([multiplier for _, _, multiplier in found.equalities])
+    A = rows + 2 * bend * x
+    np.testing.assert_allclose(rows @ x + bend @ x**2, level, atol=1e-8)
+    np.testing.assert_allclose(g + B @ x + lam @ A, linear.normals.T @ found.multipliers, atol=1e-6)
+    assert np.all(found.multipliers >= 0.0)
+    assert np.all(linear.slack(x) >= -1e-12)
+    assert np.all(linear.slack(x)[found.multipliers > 1e-7] < 1e-9)
+    Z = found.free_basis
+    assert not Z.size or np.linalg.eigvalsh(Z.T @ (B + np.diag(2 * lam @ bend)) @ Z)[0] > 0
 
 
 # --- each part of the method ------------------------------------------------------------------------------------------
@@ -248,29 +222,25 @@ def test_linearisations_that_bounds_contradict_are_met_as_far_as_they_can_be():
 
 
 def test_constraints_that_say_the_same_twice_are_met():
-    found = solve(
-        lambda x: x[0] + x[1],
-        lambda x: [x[0] ** 2 + x[1] ** 2 - 2, 3 * (x[0] ** 2 + x[1] ** 2 - 2)],
-        [-2.0, 0.5],
-    )
+    circle = lambda x: x[0] ** 2 + x[1] ** 2 - 2  # noqa: E731
+    found = solve(lambda x: x[0] + x[1], lambda x: [circle(x), 3 * circle(x)], [-2.0, 0.5])
     assert found.status.successful
     np.testing.assert_allclose(found.theta, [-1.0, -1.0], atol=1e-8)
 
 
-def test_constraints_that_cannot_be_met_are_named():
-    found = solve(lambda x: (x[0] - 3.0) ** 2 + x[1] ** 2, lambda x: [x[1] - 1.0, x[0] ** 2 + 1.0], [2.0, 0.0])
+@pytest.mark.parametrize(
+    ("constraints", "violated", "evaluations"),
+    [
+        (lambda x: [x[1] - 1.0, x[0] ** 2 + 1.0], {"c1": 1.0}, 40),  # 53 where a trust region has to vanish
+        (lambda x: [x[0] - 1.0, x[0] - 2.0], {"c0": 0.5, "c1": -0.5}, 10),
+    ],
+)
+def test_constraints_that_cannot_be_met_are_named(constraints, violated, evaluations):
+    found = solve(lambda x: (x[0] - 3.0) ** 2 + x[1] ** 2, constraints, [2.0, 0.0])
     assert found.status is Status.INFEASIBLE
     assert not found.status.successful
-    assert found.violated[-1][0] == "c1"
-    assert found.violated[-1][1] == pytest.approx(1.0, abs=1e-3)
-    assert found.evaluations < 40  # 53 where only a trust region that has vanished ends it
-
-
-def test_constraints_that_contradict_each_other_are_named():
-    found = solve(lambda x: x[0] ** 2 + x[1] ** 2, lambda x: [x[0] - 1.0, x[0] - 2.0], [0.0, 0.0])
-    assert found.status is Status.INFEASIBLE
-    assert {name for name, _ in found.violated} == {"c0", "c1"}
-    assert found.evaluations < 10
+    assert {name: value for name, value in found.violated if abs(value) > 1e-3} == pytest.approx(violated, abs=1e-3)
+    assert found.evaluations < evaluations
 
 
 def test_a_saddle_on_a_surface_is_left():
@@ -281,60 +251,42 @@ def test_a_saddle_on_a_surface_is_left():
     assert found.cost == pytest.approx(-1.0)
 
 
-def test_a_kink_on_a_surface_holds_the_solution():
-    """|x - 1| + (y - 2)²/2 on x = y²: at the kink the multiplier is -1/2, and the slope 1/2 is between -1 and 1."""
+SURFACE = lambda x, y: (x - y**2, [1.0, -2 * y], np.diag([0.0, -2.0]))  # noqa: E731
+
+
+def kinked(weight, level, start, surface=SURFACE):
+    """Minimize w |x - 1| + (y - level)²/2 on a surface, which is x = y² unless said."""
 
     def evaluate(z, side, multipliers):
         x, y = z
-        slope = np.sign(x - 1.0) or side
-        gradient = np.array([slope, y - 2.0])
-        hessian = np.diag([0.0, 1.0 - 2.0 * multipliers[0]])
-        return Here(abs(x - 1) + 0.5 * (y - 2) ** 2, gradient, hessian, np.array([x - y**2]), np.array([[1.0, -2 * y]]))
+        gradient = np.array([weight * (np.sign(x - 1.0) or side), y - level])
+        c, normal, bend = surface(x, y)
+        hessian = np.diag([0.0, 1.0]) + multipliers[0] * bend
+        cost = weight * abs(x - 1) + 0.5 * (y - level) ** 2
+        return Here(cost, gradient, hessian, np.array([c]), np.array([normal]))
 
-    for start in ([0.3, 0.9], [1.0, 1.0], [2.5, 1.2], [1.0, 0.6]):
-        found = minimize(
-            evaluate, start, constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("surface",)
-        )
-        assert found.status is Status.CONVERGED_AT_KINK, start
-        assert found.theta[0] == 1.0
-        assert found.theta[1] == pytest.approx(1.0, abs=1e-8)
-        assert found.equalities[0][2] == pytest.approx(-0.5, abs=1e-7)
+    settings = {"constraints": free(2), "breakpoints": ([1.0], ()), "hessian": "auto", "equalities": ("surface",)}
+    return minimize(evaluate, start, **settings)
 
 
-def test_a_kink_that_does_not_hold_the_solution_is_passed():
-    """0.2 |x - 1| + (y - 3)²/2 on x = y²: at y = 1 the pull is (y - 3)/2y = -1, more than the kink can hold."""
-
-    def evaluate(z, side, multipliers):
-        x, y = z
-        slope = 0.2 * (np.sign(x - 1.0) or side)
-        gradient = np.array([slope, y - 3.0])
-        hessian = np.diag([0.0, 1.0 - 2.0 * multipliers[0]])
-        cost = 0.2 * abs(x - 1) + 0.5 * (y - 3) ** 2
-        return Here(cost, gradient, hessian, np.array([x - y**2]), np.array([[1.0, -2 * y]]))
-
-    for start in ([0.3, 0.9], [1.0, 1.0], [1.0, 0.6]):
-        found = minimize(
-            evaluate, start, constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("surface",)
-        )
-        assert found.status is Status.CONVERGED, start
-        # y - 3 + 2 y 0.2 = 0
-        assert found.theta[1] == pytest.approx(3.0 / 1.4, abs=1e-8)
+@pytest.mark.parametrize("start", [(0.3, 0.9), (1.0, 1.0), (2.5, 1.2), (1.0, 0.6)])
+def test_a_kink_on_a_surface_holds_the_solution_or_is_passed(start):
+    """At the kink, y = 1, the pull is (y - level)/2y: -1/2 is less than the weight 1, and -1 more than 0.2."""
+    found = kinked(1.0, 2.0, start)
+    assert found.status is Status.CONVERGED_AT_KINK
+    assert found.theta[0] == 1.0
+    assert found.theta[1] == pytest.approx(1.0, abs=1e-8)
+    assert found.equalities[0][2] == pytest.approx(-0.5, abs=1e-7)
+    found = kinked(0.2, 3.0, start)
+    assert found.status is Status.CONVERGED
+    assert found.theta[1] == pytest.approx(3.0 / 1.4, abs=1e-8)  # y - 3 + 2 y 0.2 = 0
 
 
 @pytest.mark.parametrize("place", [0.7, 1.3])
 @pytest.mark.parametrize("weight", [5.0, -1e-9])
 def test_a_kink_is_left_where_constraints_cannot_be_met_on_it(place, weight):
-    """w |x - 1| + y²/2 with x given: the kink at which the start is holds x, or keeps it to one side."""
-
-    def evaluate(z, side, multipliers):
-        x, y = z
-        slope = weight * (np.sign(x - 1.0) or side)
-        cost = weight * abs(x - 1) + 0.5 * y**2
-        return Here(cost, np.array([slope, y]), np.diag([0.0, 1.0]), np.array([x - place]), np.array([[1.0, 0.0]]))
-
-    found = minimize(
-        evaluate, [1.0, 0.5], constraints=free(2), breakpoints=([1.0], ()), hessian="auto", equalities=("place",)
-    )
+    """With x given: the kink at which the start is holds x, or keeps it to one side."""
+    found = kinked(weight, 0.0, [1.0, 0.5], lambda x, y: (x - place, [1.0, 0.0], np.zeros((2, 2))))
     assert found.status is Status.CONVERGED
     np.testing.assert_allclose(found.theta, [place, 0.0], atol=1e-10)
     assert found.equalities[0][2] == pytest.approx(weight * np.sign(1 - place))
@@ -357,15 +309,6 @@ def test_units_of_constraints_and_unknowns_do_not_matter(unit):
     assert found.status.successful
     np.testing.assert_allclose(found.theta / scale, plain.theta, rtol=1e-6)
     assert abs(found.iterations - plain.iterations) <= 2
-
-
-def test_iterations_and_callbacks_end_it():
-    cost, constraints, start, _ = PUBLISHED[77]
-    few = solve(cost, constraints, start, max_iterations=2)
-    assert (few.status, few.iterations, len(few.history)) == (Status.MAX_ITERATIONS, 2, 3)
-    assert few.violated
-    stopped = solve(cost, constraints, start, callback=lambda record: record.iteration == 1)
-    assert (stopped.status, stopped.iterations) == (Status.INTERRUPTED, 1)
 
 
 def test_known_multipliers_save_the_second_evaluation_of_the_start():
@@ -409,19 +352,6 @@ def test_points_where_constraints_are_not_finite_are_avoided():
 
 
 # --- the composite step -----------------------------------------------------------------------------------------------
-
-
-def test_factorised_rows_solve_and_project_like_lstsq():
-    rng = np.random.default_rng(0)
-    for k, d, copies in ((2, 5, 0), (5, 5, 0), (3, 5, 2), (7, 4, 0)):
-        A = rng.normal(size=(k, d))
-        A = np.vstack([A, A[:copies]])
-        c, g = rng.normal(size=len(A)), rng.normal(size=d)
-        rows = Rows.of(A)
-        assert rows.rank == np.linalg.matrix_rank(A)
-        np.testing.assert_allclose(A @ rows.null, 0.0, atol=1e-13)
-        np.testing.assert_allclose(rows.solve(c), -np.linalg.lstsq(A, c, rcond=1e-10)[0], atol=1e-12)
-        np.testing.assert_allclose(rows.multipliers(g), -np.linalg.lstsq(A.T, g, rcond=1e-10)[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(20))

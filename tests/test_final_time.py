@@ -3,17 +3,14 @@
 from dataclasses import replace
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import test_protocol as protocol
 from derivatives import differentiate
 from models import decay
 
 import switchfit as sf
-from switchfit.discretization.model import Model
 from switchfit.fit.evaluator import Evaluator
-from switchfit.io.problem_file import load_problem
-from switchfit.problem.functions import use_float64
 from switchfit.strategy.starts import is_minimum_time
 
 METHODS = ("auto", "forward", "autodiff", "adjoint")
@@ -58,48 +55,19 @@ def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     np.testing.assert_allclose(found.hessian, expected[2], rtol=0, atol=1e-8)
 
 
-def swing(t, x, p, u):
-    return jnp.stack([x[1], -jnp.sin(x[0]) * (1 + 0.3 * jnp.sin(t)) - p["c"] * x[1] + u])
-
-
-def drift(t, x, p, u):
-    return jnp.stack([x[1] * jnp.cos(t * x[0]), p["q"] * x[0] * x[1] - u * t])
-
-
-def kick(t, x, p):
-    return jnp.stack([x[0] + 0.1 * p["q"] * t, 0.5 * x[1] * x[0]])
-
-
 def hard_problem(tf=2.4, **settings):
-    """Two transitions, one with a reset map and one with a guard, an input, a reference signal, samples and costs of
-    every kind, all of them nonlinear and dependent on time."""
-    times = np.linspace(0.0, 4.0, 33)
-    rng = np.random.default_rng(3)
-    signal = sf.ReferenceSignal.from_samples(times, rng.normal(size=(33, 1)), observe=lambda t, x, p: x[:1] * x[1] ** 2)
-    samples = sf.Measurements(times[1:12], rng.normal(size=(11, 1)), lambda t, x, p: x[1:] + p["c"] * t, sigma=0.7)
+    """Two transitions, one with a reset map and one with a guard, a reference signal, late samples and costs of every
+    kind, all of them nonlinear and dependent on time."""
     costs = [
-        samples,
-        signal,
-        sf.RunningCost(lambda t, x, p: jnp.cos(x[0] * t) * p["c"] + x[1] ** 3),
-        sf.TransitionCost(lambda t, x, p: t * x[0] ** 2, before="drift", after="swing"),
-        sf.TerminalCost(lambda x, p: jnp.exp(0.3 * x[0]) * p["q"] * x[1]),
-        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["c"], x[1] ** 2])),
+        sf.Measurements(protocol.TIMES[2:8], protocol.VALUES[2:8], sigma="s", delay="d"),
+        *protocol.DATA["transitions, end"][1:],
+        *protocol.DATA["reference, running"][:2],
+        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["k"], x[1] ** 2])),
     ]
-    system = sf.HybridSystem(
-        {"swing": swing, "drift": drift},
-        lambda p: jnp.stack([0.4 + 0 * p["c"], p["c"]]),
-        reset_maps={("swing", "drift"): kick},
-        guards={("drift", "swing"): lambda t, x, p: x[0] ** 2 - 0.3 * t * p["q"]},
-    )
-    run = sf.Experiment(
-        costs,
-        ("swing", "drift", "swing"),
-        (0.83, 1.57),
-        0.0,
-        sf.Parameter(tf, lower=1.6, upper=4.0),
-        inputs=sf.Input(times, np.sin(2 * times), kind="cubic"),
-    )
-    return sf.Problem(system, run, {"c": 0.3, "q": -0.4}, **settings)
+    system = sf.HybridSystem(protocol.MODES, [0.4, 0.1], protocol.BOUNCE, guards=protocol.GUARDS)
+    tf = sf.Parameter(tf, lower=1.6, upper=3.0)
+    run = sf.Experiment(costs, ("swing", "fall", "swing"), (0.83, 1.57), 0.0, tf)
+    return sf.Problem(system, run, protocol.PARAMETERS | protocol.MORE, **settings)
 
 
 @pytest.mark.slow
@@ -148,10 +116,18 @@ def cooled():
     return sf.estimate(cooling())
 
 
+def test_simulation_ends_at_the_given_tf():
+    for tf in (3.3, 9.0):  # and at its upper bound
+        path = sf.simulate(cooling(), [tf, 0.5])
+        assert (path.times[0], path.times[-1]) == (0.0, tf)
+        assert path.states[-1, 0] == pytest.approx(np.exp(-0.5 * tf), rel=1e-8)
+
+
 def test_the_time_to_a_level_and_its_standard_error_follow_from_the_rate(cooled):
     """tf = ln(1 / level) / k, which the samples up to 2 s determine through k."""
     fit = cooled
     assert fit.success
+    assert cooling(cooling_run(tf=sf.Parameter(3.0, fixed=True))).theta_names == ("k",)
     assert fit.theta_names == ("tf", "k")
     tf, k = fit.theta
     assert tf == pytest.approx(np.log(1 / LEVEL) / k, rel=1e-8)
@@ -171,11 +147,8 @@ def test_what_is_printed_drawn_predicted_and_saved_ends_at_tf(cooled, tmp_path):
     tf = fit.final_times[0]
     assert fit.trajectory.times[-1] == tf
     assert fit.trajectory.mode_spans == [("cools", 0.0, tf)]
-    assert "cools, 0 to 3.98557 s" in str(fit)
     assert "  tf   3.986  ± 0.033" in str(fit)
-    figure = fit.plot(bands=True)
-    assert {ax.get_xlim() for ax in figure.axes} == {(0.0, tf)}
-    plt.close(figure)
+    assert {ax.get_xlim() for ax in fit.plot(bands=True).axes} == {(0.0, tf)}
     assert fit.predict().times[-1] == tf
     at_end = fit.predict([1.0, tf])
     assert at_end.outputs[1, 0] == pytest.approx(LEVEL, rel=1e-9)
@@ -183,23 +156,10 @@ def test_what_is_printed_drawn_predicted_and_saved_ends_at_tf(cooled, tmp_path):
     np.testing.assert_allclose(
         at_end.output_errors[:, 0], at_end.times * at_end.outputs[:, 0] * fit.standard_errors[1], rtol=1e-6
     )
-    with pytest.raises(ValueError, match="times must not lie after tf where tf is estimated: the system stops there"):
-        fit.predict([tf + 1e-3])
     fit.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json")
     assert str(loaded) == str(fit)
     assert (loaded.final_times, loaded.final_places) == ((tf,), (0,))
-    assert loaded.is_time.tolist() == [True, False]
-
-
-def test_simulation_ends_at_the_given_tf():
-    path = sf.simulate(cooling(), [3.3, 0.5])
-    assert (path.times[0], path.times[-1]) == (0.0, 3.3)
-    assert set(path.modes) == {"cools"}
-    assert path.states[-1, 0] == pytest.approx(np.exp(-0.5 * 3.3), rel=1e-8)
-    at_bound = sf.simulate(cooling(), [9.0, 0.5])
-    assert at_bound.times[-1] == 9.0
-    assert at_bound.states[-1, 0] == pytest.approx(np.exp(-0.5 * 9.0), rel=1e-8)
 
 
 @pytest.mark.slow
@@ -253,22 +213,15 @@ def test_batches_without_constraints_take_a_free_tf_in_their_compiled_program():
     ]
     tf = sf.Parameter(4.0, lower=2.0, upper=9.0, prior=sf.Normal(3.5, 0.5))
     problem = sf.Problem(system, sf.Experiment(data, ("cools",), (), 0.0, tf), {"k": sf.Parameter(0.5, lower=0.1)})
-    truth = np.array([3.2, RATE])
     alone = sf.estimate(problem)
     assert alone.success
     by_hand = lambda tf: 9 * (np.exp(-alone.theta[1] * tf) - 0.3) ** 2 + 0.5 * (tf - 3.5) ** 2 / 0.25  # noqa: E731
     for step in (1e-4, -1e-4):
         assert by_hand(alone.theta[0] + step) > by_hand(alone.theta[0])
-    fits = sf.monte_carlo(problem, runs=6, seed=5, theta=truth)
-    assert fits.success.all()
-    again = [
-        sf.estimate(replace(problem, experiments=replace(problem.experiments[0], tf=replace(tf, value=t))))
-        for t in (2.5, 6.0)
-    ]
-    for fit in again:
-        np.testing.assert_allclose(fit.theta, alone.theta, rtol=1e-6)
-    several = sf.estimate_many([fit.problem for fit in again])
-    np.testing.assert_allclose(several.theta, [alone.theta] * 2, rtol=1e-6)
+    assert sf.monte_carlo(problem, runs=6, seed=5, theta=np.array([3.2, RATE])).success.all()
+    run = problem.experiments[0]
+    others = [replace(problem, experiments=replace(run, tf=replace(tf, value=value))) for value in (2.5, 6.0)]
+    np.testing.assert_allclose(sf.estimate_many(others).theta, [alone.theta] * 2, rtol=1e-6)
 
 
 def minimum_time(tf=None, **settings):
@@ -391,131 +344,51 @@ def test_a_last_mode_that_vanishes_is_reported_as_collapsed():
     assert [(c.kind, c.mode, c.position) for c in fit.active] == [("collapsed", "slow", 1)]
 
 
-def test_a_guard_before_a_free_tf():
-    """A ball falls from 1 m, bounces with e = 1/2 and rises until it stands still: both times are known."""
-    g = 9.81
-    fall = lambda t, x, p: jnp.stack([x[1], -g * jnp.ones(())])  # noqa: E731
-    system = sf.HybridSystem(
-        {"falls": fall, "rises": fall},
-        [1.0, 0.0],
-        reset_maps={("falls", "rises"): lambda t, x, p: jnp.stack([x[0], -0.5 * x[1]])},
-        guards={("falls", "rises"): lambda t, x, p: x[0]},
-    )
-    costs = [sf.TerminalCost(lambda x, p: 0.0 * x[0]), sf.TerminalConstraint(lambda x, p: x[1])]
-    problem = sf.Problem(system, sf.Experiment(costs, ("falls", "rises"), (0.4,), 0.0, sf.Parameter(0.7, upper=2.0)))
-    fit = sf.estimate(problem)
-    hits = np.sqrt(2 / g)
-    np.testing.assert_allclose(fit.theta, [hits, 1.5 * hits], rtol=1e-8)
-    assert fit.trajectory.states[-1, 0] == pytest.approx(0.25, rel=1e-8)
+# --- errors -----------------------------------------------------------------------------------------------------------
 
 
-# --- problem files and errors -----------------------------------------------------------------------------------------
+GRID = np.linspace(0.0, 4.0, 9)
+SIGNAL = sf.ReferenceSignal.from_samples(GRID, GRID[:, None])
+LONG = sf.ReferenceSignal.from_samples(np.linspace(0.0, 5.0, 21), np.exp(-RATE * np.linspace(0.0, 5.0, 21))[:, None])
 
 
-def test_a_problem_file_has_a_free_tf(tmp_path):
-    (tmp_path / "room.py").write_text(
-        "import switchfit as sf\nroom = sf.HybridSystem({'cools': lambda t, x, p: -p['k'] * x}, [1.0])\n"
-    )
-    rows = "".join(f"{t},{v}\n" for t, v in zip(TIMES.tolist(), np.exp(-RATE * TIMES).tolist(), strict=True))
-    (tmp_path / "log.csv").write_text("t,x\n" + rows)
-    (tmp_path / "problem.toml").write_text(
-        'model = "room.py:room"\n[parameters]\nk = 0.6\n[[experiments]]\nmode_sequence = ["cools"]\n'
-        "transition_times = []\nt0 = 0.0\n"
-        "tf = { value = 3.0, lower = 2.0, upper = 9.0, prior = { mean = 3.5, sd = 0.5 } }\n"
-        '[[experiments.data]]\nfile = "log.csv"\ntime = "t"\ncolumns = ["x"]\nsigma = 0.01\n'
-    )
-    loaded = load_problem(tmp_path / "problem.toml").problem
-    tf = loaded.experiments[0].tf
-    assert (float(tf.value), float(tf.lower), float(tf.upper)) == (3.0, 2.0, 9.0)
-    fit = sf.estimate(loaded)
-    assert fit.theta == pytest.approx([3.5, RATE], rel=1e-6)
-    assert fit.standard_errors[0] == pytest.approx(0.5, rel=1e-6)
+def cool(data=SIGNAL, sequence=("cools",), times=(), **given):
+    return sf.Experiment(data, sequence, times, 0.0, sf.Parameter(3.0, lower=2.0, upper=5.0), **given)
 
 
-def test_a_fixed_parameter_is_a_number():
-    run = cooling_run(tf=sf.Parameter(3.0, fixed=True))
-    assert (run.tf, run.has_free_tf) == (3.0, False)
-    assert cooling(run).theta_names == ("k",)
+def cool_late(lower):
+    """Samples from 1.1 to 3 s that are late by at least `lower`."""
+    late = sf.Measurements(TIMES + 1.0, np.exp(-RATE * TIMES), sigma=0.01, delay="lag")
+    lag = sf.Parameter(0.6, lower=lower, upper=1.05)
+    return sf.Problem(sf.HybridSystem({"cools": decay}, [1.0]), cool(late), {"k": 0.5, "lag": lag})
 
 
-@pytest.mark.parametrize(
-    ("tf", "message"),
-    [
-        (sf.Parameter(5.0, lower=2.0), r"A free tf needs a finite upper bound, .*; got the upper bound inf"),
-        (
-            sf.Parameter(5.0, lower=-1.0, upper=9.0),
-            r"must not lie after a free tf, at its earliest 0.0; \d+ of 20 do not",
-        ),
-        (sf.Parameter([5.0, 6.0], upper=9.0), r"tf must be a single number .* the shape \(2,\)"),
-        (sf.Parameter(5.0, lower=2.0, upper=9.0, unit="h"), r"tf has the unit 'h', but time_unit of .* is 's'"),
-        (
-            sf.Parameter(5.0, lower=1.5, upper=9.0),
-            r"must not lie after a free tf, at its earliest 1.5; 5 of 20 do not, .* a lower bound of 2.0 or more",
-        ),
-    ],
-)
-def test_a_tf_that_makes_no_sense_is_refused(tf, message):
+def cool_until(**tf):
+    return cooling_run(tf=sf.Parameter(**{"value": 5.0, "upper": 9.0} | tf))
+
+
+REFUSED = {
+    "A free tf needs a finite upper bound, .*; got the upper bound inf": lambda fit: cool_until(
+        lower=2.0, upper=np.inf
+    ),
+    "at its earliest 1.5; 5 of 20 do not, .* a lower bound of 2.0 or more": lambda fit: cool_until(lower=1.5),
+    r"tf must be a single number .* the shape \(2,\)": lambda fit: cool_until(value=[5.0, 6.0]),
+    "tf has the unit 'h', but time_unit of .* is 's'": lambda fit: cool_until(lower=2.0, unit="h"),
+    r"over \(t0, tf\) = \(0.0, 5.0\), whose end is the upper bound of tf": lambda fit: cool(),
+    r"Input must be known over \(t0, tf\) = \(0.0, 5.0\)": lambda fit: cool(
+        LONG, inputs=sf.Input(GRID, GRID, kind="linear")
+    ),
+    r"strictly inside \(t0, tf\) = \(0.0, 3.0\); got \[3.0\]": lambda fit: cool(LONG, ("a", "b"), (3.0,)),
+    r"\(t0, tf\) = \(0.0, 5.0\), with the upper bound": lambda fit: sf.simulate(minimum_time(), [1.0, 5.5]),
+    "must not decrease": lambda fit: sf.simulate(minimum_time(), [2.0, 1.5]),
+    "after the lower bound of a free tf, cannot be": lambda fit: sf.monte_carlo(cooling(cool(LONG)), runs=2),
+    r"only from 1 to 1.1 s are all samples .* = \(0.0, 2.0\)": lambda fit: cool_late(0.4),
+    "a profile does not support guards and terminal constraints": lambda fit: fit.profile("tf"),
+    "times must not lie after tf where tf is": lambda fit: fit.predict([fit.final_times[0] + 1e-3]),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_what_a_free_tf_does_not_allow_is_refused(cooled, message):
     with pytest.raises(ValueError, match=message):
-        cooling_run(tf=tf)
-
-
-def test_signals_must_reach_to_the_upper_bound_of_tf():
-    times = np.linspace(0.0, 4.0, 9)
-    tf = sf.Parameter(3.0, lower=2.0, upper=5.0)
-    signal = sf.ReferenceSignal.from_samples(times, times[:, None])
-    with pytest.raises(ValueError, match=r"over \(t0, tf\) = \(0.0, 5.0\), whose end is the upper bound of tf"):
-        sf.Experiment(signal, ("cools",), (), 0.0, tf)
-    with pytest.raises(ValueError, match=r"Input must be known over \(t0, tf\) = \(0.0, 5.0\)"):
-        sf.Experiment(
-            sf.RunningCost(lambda t, x, p: x[0]), ("cools",), (), 0.0, tf, inputs=sf.Input(times, times, kind="linear")
-        )
-
-
-def test_transitions_must_lie_before_tf():
-    cost = sf.TerminalCost(lambda x, p: x[0])
-    with pytest.raises(ValueError, match=r"strictly inside \(t0, tf\) = \(0.0, 2.0\); got \[3.0\]"):
-        sf.Experiment(cost, ("a", "b"), (3.0,), 0.0, sf.Parameter(2.0, upper=5.0))
-    problem = minimum_time()
-    with pytest.raises(
-        ValueError, match=r"must not decrease inside \(t0, tf\) = \(0.0, 5.0\), with the upper bound of tf"
-    ):
-        sf.simulate(problem, [1.0, 5.5])
-    with pytest.raises(ValueError, match="must not decrease"):
-        sf.simulate(problem, [2.0, 1.5])
-
-
-@pytest.mark.slow
-def test_a_delay_must_leave_all_samples_before_the_lower_bound_of_tf():
-    data = sf.Measurements(TIMES + 1.0, np.exp(-RATE * TIMES), sigma=0.01, delay="lag")
-    run = sf.Experiment(data, ("cools",), (), 0.0, sf.Parameter(3.0, lower=2.5, upper=5.0))
-    system = sf.HybridSystem({"cools": decay}, [1.0])
-    parameters = {"k": 0.5, "lag": sf.Parameter(0.6, lower=0.5, upper=1.05)}
-    assert sf.check_derivatives(sf.Problem(system, run, parameters)).passed
-    with pytest.raises(ValueError, match=r"only from 0.5 to 1.1 s are all samples .* = \(0.0, 2.5\)"):
-        sf.Problem(system, run, parameters | {"lag": sf.Parameter(0.6, lower=0.4, upper=1.05)})
-
-
-def test_a_reference_signal_that_outlasts_a_free_tf_cannot_be_simulated():
-    times = np.linspace(0.0, 5.0, 21)
-    signal = sf.ReferenceSignal.from_samples(times, np.exp(-RATE * times)[:, None])
-    system = sf.HybridSystem({"cools": decay}, [1.0])
-    problem = sf.Problem(
-        system, sf.Experiment(signal, ("cools",), (), 0.0, sf.Parameter(3.0, lower=2.0, upper=5.0)), {"k": 0.5}
-    )
-    with pytest.raises(ValueError, match="or after the lower bound of a free tf, cannot be simulated"):
-        sf.monte_carlo(problem, runs=2)
-
-
-def test_a_profile_with_constraints_is_refused(cooled):
-    with pytest.raises(ValueError, match="a profile does not support guards and terminal constraints"):
-        cooled.profile("tf")
-
-
-def test_nothing_is_left_of_the_running_cost_after_tf_in_the_functions_of_the_model():
-    problem = closed_problem()
-    structure = problem.structures[0]
-    assert [structure.is_rest(mode) for mode in range(3)] == [False, False, True]
-    model = Model(structure, Evaluator(problem).arguments[0])
-    with use_float64():
-        at = 1.0, jnp.array([2.0]), jnp.array([1.2, 0.7])
-        assert [float(model.density(mode, None)(*at)) for mode in range(3)] == [5.0, 5.0, 0.0]
+        REFUSED[message](cooled)

@@ -157,7 +157,7 @@ def test_unknowns_on_a_logarithmic_scale_are_fitted_beside_guards():
 
 
 def test_priors_count_beside_guards():
-    """They are part of J and of the Lagrangian, and pull a fit whose data say less."""
+    """They are part of J and of the Lagrangian."""
     problem = tank(sf.Parameter(0.8, prior=sf.Normal(0.45, 1e-3)))
     theta = problem.initial_theta
     evaluator = Evaluator(problem)
@@ -165,10 +165,6 @@ def test_priors_count_beside_guards():
     assert found.cost == pytest.approx(expected.cost, rel=1e-12)
     np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10)
     np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-10, atol=1e-10)
-    fit = sf.estimate(problem)
-    assert fit.status.successful
-    assert fit.verdict.level == "doubtful"  # what the prior says is not what the data say
-    assert 0.45 < fit.parameters["inflow"] < 0.499  # 0.5 without the prior
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -225,59 +221,35 @@ def test_the_lagrangian_has_exact_derivatives():
 # --- what can go wrong ------------------------------------------------------------------------------------------------
 
 
-def test_constraints_that_cannot_be_met_are_named():
+def constrain(psi):
+    """Pose a problem with this terminal constraint."""
+    data = [sf.TerminalCost(lambda x, p: p["k"] ** 2), sf.TerminalConstraint(psi)]
     system = sf.HybridSystem({"decay": decay}, [1.0])
-    costs = [sf.TerminalCost(lambda x, p: p["k"] ** 2), sf.TerminalConstraint(lambda x, p: x[0] + 1.0)]
-    problem = sf.Problem(system, sf.Experiment(costs, ("decay",), (), 0.0, 1.0), {"k": sf.Parameter(1.0, 0.1, 5.0)})
-    fit = sf.estimate(problem)
+    return sf.Problem(system, sf.Experiment(data, ("decay",), (), 0.0, 1.0), {"k": sf.Parameter(1.0, 0.1, 5.0)})
+
+
+def test_constraints_that_cannot_be_met_are_named():
+    fit = sf.estimate(constrain(lambda x, p: x[0] + 1.0))
     assert fit.status is sf.Status.INFEASIBLE
     assert not fit.success
     assert "The constraints are not met: terminal constraint 1 = 1.0" in fit.message
 
 
-def test_a_guard_that_is_not_reached_is_told():
-    problem = guarded_ball()
-    high = ball_system(guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
-    run = sf.Experiment(problem.experiments[0].data, ("air", "air"), (3.0,), 0.0, END)
-    with pytest.raises(ValueError, match=r"No transition times near .* put tau_1 on their guards"):
-        sf.evaluate_on_guards(sf.Problem(high, run, {"e": 0.5}))
+HIGH = ball_system(guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
+FIXED = guarded_ball((sf.Parameter(3.2, fixed=True),))
+WRONG = {
+    "No transition times near .* put tau_1 on their": lambda: sf.evaluate_on_guards(ball((3.0,), system=HIGH)),
+    "This problem has no guards": lambda: sf.evaluate_on_guards(ball((3.0,))),
+    "A transition with a guard cannot have a fixed time": lambda: sf.evaluate_on_guards(FIXED),
+    r"hessian must be ('auto' or 'exact'|one of)": lambda: sf.estimate(tank(), hessian="none"),
+    "guards names the unknown mode 'c'; the modes are air": lambda: ball_system(guards={("air", "c"): abs}),
+    r"guard \('air', 'air'\) must be a function g\(t, x, p\)": lambda: ball_system(guards={("air", "air"): 3.0}),
+    r"TerminalConstraint must be a function psi\(x, p\); got int": lambda: sf.TerminalConstraint(3),
+    r"an array of shape \(m,\); got shape \(2, 2\)": lambda: constrain(lambda x, p: jnp.ones((2, 2)) * x[0]),
+}
 
 
-def test_without_guards_there_is_nothing_to_be_on():
-    system = sf.HybridSystem({"decay": decay}, [1.0])
-    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("decay",), (), 0.0, 1.0)
-    with pytest.raises(ValueError, match="This problem has no guards"):
-        sf.evaluate_on_guards(sf.Problem(system, run, {"k": 1.0}))
-
-
-def test_a_guarded_time_cannot_be_fixed():
-    with pytest.raises(ValueError, match="A transition with a guard cannot have a fixed time"):
-        sf.evaluate_on_guards(guarded_ball((sf.Parameter(3.2, fixed=True),)))
-
-
-@pytest.mark.parametrize("kind", ["gauss-newton", "block-diagonal", "descent-first", "none"])
-def test_only_the_exact_hessian_knows_constraints(kind):
-    with pytest.raises(ValueError, match=r"hessian must be ('auto' or 'exact'|one of)"):
-        sf.estimate(tank(), hessian=kind)
-
-
-@pytest.mark.parametrize(
-    ("guards", "error", "message"),
-    [
-        ({("a", "c"): abs}, ValueError, "guards names the unknown mode 'c'; the modes are a, b"),
-        ({("a", "b"): 3.0}, TypeError, r"guard \('a', 'b'\) must be a function g\(t, x, p\); got float"),
-    ],
-)
-def test_bad_guards(guards, error, message):
-    modes = {"a": lambda t, x, p: -x, "b": lambda t, x, p: 0 * x}
-    with pytest.raises(error, match=message):
-        sf.HybridSystem(modes, [1.0], guards=guards)
-
-
-def test_bad_terminal_constraints():
-    with pytest.raises(TypeError, match=r"TerminalConstraint must be a function psi\(x, p\); got int"):
-        sf.TerminalConstraint(3)
-    system = sf.HybridSystem({"a": lambda t, x, p: -x}, [1.0])
-    data = [sf.TerminalCost(lambda x, p: x[0]), sf.TerminalConstraint(lambda x, p: jnp.ones((2, 2)) * x[0])]
-    with pytest.raises(ValueError, match=r"must return a number or an array of shape \(m,\); got shape \(2, 2\)"):
-        sf.Problem(system, sf.Experiment(data, ("a",), (), 0.0, 1.0), {"k": 1.0})
+@pytest.mark.parametrize("message", WRONG)
+def test_what_is_wrong_is_said(message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        WRONG[message]()

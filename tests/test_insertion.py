@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import fishing
-from test_protocol import BOUNCE, DATA, GUARDS, MODES, MORE, SYSTEM, problem, samples
+from test_protocol import BOUNCE, DATA, GUARDS, MODES, MORE, problem, samples
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
@@ -49,6 +49,15 @@ def driven(data):
     return sf.Problem(system, run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
 
 
+def dosed():
+    """Rows after a jump have the costate behind it; there are none after tf."""
+    dose = sf.Jump([0.2, 1.0], lambda t, x, p: jnp.array([x[0] * x[1], x[1] - 0.2 * p["k"]]))
+    costs = [sf.RunningCost(lambda t, x, p: x[0] ** 2), sf.TerminalCost(lambda x, p: x[0] ** 2 + p["k"] * x[1])]
+    tf = sf.Parameter(2.5, upper=3.0)
+    run = sf.Experiment(costs, ("swing", "fall"), (1.1,), 0.0, tf, jumps=dose)
+    return sf.Problem(sf.HybridSystem(MODES, [0.4, 0.1]), run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
+
+
 def rates_of(given, theta=None):
     """The rates, and the meshes that they were computed on."""
     whole = add_all_modes(given)
@@ -85,7 +94,9 @@ def derivative(given, meshes, e, mode, time, side=1):
 
 CASES = {name: lambda data=data: problem(data, parameters=MORE, rtol=1e-11, atol=1e-13) for name, data in KINDS.items()}
 CASES["inputs"] = lambda: driven(samples())
-CHOSEN = [pytest.param(name, marks=[pytest.mark.slow] * (name == "reference, running")) for name in CASES]
+CASES["jumps, free tf"] = lambda: dosed()
+SLOW = ("reference, running", "jumps, free tf")
+CHOSEN = [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES]
 
 
 @pytest.mark.parametrize("name", CHOSEN)
@@ -95,7 +106,8 @@ def test_rates_are_derivatives_of_sequences_with_a_pulse_of_no_length(name):
     scale = np.nanmax(abs(found.rate))
     knots = {0.5, 1.0, 2.0} if name == "inputs" else {0.2, 1.0, 2.4}
     rows = [r for r, t in enumerate(found.times) if any(abs(t - knot) < 1e-9 for knot in (0.0, 1.1, 2.3, *knots))]
-    assert len(rows) >= 5
+    assert len(rows) >= 4
+    assert name != "jumps, free tf" or found.times[-1] < 2.5
     rows += [*(r - 1 for r in rows[1:]), 1, len(found.times) // 2, len(found.times) - 1]  # also before a knot
     compared = 0
     for r in rows:
@@ -111,35 +123,17 @@ def test_rates_are_derivatives_of_sequences_with_a_pulse_of_no_length(name):
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "samples")) for name in CASES])
 def test_engines_agree(name):
-    given = CASES[name]()
+    """On two runs, each of which has its own rates."""
+    one = CASES[name]()
+    given = replace(one, experiments=[*one.experiments, replace(one.experiments[0], name="second")])
     native = Evaluator(add_all_modes(replace(given, engine="native")))
     by_jax = Evaluator(add_all_modes(replace(given, engine="jax")), meshes=native.meshes)
     theta = given.initial_theta
-    (found,), (expected,) = compute_rates(native, theta), compute_rates(by_jax, theta)
-    np.testing.assert_array_equal(found.times, expected.times)
-    np.testing.assert_array_equal(found.active, expected.active)
-    np.testing.assert_allclose(found.rate, expected.rate, rtol=1e-10, atol=1e-11 * np.nanmax(abs(found.rate)))
-
-
-def test_samples_count_on_the_side_of_the_pulse():
-    """A pulse that begins at a sample does not change it; one that ends there would."""
-    given = CASES["samples"]()
-    (found,), meshes = rates_of(given)
-    r = int(np.argmin(abs(found.times - 1.6)))
-    k = found.modes.index("rest")
-    more, theta, place = with_pulse(given, 0, "rest", found.times[r])
-    evaluator = Evaluator(more, meshes=meshes)
-    ending = -evaluator(theta, -1).gradient[place - 1]
-    assert abs(ending - found.rate[r, k]) > 0.05 * abs(ending)
-    # What differs is the sample: D_x ell (f_k - f_m).
-    x = np.interp(1.6, found.trajectory.times, found.trajectory.states[:, 0])
-    v = np.interp(1.6, found.trajectory.times, found.trajectory.states[:, 1])
-    state = np.array([x, v])
-    p = {"k": 1.2, "g": 0.8}
-    change = np.array(MODES["rest"](1.6, state, p) - MODES["fall"](1.6, state, p))
-    sample = samples()
-    residual = state - sample.values[list(sample.times).index(found.times[r])]
-    assert ending - found.rate[r, k] == pytest.approx(residual / 0.25 @ change, rel=1e-4)
+    theta[given.unknowns.times[1][0]] -= 0.05
+    for found, expected in zip(compute_rates(native, theta), compute_rates(by_jax, theta), strict=True):
+        np.testing.assert_array_equal(found.times, expected.times)
+        np.testing.assert_array_equal(found.active, expected.active)
+        np.testing.assert_allclose(found.rate, expected.rate, rtol=1e-10, atol=1e-11 * np.nanmax(abs(found.rate)))
 
 
 def test_rates_with_reset_maps_are_not_defined():
@@ -189,30 +183,6 @@ def test_guards_move_with_the_pulse(engine):
 
 
 @pytest.mark.slow
-def test_jumps_and_a_free_tf():
-    """Rows after a jump have the costate behind it; there are none after tf."""
-    dose = sf.Jump([0.7, 1.5], lambda t, x, p: jnp.array([x[0] * x[1], x[1] - 0.2 * p["k"]]))
-    end = sf.TerminalCost(lambda x, p: x[0] ** 2 + p["k"] * x[1])
-    run = sf.Experiment(
-        [sf.RunningCost(lambda t, x, p: x[0] ** 2), end],
-        ("swing", "rest"),
-        (1.1,),
-        0.0,
-        sf.Parameter(2.5, upper=3.0),
-        jumps=dose,
-    )
-    given = sf.Problem(sf.HybridSystem(MODES, [0.4, 0.1]), run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
-    (found,), meshes = rates_of(given)
-    assert found.times[-1] < 2.5
-    for time in (0.7, 1.5, 1.9):
-        r = int(np.flatnonzero(found.times <= time + 1e-12)[-1])
-        expected = derivative(given, meshes, 0, "fall", found.times[r])
-        assert found.rate[r, found.modes.index("fall")] == pytest.approx(expected, rel=1e-6)
-    by_jax = sf.insertion(replace(given, engine="jax"))
-    np.testing.assert_allclose(by_jax.rate, found.rate, rtol=1e-9, atol=1e-10)
-
-
-@pytest.mark.slow
 def test_implicit_steps_have_rates_too():
     given = problem(samples(), system=sf.HybridSystem(MODES, [0.4, 0.1]), solver="stiff")
     found, explicit = sf.insertion(given), sf.insertion(replace(given, solver="explicit"))
@@ -223,18 +193,6 @@ def test_implicit_steps_have_rates_too():
         assert np.median(abs(at - explicit.rate[:, mode])[away]) < 0.02 * scale
 
 
-def test_several_experiments_have_their_own_rates():
-    one = problem(samples())
-    run = one.experiments[0]
-    other = replace(run, mode_sequence=("fall", "rest"), transition_times=(1.4,), name="second")
-    both = sf.Problem(SYSTEM, [run, other], one.parameters, rtol=1e-11, atol=1e-13)
-    found = sf.insertion(both)
-    assert [each.name for each in found] == ["run1", "second"]
-    for each, alone in zip(found, (run, other), strict=True):
-        expected = sf.insertion(sf.Problem(SYSTEM, alone, one.parameters, rtol=1e-11, atol=1e-13))
-        np.testing.assert_allclose(each.rate, expected.rate, rtol=1e-9, atol=1e-10)
-
-
 # Text and figure
 
 
@@ -242,23 +200,16 @@ def test_the_report_names_the_best_pulse_and_what_is_not_defined():
     found = sf.insertion(fishing((2.6, 4.34)))
     mode, time = found.best()
     assert (mode, time) == (found.minima()[0].mode, found.minima()[0].time)
-    text = str(found)
-    assert text.startswith(f"A short pulse of fishing at {time:.6g} s lowers J fastest: by 0.2727 per s of its length.")
-    assert "idle" in text.splitlines()[4]
-    assert "Not defined" not in text
+    text = f"A short pulse of fishing at {time:.6g} s lowers J fastest: by 0.2727 per s of its length."
+    assert str(found).startswith(text)
+    assert len(found.plot().axes) == 1
     text = str(sf.insertion(problem(samples())))
     assert text.splitlines()[-1].endswith("a pulse of fall in swing, swing in fall.")
-    assert repr(found) == f"Insertion(run1, {len(found.times)} times, 2 modes, best fishing at {time:.6g})"
-
-
-def test_where_no_pulse_lowers_j():
     still = {"stay": lambda t, x, p: 0.0 * x, "leave": lambda t, x, p: 1.0 + 0.0 * x}
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("stay",), (), 0.0, 2.0)
-    found = sf.insertion(sf.Problem(sf.HybridSystem(still, [0.5]), run, max_transitions=1))
-    assert found.best() is None
-    assert found.minima() == []
-    assert str(found) == "No short pulse of any mode lowers J."
-    assert repr(found).endswith("no pulse lowers J)")
+    nothing = sf.insertion(sf.Problem(sf.HybridSystem(still, [0.5]), run, max_transitions=1))
+    assert (nothing.best(), nothing.minima()) == (None, [])
+    assert str(nothing) == "No short pulse of any mode lowers J."
 
 
 def test_minima_are_local_ones():
@@ -272,14 +223,3 @@ def test_minima_are_local_ones():
         ("idle", 2.0, -2.0),
     ]
     assert [p.rate for p in found.minima(1)] == [-5.0, -4.0]
-
-
-def test_the_figure_has_a_line_for_each_mode():
-    found = sf.insertion(fishing((2.6, 4.34)))
-    figure = found.plot()
-    (ax,) = figure.axes
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["pulse of idle", "pulse of fishing"]
-    assert ax.get_xlim() == (0.0, 12.0)
-    dots = [line for line in ax.lines if line.get_marker() == "o"]
-    assert [len(line.get_xdata()) for line in dots] == [1, 2]
-    assert found.plot(ax=ax) is ax

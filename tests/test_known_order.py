@@ -6,10 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import decay as off
+from models import heated_room
+from test_strategy import temperatures
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
-from switchfit.strategy import beam, choice, known_order, starts
+from switchfit.strategy import beam, choice, starts
 from switchfit.strategy.beam import Proposal, Quadratic
 from switchfit.strategy.hops import choose_hops, hop_over_samples, is_lower
 from switchfit.strategy.known_order import Beams, _list_settled, explain_no_beam, find_times
@@ -21,11 +23,8 @@ POWER, LOSS = 1.0, 0.8
 GUESS = {"power": sf.Parameter(2.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.4, lower=0.05, upper=3.0)}
 
 
-def on(t, x, p):
-    return p["power"] - p["k"] * x
-
-
-ROOM = sf.HybridSystem({"on": on, "off": off}, [0.2], state_names=("T",))
+ROOM = heated_room()
+on = ROOM.modes["on"]
 
 
 def see_twice(t, x, p):
@@ -50,6 +49,10 @@ def measure(sigma=0.02, seed=1, times=TIMES, observe=None, channels=1, **more):
     return sf.Measurements(times, np.zeros((len(times), channels)), observe=observe, sigma=sigma, **more), noise
 
 
+def is_fixed(tau):
+    return isinstance(tau, sf.Parameter) and tau.fixed
+
+
 def pose(logs, system=ROOM, parameters=GUESS, times=FAR, truth=(POWER, LOSS), **more):
     """Return a problem with a bad guess whose data are simulated at the truth, and the fit that begins there."""
 
@@ -58,45 +61,25 @@ def pose(logs, system=ROOM, parameters=GUESS, times=FAR, truth=(POWER, LOSS), **
         run = sf.Experiment(list(data), transition_times=tau, **given)
         return sf.Problem(system, run, parameters)
 
-    def value(tau):
-        return float(tau.value) if isinstance(tau, sf.Parameter) and tau.fixed else None
-
-    measured = [log for log, _ in logs]
-    near = [tau for tau, given in zip(TAU, times, strict=True) if value(given) is None]
-    problem = build(measured, times)
+    near = [tau for tau, given in zip(TAU, times, strict=True) if not is_fixed(given)]
+    problem = build([log for log, _ in logs], times)
     theta = np.concatenate([near, truth])
-    filled = []
-    for (log, noise), comparison in zip(logs, simulate(problem, theta), strict=True):
-        filled.append(replace(log, values=np.where(np.isnan(noise), np.nan, comparison + noise)))
+    seen = Evaluator(problem, theta).simulate(theta)[0].seen
+    filled = [
+        replace(log, values=values[: len(noise)] + noise) for (log, noise), values in zip(logs, seen, strict=True)
+    ]
     problem = build(filled, times)
     return problem, fit_briefly(problem, theta)
 
 
-def simulate(problem, theta):
-    """Return what each sensor sees at theta."""
-    path, p = sf.simulate(problem, theta), problem.name_parameters(theta, 0)
-    found = []
-    for item in problem.experiments[0].data:
-        late = item.delay if not isinstance(item.delay, str) else float(theta[-1])
-        at = np.array([np.interp(item.times - late, path.times, column) for column in path.states.T]).T
-        see = item.observe or (lambda t, x, p: x)
-        found.append(np.array([see(t, x, p) for t, x in zip(item.times, at, strict=True)]))
-    return found
-
-
-def with_outliers(seed=3):
-    log, noise = measure(loss="soft_l1")
-    wrong = np.random.default_rng(seed).choice(len(TIMES), 3, replace=False)
-    noise[wrong] += 1.5
+def measure_oddly(places, value, **more):
+    """Return measurements with some values that are wrong by a value, or missing where it is NaN."""
+    log, noise = measure(**more)
+    noise[places] += value
     return log, noise
 
 
-def without_some():
-    log, noise = measure()
-    noise[[3, 4, 5, 17, 30]] = np.nan
-    return log, noise
-
-
+MEASURED = sf.Measurements(TIMES, np.sin(TIMES))
 FIXED = (sf.Parameter(TAU[0], fixed=True), 2.5, 9.5)
 BOUNDED = (0.5, sf.Parameter(6.0, lower=5.0, upper=6.5), sf.Parameter(9.0, lower=7.05, upper=9.5))
 NARROW = (0.5, sf.Parameter(5.3, lower=5.25, upper=5.4), 9.5)
@@ -126,8 +109,8 @@ CASES = {
     "logarithmic scales": lambda: pose([measure()], parameters=LOGARITHMIC),
     "sigma unknown": lambda: pose([measure(sigma=None)]),
     "sigma estimated": lambda: pose([measure(sigma="noise")], parameters=GUESS | THIRD, truth=(POWER, LOSS, 0.02)),
-    "outliers": lambda: pose([with_outliers()]),
-    "missing values": lambda: pose([without_some()]),
+    "outliers": lambda: pose([measure_oddly([6, 19, 31], 1.5, loss="soft_l1")]),
+    "missing values": lambda: pose([measure_oddly([3, 4, 5, 17, 30], np.nan)]),
     "several sensors": lambda: pose(
         [measure(times=TIMES[::3]), measure(seed=2, times=TIMES[1::2], observe=see_twice, channels=2)]
     ),
@@ -166,33 +149,13 @@ def test_machine_code_keeps_the_hypotheses_that_the_rules_say(name, monkeypatch)
         np.testing.assert_array_equal(one.parameters, other.parameters)
 
 
-def test_a_reference_is_followed():
-    path = sf.simulate(pose([measure()])[0], np.array([*TAU, POWER, LOSS]))
-    reference = sf.ReferenceSignal.from_samples(path.times, path.states)
-    run = sf.Experiment(reference, SEQUENCE, FAR, 0.0, 10.0)
-    problem = sf.Problem(ROOM, run, GUESS)
-    right = fit_briefly(problem, np.array([*TAU, POWER, LOSS]))
-    end = find_times(problem, problem.initial_theta)
-    np.testing.assert_allclose(end.theta, right.theta, rtol=1e-3)
-
-
-def _thermostat(t, tau, power, k):
-    x, begin = 0.2, 0.0
-    for i, edge in enumerate([*tau, np.inf]):
-        level = power / k if i % 2 == 0 else 0.0
-        if t < edge:
-            return level + (x - level) * np.exp(-k * (t - begin))
-        x, begin = level + (x - level) * np.exp(-k * (edge - begin)), edge
-    return x
-
-
 def many_rooms(count, guess_k=2.0):
     """Rooms with one loss coefficient, each with a power and times of its own."""
     random = np.random.default_rng(4)
     runs, truth = [], []
     for e in range(count):
         tau, power = np.sort(random.uniform(1.0, 9.0, 3)), random.uniform(0.8, 1.6)
-        values = [_thermostat(t, tau, power, LOSS) for t in TIMES] + random.normal(0.0, 0.02, len(TIMES))
+        values = temperatures(TIMES, tau, power, LOSS) + random.normal(0.0, 0.02, len(TIMES))
         data, mapped = sf.Measurements(TIMES, values, sigma=0.02), {"power": f"power_{e}"}
         runs.append(sf.Experiment(data, SEQUENCE, FAR, 0.0, 10.0, parameter_map=mapped, name=f"room{e}"))
         truth.append((tau, power))
@@ -260,8 +223,6 @@ def test_evidence_is_the_curvature_of_the_data_alone():
     proposal = beam.follow_order(problem, 0, right.theta[3:])[0]
     bare = sf.Problem(ROOM, problem.experiments[0], {"power": 1.0, "k": 1.0})
     theta = np.append(proposal.transition_times[0], proposal.parameters)
-    from switchfit.fit.evaluator import Evaluator
-
     H = Evaluator(bare, theta)(theta, matrix="gauss-newton").hessian
     # A time is known to half a grid interval at least.
     H[:3, :3] += 12 / beam.prepare(problem, 0).grid ** 2 * np.eye(3)
@@ -269,28 +230,35 @@ def test_evidence_is_the_curvature_of_the_data_alone():
     np.testing.assert_allclose(proposal.evidence.Q, expected, rtol=1e-2)
 
 
-def test_where_no_beam_applies_it_says_why():
-    data = pose([measure()])[0].experiments[0].data
-    free = sf.Experiment(data, SEQUENCE, FAR, 0.0, sf.Parameter(11.0, lower=10.0, upper=12.0))
-    assert "free tf" in explain_no_beam(sf.Problem(ROOM, free, GUESS))
-    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), SEQUENCE, FAR, 0.0, 10.0)
-    assert explain_no_beam(sf.Problem(ROOM, cost, GUESS)) == "there are no data to follow"
-    slow = sf.Experiment(data, SEQUENCE, FAR, 0.0, 10.0)
-    assert "machine code" in explain_no_beam(sf.Problem(ROOM, slow, GUESS, engine="jax"))
+NO_BEAM = {
+    "the experiment has a free tf: give tf a number": {"tf": sf.Parameter(11.0, lower=10.0, upper=12.0)},
+    "there are no data to follow": {"data": sf.RunningCost(lambda t, x, p: x[0] ** 2)},
+    "has terminal constraints: leave": {"data": [MEASURED, sf.TerminalConstraint(lambda x, p: x[0])]},
+    "a beam needs machine code, but engine='jax' is set. Use method='insertion'": {},
+}
+
+
+@pytest.mark.parametrize("reason", NO_BEAM)
+def test_where_no_beam_applies_it_says_why(reason):
+    given = {"data": MEASURED, "mode_sequence": SEQUENCE, "transition_times": FAR, "t0": 0.0, "tf": 10.0}
+    run = sf.Experiment(**given | NO_BEAM[reason])
+    assert reason in explain_no_beam(sf.Problem(ROOM, run, GUESS, engine="jax" if "jax" in reason else "auto"))
+
+
+def pose_one_switch(values):
+    """Return the problem of when the heater goes off, all else being known."""
+    held = {"power": sf.Parameter(POWER, fixed=True), "k": sf.Parameter(LOSS, fixed=True)}
+    run = sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (9.0,), 0.0, 10.0)
+    return sf.Problem(ROOM, run, held)
 
 
 def test_hops_find_the_lowest_of_the_sample_intervals_near_by():
     """One transition, all else known, with much noise: the least cost by a fine grid."""
     grid = np.linspace(0.01, 9.99, 2000)
-    clean = np.array([[_thermostat(t, [tau], POWER, LOSS) for t in TIMES] for tau in [4.1, *grid]])
+    clean = np.array([temperatures(TIMES, [tau], POWER, LOSS) for tau in [4.1, *grid]])
     values = clean[0] + np.random.default_rng(5).normal(0.0, 0.3, len(TIMES))
     costs = 0.5 * ((clean[1:] - values) ** 2).sum(1)
-    run = sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (9.0,), 0.0, 10.0)
-    held = {
-        name: replace(parameter, value=value, fixed=True)
-        for (name, parameter), value in zip(GUESS.items(), (POWER, LOSS), strict=True)
-    }
-    problem = sf.Problem(ROOM, run, held)
+    problem = pose_one_switch(values)
     best = grid[int(np.argmin(costs))]
     for start in (best - 0.6, best + 0.6):
         theta = np.array([start])
@@ -301,14 +269,11 @@ def test_hops_find_the_lowest_of_the_sample_intervals_near_by():
 @pytest.mark.parametrize("noise", [0.3, 1.0])
 def test_only_hops_that_lower_the_cost_are_fitted(noise):
     """From the minima of many intervals; the model about the middle of an interval says too often that J falls."""
-    held = {"power": sf.Parameter(POWER, fixed=True), "k": sf.Parameter(LOSS, fixed=True)}
-    clean = np.array([_thermostat(t, [4.1], POWER, LOSS) for t in TIMES])
+    clean = temperatures(TIMES, [4.1], POWER, LOSS)
     tried = lower = 0
     for seed in range(4):
         values = clean + np.random.default_rng(seed).normal(0.0, noise, len(TIMES))
-        problem = sf.Problem(
-            ROOM, sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (4.0,), 0.0, 10.0), held
-        )
+        problem = pose_one_switch(values)
         for start in np.arange(2.0, 7.0, 0.5):
             end = fit_briefly(problem, np.array([start]))
             evaluator = Evaluator(problem, end.theta)
@@ -353,8 +318,6 @@ def test_a_callback_ends_a_search_within_one_evaluation(strategy):
 
 def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypatch):
     """On a clock of evaluations: each of J takes a second."""
-    from switchfit.fit.evaluator import Evaluator
-
     clock, evaluate = [0.0], Evaluator.__call__
 
     def timed(self, *given, **settings):
@@ -373,18 +336,6 @@ def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypa
     assert 20 * local < clock[0] - local < 22 * local
     assert found.steps[-1].ended == "time"
     assert "with more seconds as time_budget it goes on" in " ".join(str(found).split())
-
-
-def test_a_beam_ends_with_the_time(monkeypatch):
-    problem, _ = CASES["nothing more"]()
-    passes = []
-    monkeypatch.setattr(known_order, "follow_order", lambda *given, **more: passes.append(given) or [])
-    from switchfit.strategy.starts import limit_time
-
-    with limit_time(0.0):
-        end = find_times(problem, problem.initial_theta)
-    assert end.failed
-    assert len(passes) == 1
 
 
 def test_a_beam_of_which_no_hypothesis_is_left_proposes_nothing():

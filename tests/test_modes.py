@@ -22,7 +22,6 @@ from switchfit.modes.hunt import propose_starts
 from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.report.formats import format_rounded
-from switchfit.report.modes import wrap_sequence
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -31,10 +30,6 @@ FREE = {"rate": sf.Parameter(0.8, lower=0.1, upper=3.0)}
 
 def rise(t, x, p):
     return p["rate"] * jnp.stack([1.0 - x[0], -x[1]])
-
-
-def rise_alone(t, x, p):
-    return 1.0 - x
 
 
 def fall(t, x, p):
@@ -59,8 +54,7 @@ def simulate(sequence=SEQUENCE, times=SWITCHES, seed=0, sigma=SIGMA, system=SYST
     """Values of both states with noise, rate being 1."""
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), sequence, times, 0.0, 8.0)
     problem = sf.Problem(system, run, {"rate": 1.0, "force": force}, max_transitions=3)
-    trajectory = sf.simulate(problem)
-    states = np.stack([np.interp(TIMES, trajectory.times, column) for column in trajectory.states.T], axis=1)
+    states = sf.simulate(problem, times=TIMES).states
     return states + sigma * np.random.default_rng(seed).standard_normal(states.shape)
 
 
@@ -97,19 +91,11 @@ def test_the_sequence_is_found_with_its_times_and_parameters(found):
     assert found.fits == SEEN[-1].fits > 3
     assert [progress.fits for progress in SEEN] == sorted(progress.fits for progress in SEEN)
     assert found.evaluations > found.fits
+    assert list(found.by_switches) == [0, 1, 2, 3]
+    assert found.by_switches[2] is found.best
     run = replace(make_run(), mode_sequence=SEQUENCE, transition_times=SWITCHES)
     fit = sf.estimate(sf.Problem(SYSTEM, run, FREE))
     assert abs(found.best.cost - fit.cost) < 1e-6 * fit.cost
-
-
-def test_the_best_of_each_number_is_fitted_at_its_first_access(found):
-    assert list(found.by_switches) == [0, 1, 2, 3]
-    costs = [found.by_switches[k].cost for k in found.by_switches]
-    assert costs == sorted(costs, reverse=True)
-    for row in found.fitted:
-        assert abs(found.by_switches[row.switches].cost - row.cost) < 1e-3 * row.cost
-    assert found.by_switches[2] is found.best
-    assert found.by_switches[1] is found.by_switches[1]
 
 
 def test_alternatives_have_weights_that_sum_to_one(found):
@@ -137,12 +123,8 @@ def test_mode_probabilities_are_those_of_the_alternatives(found):
 
 
 def test_criteria_are_those_computed_by_hand(found):
-    n, rows = 162, {row.switches: row for row in found.fitted}
-    for N, row in rows.items():
-        k = 1 + N
-        assert abs(row.bic - (2 * row.cost + k * np.log(n))) < 1e-5 * row.cost
-        assert abs(row.mbic - (2 * row.cost + (1 + 2 * N) * np.log(n))) < 1e-5 * row.cost
-        assert abs(row.aicc - (2 * row.cost + 2 * k + 2 * k * (k + 1) / (n - k - 1))) < 1e-5 * row.cost
+    for row in found.fitted:
+        assert abs(row.bic - (2 * row.cost + (1 + row.switches) * np.log(162))) < 1e-5 * row.cost
 
 
 @pytest.mark.parametrize(
@@ -183,39 +165,19 @@ def test_another_sequence_and_another_log_compile_nothing():
 
 
 @pytest.mark.slow
-def test_without_machine_code_the_sequence_is_found_without_the_beam():
-    """Derivatives are matched where the whole state is measured, else all short sequences are simulated."""
-
+def test_without_machine_code_the_sequence_is_found_by_insertion():
     def spin(t, x, p):
         rates = jnp.linalg.eigvalsh(jnp.array([[0.0, 1.0], [1.0, 0.0]]) * p["rate"])
         return rates[1] * jnp.stack([-x[1], x[0]])
 
-    system = sf.HybridSystem({"rise": rise, "turn": spin, "fall": fall}, [0.2, 1.0])
-    run = make_run()
-    alone = replace(run, data=sf.Measurements(TIMES, run.data[0].values[:, :1], lambda t, x, p: x[:1], sigma=SIGMA))
-    for given, used in ((run, "matching"), (alone, "exhaustive")):
-        seen = []
-        found = sf.find_modes(sf.Problem(system, given, FREE), max_switches=3, callback=seen.append)
-        assert found.status is sf.ModeStatus.FOUND
-        assert found.mode_sequence == SEQUENCE
-        np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.1)
-        assert {"matching", "exhaustive"} & {each.stage for each in seen} == {used}
-        assert "mode 'turn' calls jnp.linalg.eigvalsh" in str(found.best.engine)
-
-
-def test_costs_of_schedules_are_those_of_their_problems():
-    resets = {("rise", "fall"): lambda t, x, p: x * jnp.stack([1.0 + 0.0 * t, p["rate"]])}
-    system = replace(SYSTEM, reset_maps=resets)
-    problem = sf.Problem(system, make_run(), FREE)
-    library = build_library(problem, max_switches=3)
-    fitter = Fitter(problem, library)
-    for sequence in (("rise",), ("rise", "fall"), ("fall", "rise", "fall"), ("turn", "rise", "turn", "fall")):
-        schedule = space_evenly(sequence, 0.0, 8.0, library)
-        run = replace(make_run(), mode_sequence=sequence, transition_times=tuple(schedule.times))
-        whole = sf.Problem(system, run, FREE)
-        cost = sf.evaluate(whole).cost
-        assert abs(fitter.costs([schedule], fitter.start) - cost) < 1e-5 * cost
-        assert abs(fitter.costs._evaluate([schedule], fitter.start) - cost) < 1e-5 * cost
+    stages, system = [], sf.HybridSystem({"rise": rise, "turn": spin, "fall": fall}, [0.2, 1.0])
+    found = sf.find_modes(make_problem(system=system), max_switches=3, callback=lambda now: stages.append(now.stage))
+    assert found.status is sf.ModeStatus.FOUND
+    assert found.mode_sequence == SEQUENCE
+    np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.1)
+    assert "insertion" in stages
+    assert "beam" not in stages
+    assert "mode 'turn' calls jnp.linalg.eigvalsh" in str(found.best.engine)
 
 
 # --- how a search ends ------------------------------------------------------------------------------------------------
@@ -226,7 +188,8 @@ def test_as_many_switches_as_allowed_are_said_to_be_so(found):
     assert limited.status is sf.ModeStatus.AT_LIMIT
     assert limited.mode_sequence == found.mode_sequence
     assert "Raise max_switches" in limited.message
-    enough = sf.find_modes(make_problem(), successions={"rise": "turn", "turn": "fall"}, max_switches=2)
+    chain = {"rise": "turn", "turn": "fall"}
+    enough = sf.find_modes(make_problem(), first="rise", last="fall", successions=chain, max_switches=2)
     assert enough.status is sf.ModeStatus.FOUND  # no sequence has more
 
 
@@ -243,7 +206,6 @@ def test_a_missing_mode_is_not_explained():
     assert missing.status is sf.ModeStatus.NOT_EXPLAINED
     assert missing.ending.reason == "chi-square"
     assert missing.ending.probability < 1e-6
-    assert "A mode may be missing" in missing.message
     assert 2 * missing.best.cost > 4.0 * 162, "so far off that nothing says what the values are worth"
     assert missing.chosen[0].switches > 0
     assert {"discounted", "outliers"}.isdisjoint(warning.kind for warning in missing.warnings)
@@ -265,7 +227,8 @@ def test_a_fit_that_does_not_converge_is_said_to_be_so(monkeypatch):
 def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
     values = simulate(("rise", "fall"), (3.0,), system=system)
-    problem = make_problem(system=system, parameters=FREE | {"force": 4.0}, values=values)
+    force = sf.Parameter(4.0, prior=sf.Normal(4.5, 0.5))  # which would move it to its mean
+    problem = make_problem(system=system, parameters=FREE | {"force": force}, values=values)
     found = sf.find_modes(problem, max_switches=3)
     assert found.mode_sequence == ("rise", "fall")
     assert found.status is sf.ModeStatus.FOUND
@@ -276,25 +239,6 @@ def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     assert found.parameters["force"] == 4.0
     row = found.chosen[0]
     assert abs(row.bic - (2 * row.cost + 2 * np.log(162))) < 1e-4  # force does not count
-
-
-def test_entries_of_an_array_for_modes_that_do_not_occur_are_a_note():
-    def decay(k):
-        return lambda t, x, p: -p["rate"][k] * x
-
-    system = sf.HybridSystem({"rise": rise_alone, **{f"decay {k}": decay(k) for k in range(4)}}, [0.2])
-    values = np.where(
-        TIMES < 3.0, 1.0 - 0.8 * np.exp(-TIMES), (1.0 - 0.8 * np.exp(-3.0)) * np.exp(-0.5 * (TIMES - 3.0))
-    )
-    values = values + SIGMA * np.random.default_rng(0).standard_normal(len(TIMES))
-    chain = {"rise": "decay 0", "decay 0": "decay 1", "decay 1": "decay 2", "decay 2": "decay 3"}
-    problem = make_problem(system=system, parameters={"rate": [0.4, 0.3, 0.2, 0.1]}, values=values)
-    found = sf.find_modes(problem, first="rise", successions=chain)
-    assert found.mode_sequence == ("rise", "decay 0")
-    assert found.status is sf.ModeStatus.FOUND
-    assert "rate[1], rate[2], rate[3] act in modes that do not occur: they keep their guesses" in str(found).replace(
-        "\n  ", " "
-    )
 
 
 def test_a_parameter_that_no_mode_of_the_library_reads_is_unidentified():
@@ -320,7 +264,6 @@ def test_an_interrupted_search_returns_the_best_so_far(how):
     assert not found.success
     assert found.mode_sequences == seen[-1].sequences
     assert found.best.cost < seen[-1].cost * (1 + 1e-4)
-    assert "best so far" in found.message
     with pytest.raises(KeyboardInterrupt):
         sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: True)
 
@@ -340,13 +283,10 @@ def test_modes_that_make_up_for_correlated_noise_do_not_win(sigma):
     assert note.switches == 2
     assert note.samples < 60
     assert "2 switches by the discounted mBIC" in str(note)
-    assert "mBIC discounted" in str(found)
     corrected, naive = found.best.corrected_standard_errors, found.best.standard_errors
     assert np.all(corrected > 1.5 * naive)
+    assert format_rounded(found.best.theta[0], corrected[0])[1] in str(found)
     assert "Standard errors allow for the correlation of the residuals." in str(found)
-    for k, value in enumerate(found.best.theta):
-        assert format_rounded(value, corrected[k])[1] in str(found)
-        assert format_rounded(value, naive[k])[1] not in str(found)
 
 
 def test_a_discounted_score_counts_values_as_what_they_are_worth():
@@ -365,12 +305,9 @@ def test_no_sequence_at_all_is_said_to_be_so():
     assert found.status is sf.ModeStatus.NO_SUCCESSION
     assert found.best is None
     assert "at most 1 switch" in found.message
-    assert repr(found) == "ModeSearch(NO_SUCCESSION)"
     assert str(found).startswith("No succession")
     with pytest.raises(ValueError, match="no mode sequence was found"):
         _ = found.mode_sequence
-    longer = sf.find_modes(make_problem(), first="rise", last="fall", successions=chain, max_switches=2)
-    assert longer.mode_sequence == SEQUENCE
 
 
 def test_a_mode_of_few_samples_is_warned_of():
@@ -381,21 +318,9 @@ def test_a_mode_of_few_samples_is_warned_of():
     assert warning.mode == "turn"
     assert warning.samples < 5
     assert "it may make up for an error of the model" in str(warning)
-    assert str(warning)[:40] in str(found)
 
 
 # --- structure, several runs, costs -----------------------------------------------------------------------------------
-
-
-def test_successions_and_durations_are_kept():
-    chain = {"fall": "rise", "rise": ("turn", "fall")}
-    found = sf.find_modes(make_problem(), successions=chain, min_duration={"turn": 4.0}, max_switches=3)
-    for row in (*found.fitted, *found.chosen):
-        for a, b in zip(row.sequences[0], row.sequences[0][1:], strict=False):
-            assert b in chain.get(a, ())
-        knots = np.concatenate([[0.0], row.transition_times[0], [8.0]])
-        for mode, length in zip(row.sequences[0], np.diff(knots), strict=True):
-            assert mode != "turn" or length >= 4.0 - 1e-9
 
 
 def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
@@ -403,7 +328,6 @@ def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
     assert found.mode_sequence == SEQUENCE
     first, second = found.transition_times[0]
     assert abs(second - first - 3.5) < 1e-9
-    assert [issue.mode for issue in found.best.active] == ["turn"]
     assert found.best.problem.min_duration == {"rise": 0.0, "fall": 0.0, "turn": 3.5}
 
 
@@ -414,7 +338,6 @@ def test_a_log_that_begins_in_the_middle_of_a_mode():
     bound = sf.find_modes(problem, first="rise", max_switches=2, successions={"rise": "turn", "turn": "fall"})
     assert abs(bound.transition_times[0][0] - 2.0) < 1e-6
     [warning] = kinds_of(bound.warnings, "cut off")
-    assert (warning.mode, warning.begin) == ("rise", 0.0)
     assert str(warning).startswith("rise from 0 to 2 s is as short as its min_duration allows")
     free = sf.find_modes(problem, max_switches=2, min_duration={"rise": 0.0})
     assert free.mode_sequence == SEQUENCE
@@ -484,16 +407,11 @@ def test_guarded_transitions_are_found_on_their_guards():
 
     guards = {("fill", "drain"): lambda t, x, p: x[0] - p["high"], ("drain", "fill"): lambda t, x, p: x[0] - 0.4}
     system = sf.HybridSystem({"fill": fill, "drain": drain}, [0.2], guards=guards)
-    times, step = np.linspace(0.0, 8.0, 81), 1e-3
-    level, filling, levels, switches = 0.2, True, [], []
-    for k in range(8001):
-        if k % 100 == 0:
-            levels.append(level)
-        level += step * (1.0 * filling - 0.5 * level)
-        if level >= 1.0 if filling else level <= 0.4:
-            filling = not filling
-            switches.append(k * step)
-    values = np.array(levels) + 0.02 * np.random.default_rng(0).standard_normal(81)
+    switches = np.cumsum(2 * np.log([1.8, 2.5, 1.6, 2.5, 1.6]))  # from 0.2 to 1, to 0.4, to 1 and so on
+    cost, times = sf.RunningCost(lambda t, x, p: x[0]), np.linspace(0.0, 8.0, 81)
+    truth = sf.Experiment(cost, ("fill", "drain") * 3, tuple(switches), 0.0, 8.0)
+    values = sf.simulate(sf.Problem(system, truth, {"inflow": 1.0, "high": 1.0}), times=times).states[:, 0]
+    values = values + 0.02 * np.random.default_rng(0).standard_normal(81)
     run = sf.Experiment(sf.Measurements(times, values, sigma=0.02), ("fill",), (), 0.0, 8.0)
     problem = sf.Problem(system, run, {"inflow": 1.1, "high": sf.Parameter(0.9, lower=0.5, upper=1.5)})
     found = sf.find_modes(problem, max_switches=7)
@@ -504,14 +422,9 @@ def test_guarded_transitions_are_found_on_their_guards():
     assert abs(row.bic - (2 * row.cost + 2 * np.log(81))) < 1e-3  # their times do not count
 
 
-@pytest.fixture(scope="module")
-def joint():
+def test_several_runs_have_sequences_of_their_own_and_share_parameters():
     runs = [make_run(name="one"), make_run(("fall", "rise"), (4.0,), seed=1, name="two")]
-    return sf.Problem(SYSTEM, runs, FREE)
-
-
-def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
-    found = sf.find_modes(joint, max_switches=3)
+    found = sf.find_modes(sf.Problem(SYSTEM, runs, FREE), max_switches=3)
     assert found.mode_sequences == (SEQUENCE, ("fall", "rise"))
     assert found.status is sf.ModeStatus.FOUND
     assert list(found.best.parameters) == ["rate"]
@@ -519,27 +432,8 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
     assert found.mode_probability([2.0], experiment=1).argmax() == found.modes.index("fall")
     with pytest.raises(ValueError, match="there are 2 experiments"):
         _ = found.mode_sequence
-    text = str(found)
-    assert "one:" in text
-    assert "two:" in text
-    [best] = [line for line in text.splitlines() if line.lstrip().startswith("*")]
-    assert best.endswith("the same")
-    shorter = next(row for row in found.fitted if row.switches == 2)
-    [index] = [e for e in range(2) if shorter.sequences[e] != found.mode_sequences[e]]
-    assert f"{found.run_names[index]}: {' -> '.join(shorter.sequences[index])}" in text
-
-
-def test_what_acts_in_no_mode_is_held():
-    system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
-    force = sf.Parameter(4.0, prior=sf.Normal(4.0, 0.5))  # which would move it to its mean
-    problem = sf.Problem(system, make_run(), FREE | {"force": force})
-    library = build_library(problem, max_switches=3)
-    fitter = Fitter(problem, library)
-    assert fitter.find_acting([("rise", "fall")]).tolist() == [True, False]
-    assert fitter.find_acting([("rise", "pull")]).tolist() == [True, True]
-    fitted = fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], np.array([0.9, 3.21]))
-    assert fitted.parameters[1] == 3.21
-    assert np.isfinite(fitted.cost)
+    assert "one:" in str(found)
+    assert "two:" in str(found)
 
 
 def test_a_criterion_of_ones_own():
@@ -550,16 +444,15 @@ def test_a_criterion_of_ones_own():
 
 def test_a_running_cost_has_a_cost_of_switches():
     cost = sf.RunningCost(lambda t, x, p: (x[0] - 0.5) ** 2)
-    problem = sf.Problem(SYSTEM, sf.Experiment(cost, ("fall",), (), 0.0, 4.0), {"rate": 1.0}, max_transitions=6)
-    problem = replace(problem, parameters={"rate": sf.Parameter(1.0, fixed=True)})
+    run, rate = sf.Experiment(cost, ("fall",), (), 0.0, 4.0), sf.Parameter(1.0, fixed=True)
+    problem = sf.Problem(SYSTEM, run, {"rate": rate}, max_transitions=6)
     dear = sf.find_modes(problem, switch_cost=10.0, max_switches=4)
     cheap = sf.find_modes(problem, switch_cost=1e-3, max_switches=4)
     assert dear.chosen[0].switches == 0
     assert cheap.chosen[0].switches > 0
     assert cheap.criterion == "cost"
-    for row in cheap.fitted:
-        if np.isfinite(row.criterion):
-            assert abs(row.criterion - (row.cost + 1e-3 * row.switches)) < 1e-6
+    row = cheap.chosen[0]
+    assert abs(row.criterion - (row.cost + 1e-3 * row.switches)) < 1e-6
     assert "J + cost of switches" in str(cheap)
     assert len(cheap.plot().axes) == 3
 
@@ -577,8 +470,7 @@ def test_starts_are_the_guess_and_a_little_beside_it():
 def test_parameters_far_off_are_found_from_other_starts():
     far = replace(make_problem(), parameters={"rate": sf.Parameter(2.2, lower=0.1, upper=3.0)})
     assert sf.find_modes(far, max_switches=3).mode_sequence == SEQUENCE
-    given = sf.find_modes(far, max_switches=3, starts=[[1.1]])
-    assert given.mode_sequence == SEQUENCE
+    assert sf.find_modes(far, max_switches=3, starts=[[1.1]]).mode_sequence == SEQUENCE
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -667,12 +559,10 @@ def test_a_search_is_saved_and_loaded(found, tmp_path):
     found.save(path)
     loaded = sf.ModeSearch.load(path)
     assert str(loaded) == str(found)
-    assert repr(loaded) == repr(found)
     assert loaded.ending == found.ending
     assert loaded.warnings == found.warnings
     t = np.linspace(0.0, 8.0, 33)
     np.testing.assert_array_equal(loaded.mode_probability(t), found.mode_probability(t))
-    assert loaded.best.cost == found.best.cost
     with pytest.raises(ValueError, match="was loaded without its model"):
         loaded.by_switches[0]
     whole = sf.ModeSearch.load(path, problem=make_problem())
@@ -702,31 +592,15 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
             sf.ModeSearch.load(path)
 
 
-def test_the_report_has_the_sequence_the_table_and_the_alternatives(found):
+def test_the_report_and_the_figure_have_the_sequence_and_the_criteria(found):
     text = str(found)
     assert text.startswith("Found: rise -> turn -> fall.")
-    for part in ("switches", "BIC", "mBIC", "AICc", "rise -> turn -> fall", "weight", "evaluations", "rate"):
-        assert part in text
     [line] = [line for line in text.splitlines() if line.lstrip().startswith("*")]
     assert line.split()[1] == "2"
     assert repr(found).startswith("ModeSearch(FOUND, rise -> turn -> fall, J = ")
-
-
-def test_the_figure_has_criteria_fit_and_probabilities(found):
-    numbers, best, probabilities = found.plot().axes
-    assert numbers.get_xlabel() == "number of switches"
+    numbers, _, probabilities = found.plot().axes
     assert [line.get_label() for line in numbers.lines[:3]] == ["BIC", "mBIC", "AICc"]
-    assert best.get_ylabel() == "x"
-    assert probabilities.get_ylabel() == "probability"
     assert [text.get_text() for text in probabilities.get_legend().get_texts()] == ["rise", "fall", "turn"]
-
-
-def test_no_mode_of_a_long_sequence_is_left_out_of_the_table():
-    names = [f"mode {k}" for k in range(30)]
-    lines = wrap_sequence(names)
-    assert len(lines) > 3
-    assert max(map(len, lines)) <= 62
-    assert "".join(lines).replace("  -> ", " -> ").split(" -> ") == names
 
 
 # --- statistics -------------------------------------------------------------------------------------------------------
@@ -772,11 +646,7 @@ def test_modes_that_can_take_each_other_s_place_are_said_to_do_so():
     rates = {name: sf.Parameter(0.05, lower=0.0) for name in ("k_a", "k_b")}
     found = sf.find_modes(sf.Problem(system, run, rates), max_switches=2)
     assert found.status is sf.ModeStatus.AMBIGUOUS
-    text = " ".join(str(found).split())
-    assert "a -> b, and b -> a, which is the same with other values of the parameters" in text or (
-        "b -> a, and a -> b, which is the same with other values of the parameters" in text
-    )
-    assert "Longer data" not in text
+    assert "which is the same with other values of the parameters" in " ".join(str(found).split())
     named = sf.find_modes(sf.Problem(system, run, rates), max_switches=2, first=["a"])
     assert named.status is sf.ModeStatus.FOUND
     assert named.mode_sequence == ("a", "b")
@@ -837,9 +707,6 @@ def test_a_mode_that_leaves_no_trace_is_a_warning():
     assert (untraced.mode, untraced.end) in (("fill", 20.0), ("closed", 20.0))
     assert 9.0 < untraced.begin < 11.0
     assert f"{untraced.mode} from" in str(untraced)
-    alone = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed"))
-    assert alone.status is sf.ModeStatus.FOUND
-    assert not kinds_of(alone.warnings, "no trace")
 
 
 def test_all_neighbours_of_what_is_found_are_fitted():
@@ -863,7 +730,6 @@ def test_outliers_are_told_from_modes():
     assert found.mode_sequence == SEQUENCE
     [warning] = kinds_of(found.warnings, "outliers")
     assert warning.samples == off.sum()
-    assert f"{off.sum()} samples are outliers" in str(found)
     assert found.best.problem.experiments[0].data[0].loss == "huber"
 
 
@@ -875,5 +741,4 @@ def test_a_wrong_sigma_is_told_from_modes(factor):
     assert found.ending.reason == "sigma"
     assert found.mode_sequence == SEQUENCE
     assert abs(found.ending.ratio * factor - 1.0) < 0.15
-    assert f"unless sigma is {found.ending.ratio:.2g} times as large as given" in found.message
     assert abs(found.best.residual_variance - 1.0) < 0.25

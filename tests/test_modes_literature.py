@@ -104,16 +104,6 @@ def test_the_order_of_the_heaters_is_found_one_heater_at_a_time(heaters):
 
 
 @pytest.mark.slow
-def test_the_order_of_the_heaters_is_the_best_if_settings_last(heaters):
-    order, known, modes = heaters
-    after = {mode: [m for m in after if m != "0/0"] for mode, after in order["one_at_a_time"]().items()}
-    search = order["search"](first="0/0", successions=after, min_duration=dict.fromkeys(modes[1:], order["DURATION"]))
-    assert search.mode_sequence == modes
-    np.testing.assert_allclose(search.best.cost, known.cost, rtol=1e-6)
-    assert search.status is sf.ModeStatus.NOT_EXPLAINED
-
-
-@pytest.mark.slow
 def test_the_free_library_of_the_heaters_is_never_called_found(heaters):
     """Settings with powers of their own are interchangeable: at best J is right, and the names are not."""
     order, known, _ = heaters

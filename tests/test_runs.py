@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from models import decay
 
 import switchfit as sf
 from switchfit.batch.program import Inputs, Layout
@@ -93,15 +92,6 @@ def test_one_experiment_needs_no_prefix_and_states_need_no_names():
     assert sf.Problem(system, one).theta_names == ("x2(t0)",)
     both = sf.Problem(system, [one, one])
     assert both.theta_names == ("run1.x2(t0)", "run2.x2(t0)")  # those of the system too are each run's own
-    np.testing.assert_allclose(sf.simulate(both, [5.0, 7.0], experiment=1).states[0], [1.0, 7.0, 3.0])
-
-
-def test_a_parameter_of_n_numbers_is_an_initial_state():
-    start = sf.Parameter([1.0, 2.0], lower=[0.0, 1.0], upper=9.0, unit="m")
-    problem = sf.Problem(SWING, run(initial_state=start), GUESS)
-    assert problem.theta_names[-2:] == ("q(t0)", "v(t0)")
-    np.testing.assert_array_equal(problem.unknowns.lower[-2:], [0.0, 1.0])
-    assert problem.unknowns.units[-2:] == ("m", "m")
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -135,20 +125,6 @@ def test_a_run_is_differentiated_in_what_its_functions_ask_for():
     assert sf.evaluate(unused).gradient[-1] == 0.0
 
 
-def test_a_target_is_there_under_its_own_name_too_if_asked_for():
-    system = sf.HybridSystem({"m": decay}, [1.0])
-    cost = sf.TerminalCost(lambda x, p: x[0])
-    plain = sf.Experiment(cost, ("m",), (), 0.0, 1.0)
-    doubled = sf.HybridSystem({"m": decay, "n": lambda t, x, p: -p["k1"] * p["k2"] * x}, [1.0])
-    mapped = sf.Experiment(cost, ("n",), (), 0.0, 1.0, parameter_map={"k1": "k", "k2": "k"})
-    both = sf.Problem(doubled, [plain, mapped], {"k": 0.5})
-    assert names_of(both, 0) == ["k"]
-    expected = np.exp(-0.5) + np.exp(-0.25)
-    assert sf.evaluate(both).cost == pytest.approx(expected, rel=1e-8)
-    np.testing.assert_allclose(sf.evaluate(both).gradient, [-np.exp(-0.5) - np.exp(-0.25)], rtol=1e-7)
-    assert sf.Problem(system, plain, {"k": 0.5}).theta_names == ("k",)
-
-
 @pytest.mark.parametrize(
     "whole", [lambda p: sum(p.values()), lambda p: jax.jit(lambda q: q["a"] + q["b"])(p), lambda p: {**p}["a"] + p["b"]]
 )
@@ -167,53 +143,33 @@ def test_a_function_that_takes_p_as_a_whole_sees_what_is_its_own(whole):
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
+def pose(*runs, **guess):
+    return sf.Problem(SWING, list(runs), guess or GUESS)
+
+
 THREE = [sf.Parameter(1.0), 2.0, 3.0]
+UNEQUAL = {"k": [0.8, 0.5], "k_2": [0.7, 0.6]}
+WRONG = {
+    "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'": lambda: pose(
+        run(), run(parameter_map={"k": "k_3"})
+    ),
+    "the parameter 'b', which the problem lacks; it has k": lambda: pose(run(parameter_map={"k": "k_2"}), **UNEQUAL),
+    "mode 'swing': .* raised IndexError": lambda: pose(run(parameter_map={"k": "b"})),
+    "must be a number or an sf.Parameter; got 'v'": lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
+    r"got an entry of shape \(2,\)": lambda: run(initial_state=[sf.Parameter([1.0, 2.0]), 0.0]),
+    r"must have shape \(n,\), one entry for each": lambda: sf.HybridSystem({"swing": swing}, sf.Parameter(1.0)),
+    "experiment 2 must have 2 entries, as the system's": lambda: pose(run(), run(initial_state=THREE)),
+    "one entry for each of the 3 states": lambda: sf.HybridSystem({"swing": swing}, THREE, state_names=("q", "v")),
+    r"share a name: q\(t0\)": lambda: pose(run(initial_state=[UNKNOWN[0], 0.9]), **GUESS | {"q(t0)": 1.0}),
+    "must be a dict of the model's name": lambda: run(parameter_map=["k"]),
+    "parameter_map must be a dict": lambda: run(parameter_map={"k": 1}),
+}
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (
-            lambda: sf.Problem(SWING, [run(), run(parameter_map={"k": "k_3"})], GUESS),
-            "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'; the problem has",
-        ),
-        (
-            lambda: sf.Problem(SWING, run(parameter_map={"k": "k_2"}), {"k": [0.8, 0.5], "k_2": [0.7, 0.6]}),
-            "reads the parameter 'b', which the problem lacks; it has k",
-        ),
-        (lambda: sf.Problem(SWING, run(parameter_map={"k": "b"}), GUESS), "mode 'swing': .* raised IndexError"),
-        (
-            lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
-            "each entry of initial_state must be a number or an sf.Parameter; got 'v'",
-        ),
-        (
-            lambda: run(initial_state=[sf.Parameter([1.0, 2.0]), 0.0]),
-            r"one sf.Parameter of one number for each state; got an entry of shape \(2,\)",
-        ),
-        (lambda: sf.HybridSystem({"swing": swing}, sf.Parameter(1.0)), r"must have shape \(n,\), one entry for each"),
-        (
-            lambda: sf.Problem(SWING, [run(), run(initial_state=THREE)], GUESS),
-            "initial_state of experiment 2 must have 2 entries, as the system's has; got 3",
-        ),
-        (
-            lambda: sf.HybridSystem({"swing": swing}, THREE, state_names=("q", "v")),
-            "state_names must have one entry for each of the 3 states",
-        ),
-        (
-            lambda: sf.Problem(SWING, run(initial_state=[UNKNOWN[0], 0.9]), GUESS | {"q(t0)": 1.0}),
-            r"Two unknowns share a name: q\(t0\)",
-        ),
-    ],
-)
-def test_what_is_wrong_is_said(build, message):
-    with pytest.raises(ValueError, match=message):
-        build()
-
-
-@pytest.mark.parametrize("given", [["k"], {"k": 1}])
-def test_a_map_that_is_none(given):
-    with pytest.raises(TypeError, match="parameter_map must be a dict of the model's name -> the problem's name"):
-        run(parameter_map=given)
+@pytest.mark.parametrize("message", WRONG)
+def test_what_is_wrong_is_said(message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        WRONG[message]()
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
@@ -230,10 +186,6 @@ def rise(t, x, p):
     return p["r"] * jnp.ones(1)
 
 
-def height(t, x, p):
-    return x
-
-
 TANK = sf.HybridSystem({"fall": fall, "rise": rise}, [0.0], state_names=("h",), state_units=("m",))
 
 
@@ -248,7 +200,7 @@ def tank(e, samples=25, sigma=0.02, seed=0, names=None, **given):
     times = np.linspace(0.0, 4.0, samples)
     x0, r, tau = 2.0 + e, GROWTH[e % 2], 1.93 + 0.2 * (e % 3)
     values = level(times, tau, x0, r) + sigma * np.random.default_rng([seed, e]).normal(size=samples)
-    data = sf.Measurements(times, values, observe=height, sigma=sigma)
+    data = sf.Measurements(times, values, sigma=sigma)
     own = {"r": f"r_{e}"} if names is None else names
     start = [sf.Parameter(1.5 + e, lower=0.0, upper=20.0)]
     return sf.Experiment(
@@ -357,40 +309,24 @@ def test_common_lengths():
 FILE = """
 model = "tank.py:tank"
 [parameters]
-k = 1.0
 c = 0.2
-r_0 = { value = 0.5, lower = 0.0 }
-r_1 = 0.5
 [[experiments]]
-name = "first"
-mode_sequence = ["fall", "rise"]
-transition_times = [2.0]
-initial_state = [{ value = 1.5, lower = 0.0, upper = 9.0, unit = "cm" }, 0.5]
-parameter_map = { r = "r_0" }
-data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
-[[experiments]]
-mode_sequence = ["fall", "rise"]
-transition_times = [2.0]
-initial_state = [2.5, { value = 3.5, fixed = true }]
-parameter_map = { r = "r_1" }
+mode_sequence = ["fall"]
+transition_times = []
+tf = { value = 3.0, lower = 2.0, upper = 9.0, prior = { mean = 3.5, sd = 0.5 } }
+initial_state = [{ value = 1.5, lower = 0.0, upper = 9.0, unit = "cm" }, { value = 3.5, fixed = true }]
+parameter_map = { r = "c" }
 data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
 """
-
 MODEL = """
-import jax.numpy as jnp
 import switchfit as sf
-tank = sf.HybridSystem(
-    {"fall": lambda t, x, p: p["c"] - p["k"] * x, "rise": lambda t, x, p: p["r"] * jnp.ones(2)},
-    [0.0, 0.0], state_names=("h", "g"),
-)
+tank = sf.HybridSystem({"fall": lambda t, x, p: -p["r"] * x}, [0.0, 0.0], state_names=("h", "g"))
 """
 
 
 @pytest.fixture
 def folder(tmp_path):
-    times = np.linspace(0.0, 4.0, 25)
-    rows = [f"{t},{h}" for t, h in zip(times, level(times, 1.93, 2.0, 0.7), strict=True)]
-    (tmp_path / "log.csv").write_text("\n".join(["t,h", *rows]))
+    (tmp_path / "log.csv").write_text("t,h\n0.0,1.0\n1.0,0.9\n2.0,0.7\n")
     (tmp_path / "tank.py").write_text(MODEL)
     (tmp_path / "p.toml").write_text(FILE)
     return tmp_path
@@ -398,24 +334,21 @@ def folder(tmp_path):
 
 def test_problem_files_say_it_too(folder):
     problem = load_problem(folder / "p.toml").problem
-    assert problem.theta_names == ("first.tau_1", "run2.tau_1", "k", "c", "r_0", "r_1", "first.h(t0)")
+    tf = problem.experiments[0].tf
+    assert (float(tf.value), float(tf.lower), float(tf.upper), tf.prior.mean, tf.prior.sd) == (3.0, 2.0, 9.0, 3.5, 0.5)
+    assert problem.theta_names == ("tf", "c", "h(t0)")
     assert problem.unknowns.units[-1] == "cm"
     assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1], problem.initial_theta[-1]) == (0.0, 9.0, 1.5)
-    assert problem.experiments[1].parameter_map == {"r": "r_1"}
-    np.testing.assert_array_equal(problem.experiments[1].initial_state, [2.5, 3.5])
-    assert sf.simulate(problem).states[0].tolist() == [1.5, 0.5]
+    assert problem.experiments[0].parameter_map == {"r": "c"}
+    assert sf.simulate(problem).states[0].tolist() == [1.5, 3.5]
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "lower = 0.0, upper = 9.0",
-            "lowr = 0.0",
-            r"'experiments\[1\]\.initial_state\[1\]\.lowr'; did you mean 'lower'",
-        ),
-        ('{ r = "r_0" }', "{ r = 1 }", r"'experiments\[1\]\.parameter_map.*' must be a string; got 1"),
-        ("[2.5, {", '["x", {', r"'experiments\[2\]\.initial_state\[1\]\.value' must be a number; got 'x'"),
+        ("lower = 0.0, upper", "lowr = 0.0, upper", r"initial_state\[1\]\.lowr'; did you mean 'lower'"),
+        ('{ r = "c" }', "{ r = 1 }", r"'experiments\[1\]\.parameter_map.*' must be a string; got 1"),
+        ("[{ value = 1.5", '["x", { value = 1.5', r"'experiments\[1\]\.initial_state\[1\]\.value' must be a number"),
     ],
 )
 def test_problem_files_that_are_wrong(folder, old, new, message):
@@ -519,17 +452,6 @@ def test_a_run_takes_the_entries_that_it_reads(engine):
         np.testing.assert_allclose(*states, rtol=1e-12)
 
 
-def test_other_sequences_and_fewer_runs_read_other_entries():
-    sequences = [("fall", "rise"), ("fall",), ("rise",)]
-    few = arrays(lambda q: q).with_sequences(sequences, [(2.0,), (), ()])
-    whole = arrays(lambda q: 1.0 * q).with_sequences(sequences, [(2.0,), (), ()])
-    assert [structure.M for structure in few.structures] == [7, 6, 5]
-    one, other = map(sf.evaluate, (few, whole))
-    np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-12, atol=1e-12 * np.abs(other.hessian).max())
-    one, other = (sf.evaluate(problem.without_runs("run1", "run2")) for problem in (few, whole))
-    np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-12, atol=1e-12 * np.abs(other.hessian).max())
-
-
 def test_beams_fits_and_tables_of_runs_that_read_entries():
     few, whole = arrays(lambda q: q), arrays(lambda q: 1.0 * q)
     q = few.initial_theta[3:]
@@ -538,6 +460,9 @@ def test_beams_fits_and_tables_of_runs_that_read_entries():
         np.testing.assert_allclose(one.transition_times[0], other.transition_times[0], rtol=1e-6)
         own = few.places[e][1:] - 3  # a beam that has no use for an entry leaves it where it is
         np.testing.assert_allclose(one.parameters[own], other.parameters[own], rtol=1e-6)
+    sequences, times = [("fall", "rise"), ("fall",), ("rise",)], [(2.0,), (), ()]
+    one, other = (sf.evaluate(each.with_sequences(sequences, times).without_runs("run1")) for each in (few, whole))
+    np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-12, atol=1e-12 * np.abs(other.hessian).max())
     one, other = (sf.estimate(problem, strategy="local") for problem in (few, whole))
     np.testing.assert_allclose(one.cost, other.cost, rtol=1e-9)
     np.testing.assert_allclose(one.standard_errors, other.standard_errors, rtol=1e-5)

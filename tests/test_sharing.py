@@ -66,7 +66,12 @@ def test_costs_of_many_moves_are_those_of_each(delay):
     for e in (0, 1):
         moved = [*list_insertions(here[e], library, 5), here[e]]
         assert {len(schedule.sequence) for schedule in moved} >= {1, 2, 3}
-        alone = [fitter.costs([*here[:e], schedule, *here[e + 1 :]], fitter.start) for schedule in moved]
+        alone = []
+        for schedule in moved:
+            both = [*here[:e], schedule, *here[e + 1 :]]
+            alone.append(fitter.costs(both, fitter.start))
+            own = Evaluator(fitter._build_problem(both), meshes=fitter.meshes)
+            assert alone[-1] == own.cost(np.concatenate([*(each.times for each in both), fitter.start]))
         np.testing.assert_allclose(fitter.costs.compute_all(here, e, moved, fitter.start), alone, rtol=1e-13)
         assert fitter.costs(here, fitter.start) == alone[-1]  # the experiment is as it was before
 

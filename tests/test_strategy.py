@@ -3,10 +3,9 @@
 from dataclasses import replace
 from itertools import pairwise
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay
+from models import decay, fishing, heated_room
 
 import switchfit as sf
 from benchmarks.sharp.problems import dry, valve
@@ -19,7 +18,7 @@ from switchfit.strategy.choice import Search, is_enough
 from switchfit.strategy.hops import can_reinsert, reinsert_modes
 from switchfit.strategy.starts import End, draw_starts, try_starts
 
-HEATER = sf.HybridSystem({"on": lambda t, x, p: p["power"] - p["k"] * x, "off": lambda t, x, p: -p["k"] * x}, [0.2])
+HEATER = heated_room()
 TRUTH = np.array([1.83, 3.4, 5.32, 6.7, 8.1, 1.0, 0.8])
 TIMES = np.linspace(0.25, 10.0, 40)
 
@@ -73,21 +72,8 @@ def test_what_each_step_brought_is_told(far_fit):
     text = " ".join(str(far_fit).split())
     assert f"tried local: J = {costs[0]:.6g}" in text
     assert f"{choice.BEAM}: J = {far_fit.cost:.6g}" in text
-    problem = thermostat(FAR)
-    guess = sf.evaluate(problem).cost
-    assert far_fit.initial_cost == pytest.approx(guess, rel=1e-6)
-    assert f"cost J {far_fit.cost:.8g} (first guess: {far_fit.initial_cost:.8g})" in text
-    assert f"{far_fit.evaluations} evaluations" in text
+    assert far_fit.initial_cost == pytest.approx(sf.evaluate(thermostat(FAR)).cost, rel=1e-6)
     assert far_fit.seconds >= sum(step.seconds for step in far_fit.steps) > 0
-
-
-def test_where_the_model_is_doubted_one_search_that_agrees_is_enough(right):
-    """With sigma given too small nothing explains the data to the noise; more searches would not change that."""
-    fit = sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=0.01))
-    assert fit.verdict.level == "doubtful"
-    assert [step.strategy for step in fit.steps] == ["local", choice.BEAM]
-    assert fit.starts is None
-    assert fit.cost == pytest.approx(4 * right.cost, rel=1e-6)
 
 
 LOCAL, LOWER, SAME = Step("local", 40.0, 9, 0.1), Step("a search", 30.0, 9, 0.1), Step("a search", 40.0, 9, 0.1)
@@ -157,8 +143,6 @@ def test_a_good_fit_tries_nothing_else(right):
 
 def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, right):
     """It may have gone down into their error: its J would be lower than that of any honest end."""
-    from switchfit.strategy import choice
-
     stopped = replace(right, status=Status.MAX_ITERATIONS, integration_error=1e-3, cost=0.9 * right.cost)
     first = iter([stopped])
     real = choice.fit_locally
@@ -166,12 +150,6 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, 
     found = sf.estimate(thermostat(FAR))
     assert [(step.strategy, np.isfinite(step.cost)) for step in found.steps] == [("local", False), (choice.BEAM, True)]
     assert found.cost == pytest.approx(right.cost, rel=1e-9)
-
-
-def test_a_cost_whose_constraints_are_not_met_is_not_the_lowest(right):
-    violated = replace(right, violated=(("terminal constraint 1", 0.3),))
-    assert Search(thermostat(FAR), violated, right.theta, "auto", sf.estimate, 0.0).steps[0].cost == np.inf
-    assert Search(thermostat(FAR), right, right.theta, "auto", sf.estimate, 0.0).steps[0].cost == right.cost
 
 
 def test_transition_times_need_not_be_given(right):
@@ -183,8 +161,7 @@ def test_transition_times_need_not_be_given(right):
     assert found.cost == pytest.approx(right.cost, rel=1e-6)
     # Without a known noise it is not the residuals of the nearest minimum that decide.
     unknown = sf.estimate(thermostat(None, sigma=None))
-    assert choice.BEAM in [step.strategy for step in unknown.steps]
-    assert unknown.steps[0].strategy == "local, from evenly spaced times"
+    assert [step.strategy for step in unknown.steps][:2] == ["local, from evenly spaced times", choice.BEAM]
     np.testing.assert_allclose(unknown.theta, right.theta, rtol=1e-4)
 
 
@@ -214,21 +191,8 @@ def test_a_run_that_begins_badly_does_not_lead_the_others_astray():
     assert [step.strategy for step in found.steps] == ["local", choice.BEAM]
 
 
-def fishing(guess):
-    """Lotka-Volterra fishing with a bang-bang control of four switches."""
-
-    def field(w):
-        def f(t, x, p):
-            return jnp.stack([x[0] - x[0] * x[1] - 0.4 * w * x[0], -x[1] + x[0] * x[1] - 0.2 * w * x[1]])
-
-        return f
-
-    system = sf.HybridSystem({"rest": field(0.0), "fish": field(1.0)}, [0.5, 0.7])
-    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
-    return sf.Problem(system, sf.Experiment(cost, ("rest", "fish") * 2 + ("rest",), guess, 0.0, 12.0))
-
-
 def test_modes_are_removed_and_put_in_elsewhere():
+    """Of the fishing problem with a bang-bang control of four switches."""
     best = sf.estimate(fishing((2.4, 4.2, 4.6, 5.0)), strategy="local").cost
     problem = fishing((8.0, 9.0, 10.0, 11.0))
     alone = sf.estimate(problem, strategy="local")
@@ -260,7 +224,7 @@ def test_many_starts_stop_when_nothing_new_is_found(right):
     assert found.ended == "settled"
     assert found.count_agreeing(best, 1e-9) >= 2
     assert found.count_agreeing(0.5 * best, 1e-9) == 0  # another minimum
-    assert found.end.cost == pytest.approx(sf.estimate(problem, strategy="local").cost, rel=1e-6)
+    assert found.end.cost == pytest.approx(best, rel=1e-6)
     few = try_starts(problem, problem.initial_theta, is_enough=say_no_once())
     assert (len(few.costs), few.ended) == (1, "good")
 
@@ -280,13 +244,9 @@ def test_starts_of_unknowns_without_bounds_are_drawn_around_the_guess():
     run = sf.Experiment(sf.Measurements([1.0, 2.0], [0.5, 0.4]), ("on", "off"), (1.5,), 0.0, 2.0)
     parameters = {"power": sf.Parameter(2.0, lower=0.0), "k": -0.5}
     points = draw_starts(sf.Problem(HEATER, run, parameters), 64, seed=0)
-    assert points[:, 1].min() >= 0.2
-    assert points[:, 1].max() <= 20.0
-    assert points[:, 2].min() >= -5.5
-    assert points[:, 2].max() <= 4.5
+    assert np.all((points >= [0.0, 0.2, -5.5]) & (points <= [2.0, 20.0, 4.5]))
     assert np.ptp(np.log(points[:, 1])) > 3
     assert np.ptp(points[:, 2]) > 7
-    assert ((points[:, 0] > 0) & (points[:, 0] < 2)).all()
 
 
 def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
@@ -374,12 +334,6 @@ def test_ctrl_c_keeps_what_the_starts_have_found(monkeypatch, right):
     assert found.end.cost == pytest.approx(right.cost, rel=1e-6)
 
 
-@pytest.mark.usefixtures("quick_certificates")
-def test_steps_are_saved(tmp_path, far_fit):
-    far_fit.save(tmp_path / "fit.json")
-    assert sf.Estimate.load(tmp_path / "fit.json").steps == far_fit.steps
-
-
 def test_rows_beside_transitions_are_halved_too():
     """A transition in the second half of a cell leaves the row behind it as it is where cells are halved."""
     evaluator = Evaluator(thermostat(FAR))
@@ -397,34 +351,10 @@ def test_runs_are_set_aside_by_name():
     problem = two_runs()
     rest = problem.without_runs("room1")
     assert rest.theta_names == ("tau_1", "k", "power_0")
-    alone = sf.estimate(rest)
-    assert alone.verdict.level == "good"
     with pytest.raises(ValueError, match="there is no experiment 'room7'; there are room0, room1"):
         problem.without_runs("room7")
     with pytest.raises(ValueError, match="none is left"):
         problem.without_runs("room0", "room1")
-
-
-def test_constraints_are_met_from_afar():
-    """Rest to rest of a double integrator in least time: 2 sqrt(distance), with one switch half-way."""
-    system = sf.HybridSystem(
-        {
-            "forward": lambda t, x, p: jnp.stack([x[1], 1.0 + 0.0 * x[1]]),
-            "back": lambda t, x, p: jnp.stack([x[1], -1.0 + 0.0 * x[1]]),
-        },
-        [0.0, 0.0],
-    )
-    data = [
-        sf.RunningCost(lambda t, x, p: 1.0 + 0.0 * x[0]),
-        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] - 4.0, x[1]])),
-    ]
-    run = sf.Experiment(data, ("forward", "back"), (0.3,), 0.0, sf.Parameter(0.9, lower=0.5, upper=12.0))
-    problem = sf.Problem(system, run)
-    for strategy in ("local", "auto"):
-        found = sf.estimate(problem, strategy=strategy)
-        assert not found.violated
-        np.testing.assert_allclose(found.theta, [2.0, 4.0], rtol=1e-7)
-    assert sf.estimate(problem, strategy="local").evaluations < 30
 
 
 def test_a_fit_that_goes_on_is_no_search(monkeypatch):
