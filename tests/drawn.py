@@ -45,7 +45,7 @@ TESTS = {
     ],
     "cli": ["cli", "cli_modes", "cli_comparison", "cli_design", "online_cli", "init", "cli_pipe", "interrupt"],
     "discretization": ["mesh", "implicit", "random_systems", "stiffness", "protocol"],
-    "engine": ["corners", "mesh", "stiffness", "following", "protocol", "jax_engine"],
+    "engine": ["corners", "mesh", "stiffness", "following", "protocol", "native"],
     "engine/native": ["native", "protocol", "random_systems", "beam", "implicit", "operations"],
     "estimation": ["saved_problem", "estimate", "save", "mesh", "following", "bad_input"],
     "experiment_design": ["design"],

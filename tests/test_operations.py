@@ -14,25 +14,8 @@ from switchfit.engine.native import llvm
 from switchfit.engine.native.scalars import MAY_FAIL, OPERATIONS, Graph, Namespace
 from switchfit.problem.functions import use_float64
 
-SPECIAL = [
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    0.5,
-    -0.5,
-    2.5,
-    -2.5,
-    2e3,
-    -2e3,
-    1e-300,
-    1e300,
-    -1e300,
-    5e-324,
-    np.inf,
-    -np.inf,
-    np.nan,
-]
+SIZES = [0.0, 0.5, 1.0, 2.5, 2e3, 1e-300, 1e300, np.inf]
+SPECIAL = [*SIZES, *(-size for size in SIZES), 5e-324, np.nan]
 SIGN_OF_ZERO_LEFT_OPEN = ("max", "min")
 """Of 0.0 and -0.0 NumPy takes the first."""
 
