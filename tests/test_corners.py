@@ -316,18 +316,6 @@ def driven(t, x, p, u):
     return jnp.stack([x[1], u - p["d"] * x[1] - p["mu"] * 9.81 * jnp.sign(x[1])])
 
 
-def two_modes():
-    """A block is pushed, then held by friction in both modes: the second begins at its corner, and slides along it."""
-    modes = {
-        "weak": lambda t, x, p: jnp.stack([x[1], p["a"] * (2.0 * t) - 3.0 * jnp.sign(x[1])]),
-        "strong": lambda t, x, p: jnp.stack([x[1], p["a"] * (1.0 + t) - p["mu"] * jnp.sign(x[1]) * (1.0 + x[1] ** 2)]),
-    }
-    times = np.linspace(0.0, 3.0, 31)[1:]
-    data = sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1], sigma=1.0)
-    run = sf.Experiment(data, ("weak", "strong"), (0.83,), 0.0, 3.0)
-    return sf.Problem(sf.HybridSystem(modes, [0.0, 0.5]), run, {"a": 1.0, "mu": 3.35}, **TIGHT)
-
-
 def everything(**settings):
     """A crossing in each of two modes, a reset map, an unknown start, an input, and all kinds of data, in two runs."""
     modes = {
@@ -394,7 +382,6 @@ CASES = {
     "table": (lambda: problem_of(table, [2.0], {"a": 0.9}, 4.5, **TIGHT), 2),
     "clip": (lambda: problem_of(clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 5.0, **TIGHT), 4),
     "driven": (lambda: problem_of(driven, np.zeros(2), {"mu": 0.3, "d": 0.3}, 5.0, inputs=PUSHES, **TIGHT), 4),
-    "two modes": (two_modes, 2),
     "everything": (everything, 2),
     "stiff": (lambda: problem_of(contact, [1.0, 0.0], {"k": 1e3, "c": 3.0}, 1.1, solver="stiff", **TIGHT), 2),
     "written twice": (lambda: problem_of(written_twice, [1.0, 0.0], {"k": 4.0, "c": 0.5, "w": 0.31}, 5.0, **TIGHT), 3),
@@ -405,7 +392,7 @@ CASES = {
 """Problems, and how many crossings their first experiments have at least."""
 
 
-QUICK = ("contact", "table", "clip", "driven", "two modes", "everything")
+QUICK = ("contact", "table", "clip", "driven", "everything")
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in CASES])
@@ -540,7 +527,7 @@ def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint", "autodiff"])
-@pytest.mark.parametrize("name", ["driven", "backlash", "two modes"])
+@pytest.mark.parametrize("name", ["driven", "backlash", "contact"])
 def test_all_methods_agree(name, method):
     problem = CASES[name][0]()
     found, expected = sf.evaluate(problem, method=method), sf.evaluate(problem)
@@ -609,21 +596,17 @@ def rooted(t, x, p):
     ("problem", "theta"),
     [
         (problem_of(still, [1.0, 1.0, 1.0], {"c": 0.9}, 1.9), [1.3]),
-        (problem_of(spring, [1.0, 0.0], {"k": 4.0, "c": 0.01}, 45.0), [16.0, 0.01]),
         (problem_of(rooted, [1.0, 0.0], {"k": 4.0, "c": 0.01}), [4.0, 0.0]),
     ],
-    ids=["rest", "crossings", "infinite derivative"],
+    ids=["rest", "infinite derivative"],
 )
 def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monkeypatch):
     """JAX is not asked for a program of each path, to find that a derivative is infinite."""
     monkeypatch.setattr(jax_programs, "derivatives", None)
     evaluator = Evaluator(problem)
-    assert np.isfinite(evaluator.cost(problem.initial_theta))
     for _ in range(2):
-        found = evaluator(np.array(theta))
-        assert np.isnan(found.cost)
-        assert np.isnan(evaluator.cost(np.array(theta)))
         assert np.isfinite(evaluator.cost(problem.initial_theta))
+        assert np.isnan([evaluator(np.array(theta)).cost, evaluator.cost(np.array(theta))]).all()
 
 
 def test_a_solver_that_is_stuck_makes_no_corner_steep_beyond_which_the_field_is_defined():

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import decay
-from systems import NODES, P0, case, problem_of
+from systems import P0, case, problem_of
 
 import switchfit as sf
 from switchfit.engine.native import kernels, llvm
@@ -64,19 +64,6 @@ def assert_close(found, expected, relative=2e-12):
     assert found[0] == pytest.approx(expected.cost, rel=relative)
     np.testing.assert_allclose(found[1], expected.gradient, rtol=0, atol=relative * np.abs(expected.gradient).max())
     np.testing.assert_allclose(found[2], expected.hessian, rtol=0, atol=relative * np.abs(expected.hessian).max())
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize(
-    "tau", [INSIDE, NODES[[5, 9, 14]], NODES[[4, 4, 13]], NODES[[4, 4, 4]], [0.413, 0.413, 1.287]], ids=str
-)
-def test_machine_code_against_automatic_differentiation(tau, side):
-    """Also with transitions on nodes, on samples and on one another."""
-    this = case("resets")
-    at = this.arguments(), np.array(tau), P0, side
-    expected = this.forward(*at)
-    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
-    assert_close(natively(this, *at), expected)
 
 
 def test_stages_one_at_a_time(monkeypatch):

@@ -68,7 +68,7 @@ def constant(value: float, digits: int = 2) -> Tree:
     return lambda e: value
 
 
-def state(i: int) -> Tree:
+def entry(i: int) -> Tree:
     """An entry of x."""
     return lambda e: e.x[i]
 
@@ -103,7 +103,7 @@ class Expressions:
         kinds = ["t", "p", "p", "const", *["x"] * (3 * state), *["u"] * (2 * inputs * bool(self.inputs))]
         kind = self.rng.choice(kinds)
         if kind == "x":
-            return state(int(self.rng.integers(self.n)))
+            return entry(int(self.rng.integers(self.n)))
         if kind == "p":
             name, k = self.parameters[int(self.rng.integers(len(self.parameters)))]
             return lambda e: e.p[name] if k is None else e.p[name][k]
@@ -132,17 +132,17 @@ class Expressions:
     def rate(self, i: int, depth: int) -> Tree:
         """The rate of a state: damped, driven by something bounded, with a quadratic term."""
         j, k = self.rng.integers(self.n, size=2)
-        damping = scaled(-self.rng.uniform(0.1, 1.2), state(i))
+        damping = scaled(-self.rng.uniform(0.1, 1.2), entry(i))
         driven = scaled(self.rng.normal(), self.bounded(depth, inputs=True))
-        return total(damping, driven, scaled(0.15 * self.rng.normal(), product(state(j), state(k))))
+        return total(damping, driven, scaled(0.15 * self.rng.normal(), product(entry(j), entry(k))))
 
     def jump(self, i: int) -> Tree:
         """A state after a reset."""
-        return total(scaled(self.rng.uniform(0.5, 1.0), state(i)), scaled(0.4, self.bounded(1)))
+        return total(scaled(self.rng.uniform(0.5, 1.0), entry(i)), scaled(0.4, self.bounded(1)))
 
     def output(self) -> Tree:
         """What a sensor sees, or what a constraint is made of."""
-        return total(state(int(self.rng.integers(self.n))), scaled(0.5, self.bounded(1)))
+        return total(entry(int(self.rng.integers(self.n))), scaled(0.5, self.bounded(1)))
 
 
 def vector(trees: list[Tree], xp: Any, *, arguments: str = "txp", flat_input: bool = False) -> Callable[..., Any]:
@@ -332,7 +332,7 @@ class System:
         if rng.random() < 0.5:
             times[0], times[-1] = first, last
         q = whole or q
-        trees = [state(k) for k in range(q)] if whole else [self.expressions.output() for _ in range(q)]
+        trees = [entry(k) for k in range(q)] if whole else [self.expressions.output() for _ in range(q)]
         values = rng.normal(size=(count, q))
         values[rng.random(values.shape) < 0.1] = np.nan
         values[0, 0] = 0.3

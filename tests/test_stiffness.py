@@ -95,23 +95,13 @@ def test_robertsons_problem_agrees_with_scipy():
     assert abs(evaluator_of(explicit).cost(problem.initial_theta) / y[3] - 1) > 1e-4
 
 
-def test_explicit_steps_that_make_the_cost_nan_at_the_guess_are_not_taken():
-    problem = one_mode(van_der_pol, [2.0, 0.0], {"mu": 100.0}, 300.0)
-    explicit = replace(problem, solver="explicit")
-    with np.errstate(all="ignore"):
-        assert np.isnan(evaluator_of(explicit).cost(problem.initial_theta))
-    assert np.isfinite(evaluator_of(problem).cost(problem.initial_theta))
-
-
 def test_the_explicit_solve_is_given_up_once_it_is_clear_that_stability_limits_it(monkeypatch):
     watches, watch = [], Choice.watch
     monkeypatch.setattr(Choice, "watch", lambda choice, k: watches.append(watch(choice, k)) or watches[-1])
     problem, explicit = relaxing(1e4), relaxing(1e4, solver="explicit")
     (stiffness,) = refine_mesh(problem, 0, problem.initial_theta).stiffness
     assert watches[0].modes["m"].count <= 20 * 256
-    assert stiffness.explicit_steps > 15_000
-    cells = refine_mesh(explicit, 0, explicit.initial_theta).cells
-    assert stiffness.explicit_steps == pytest.approx(cells, rel=0.1)
+    assert stiffness.explicit_steps == pytest.approx(refine_mesh(explicit, 0, explicit.initial_theta).cells, rel=0.1)
 
 
 # What is not
@@ -378,21 +368,16 @@ def test_meshes_keep_the_methods_of_their_modes():
 # Where the choice goes
 
 
-@pytest.mark.slow
 def test_the_choice_is_said(caplog):
     problem = relaxing()
     with caplog.at_level(logging.INFO, logger="switchfit"):
-        fit = sf.estimate(problem, strategy="local", max_iterations=1)
-    said = "ode 'm' is stiff: it takes 3"
-    assert f"M{said}" in caplog.text
+        engine = evaluator_of(problem).engine
+    assert caplog.text.count("Mode 'm' is stiff: it takes 3") == 1
     assert "explicit steps (limited by stability: |lambda| h is about 3." in caplog.text
-    assert caplog.text.count("implicit ones were chosen for this mode.") == 1
-    assert fit.engine.name == "native"
-    assert "Evaluated in machine code, with implicit steps in 'm'." in " ".join(fit.report(full=True).split())
+    assert "implicit ones were chosen for this mode." in caplog.text
+    assert str(engine) == "Evaluated in machine code, with implicit steps in 'm'."
     assert "implicit steps; mode 'm' is stiff" in describe_steps(problem)
     assert "explicit steps" in describe_steps(relaxing(1.0))
-    by_jax = relaxing(engine="jax")
-    assert "engine='jax' is set; mode 'm' is stiff" in evaluator_of(by_jax).engine.reason
 
 
 def fitted_to(rate, guess, times, sigma=1e-3, **settings):
