@@ -15,26 +15,9 @@ from scipy.integrate import RK45, solve_ivp
 
 import switchfit as sf
 from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, find_row_ending_cell, pad_length
-from switchfit.discretization.rows import (
-    ADAPTIVE,
-    ADAPTIVE_ERROR,
-    EXPONENT,
-    Progress,
-    Tolerances,
-    combine,
-    judge_error,
-    limit_step,
-)
-from switchfit.engine.adaptive import (
-    PACE,
-    Settings,
-    _NativeSteps,
-    _project_steps,
-    _PythonSteps,
-    _Solve,
-    _Stretch,
-    refine_mesh,
-)
+from switchfit.discretization.rows import ADAPTIVE, ADAPTIVE_ERROR, Tolerances
+from switchfit.engine import adaptive
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.protocol import runs_of
 from switchfit.fit.evaluator import Evaluator
@@ -293,7 +276,7 @@ def test_both_engines_take_the_steps_of_scipy():
     coarse = Mesh.of(run)
     arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
-    solve = _Solve(runs_of(problem)[0], problem.structures[0], coarse, Settings())
+    solve = adaptive._Solve(runs_of(problem)[0], problem.structures[0], coarse, adaptive.Settings())
     tolerances = Tolerances(problem.rtol, problem.atol)
     last = coarse.cells - 1
 
@@ -311,38 +294,15 @@ def test_both_engines_take_the_steps_of_scipy():
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
         expected, state = steps_of_scipy(mode, start, end, x)
         with use_float64():
-            stretch = _Stretch(mode, start, end, np.array(x))
-            natively = _NativeSteps(native, mode, stretch, np.zeros(0), tolerances)
-            in_python = _PythonSteps(solve._build_slope(stretch, mode), stretch, tolerances)
+            stretch = adaptive._Stretch(mode, start, end, np.array(x))
+            natively = adaptive._NativeSteps(native, mode, stretch, np.zeros(0), tolerances)
+            in_python = adaptive._PythonSteps(solve._build_slope(stretch, mode), stretch, tolerances)
             found = [solve._take_steps(stretch, steps, None) for steps in (natively, in_python)]
         for steps, after, crossing in found:
             assert crossing is None
             assert len(steps) == len(expected) > 10
             np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))
             np.testing.assert_allclose(after, state, rtol=0, atol=1e-8)
-
-
-def test_the_last_step_ends_at_the_end_and_one_shorter_than_rounding_is_stuck():
-    slopes, y = np.zeros((len(ADAPTIVE_ERROR), 1)), np.zeros(1)
-    tolerances = Tolerances(1e-8, 1e-9)
-    third = 1.0 / 3.0
-
-    def judge_step(at, end, slopes):
-        return judge_error(at, end, tolerances, y, y, at.step * combine(ADAPTIVE_ERROR, slopes), EXPONENT, np)
-
-    with np.errstate(divide="ignore"):
-        at = Progress(third, limit_step(third, 5.0, 0.7), False, False)
-        now, _ = judge_step(at, 0.7, slopes)
-        assert now.t == 0.7
-        bad = slopes + 1e100
-        short = Progress(1.0, 3e-15, False, False)
-        now, _ = judge_step(short, 2.0, bad)
-        assert now.stuck
-        assert not judge_step(short._replace(step=1e-12), 2.0, bad)[0].stuck
-        undefined = Progress(1.0, np.nan, False, False)
-        assert judge_step(undefined, 2.0, slopes)[0].stuck
-        after, _ = judge_step(short._replace(step=1e-30), 2.0, slopes)
-        assert 1.0 + after.step > 1.0, "a step after an accepted one changes t"
 
 
 def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():
@@ -375,6 +335,6 @@ def test_coefficients_of_dormand_and_prince_are_those_of_scipy():
 
 
 def test_steps_are_projected_at_the_pace_of_the_last_ones():
-    slow, fast = 10.0 * np.arange(20), 190.0 + 0.1 * np.arange(PACE + 1)
+    slow, fast = 10.0 * np.arange(20), 190.0 + 0.1 * np.arange(adaptive.PACE + 1)
     accepted = [*slow[:-1], *fast]
-    assert _project_steps(accepted, fast[-1] + 50.0) == pytest.approx(len(accepted) + 500)
+    assert adaptive._project_steps(accepted, fast[-1] + 50.0) == pytest.approx(len(accepted) + 500)

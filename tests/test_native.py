@@ -14,18 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import decay
-from systems import P0, case, problem_of
+from systems import problem_of
 
 import switchfit as sf
-from switchfit.engine.native import kernels, llvm
+from switchfit.engine.native import llvm
 from switchfit.engine.native import program as program_module
-from switchfit.engine.native.engine import foreign_derivatives
-from switchfit.engine.native.experiment import native_experiment, places_in_library
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph, Node
-from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.problem.functions import use_float64
 
 # Functions as scalars
 
@@ -49,31 +45,6 @@ def test_structural_zeros_and_repetitions_are_gone():
 
 
 # Derivatives
-
-INSIDE = [0.413, 0.791, 1.336]
-
-
-def natively(this, arguments, tau, p, side=1):
-    nodes = np.asarray(arguments.nodes)
-    native = native_experiment(this.structure, arguments, np.unique(nodes), Order.HESSIAN)
-    found = native(np.asarray(tau, float), np.asarray(p, float), side)
-    return found.cost, found.gradient, found.hessian
-
-
-def assert_close(found, expected, relative=2e-12):
-    assert found[0] == pytest.approx(expected.cost, rel=relative)
-    np.testing.assert_allclose(found[1], expected.gradient, rtol=0, atol=relative * np.abs(expected.gradient).max())
-    np.testing.assert_allclose(found[2], expected.hessian, rtol=0, atol=relative * np.abs(expected.hessian).max())
-
-
-def test_stages_one_at_a_time(monkeypatch):
-    """As where functions would become too long."""
-    monkeypatch.setattr(kernels, "SHORT", 0)
-    drop_programs()
-    this = case("resets")
-    at = this.arguments(), np.array(INSIDE), P0
-    assert_close(natively(this, *at), this.discrete(*at))
-    drop_programs()
 
 
 def test_results_of_one_evaluation_survive_the_next():
@@ -112,24 +83,6 @@ def test_simulations_are_those_of_jax():
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12, err_msg=column)
     for one, other in zip((*found.seen, *found.tangents), (*expected.seen, *expected.tangents), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
-
-
-def test_inside_a_program_of_jax():
-    """The operation that batches use: alone, in a loop, and for several at once."""
-    this = case("resets")
-    arguments, taus = this.arguments(), np.array(INSIDE) + np.array([[0.0], [0.01]])
-    places = places_in_library(this.structure)
-
-    def evaluate(tau):
-        return foreign_derivatives(this.structure, arguments, tau, P0, 1.0, places)
-
-    with use_float64():
-        alone = [jax.jit(evaluate)(tau) for tau in taus]
-        loop, at_once = jax.jit(lambda taus: (jax.lax.map(evaluate, taus), jax.vmap(evaluate)(taus)))(taus)
-    for k, tau in enumerate(taus):
-        expected = this.discrete(arguments, tau, P0)
-        for found in (alone[k], *([part[k] for part in each] for each in (loop, at_once))):
-            assert_close([np.asarray(part) for part in found], expected)
 
 
 # The cache
