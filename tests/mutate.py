@@ -132,15 +132,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "the length of a row in the Hessian": swap(
             KERNELS, '+ graph.load("length", d) * (end_d - start_d)', "+ 0.0 * (end_d - start_d)"
         ),
-        "the reset map of another transition": swap(
-            SEGMENTS,
-            '"moves": writer.at(found["units"], segment, width),\n        "x_after"',
-            '"moves": found["units"],\n        "x_after"',
-        ),
         "the sample behind a transition": swap(SEGMENTS, "(cell >= begin)", "(cell > begin)"),
-        "the costate of a late sample": swap(
-            SEGMENTS, '"late": writer.at(found["late"], row, writer.sizes.n)', '"late": found["late"]'
-        ),
         "W in the Gauss-Newton matrix": swap(TEMPLATES, "hb * apply_weights(W, A)", "hb * A"),
     },
     "jax": {
@@ -163,11 +155,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "the transposed equations": swap(IMPLICIT_ROWS, ".solve(right, transposed=True)", ".solve(right)"),
         "f in the error of a row": swap(
             IMPLICIT_ROWS, "damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)"
-        ),
-        "the damping of the error": swap(
-            IMPLICIT_ROWS,
-            "factorize(np.array([[damping]]), h, [f_x])",
-            "factorize(np.array([[damping]]), 0.0 * h, [f_x])",
         ),
         "the factors of the last row": swap(SEGMENTS, 'at(found["kept"], row,', 'at(found["kept"], 0,'),
         "no second derivative of Newton's map": swap(
@@ -291,11 +278,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "a path that does not hold any more": swap(
             SPLIT, "if found is not None and self._holds(last, found[1], tau, p):", "if found is not None:"
         ),
-        "rows end at crossings": swap(
-            "engine/choice.py",
-            "build(base) if run.branches is None else SplitEngine(",
-            "build(base) if True else SplitEngine(",
-        ),
         "the side behind a crossing": swap(COURSE, "behind if after == self.sides else after", "self.sides"),
         "sliding": swap(COURSE, "\n            )\n        return 0", "\n            )\n        return 1"),
         "a jump of the input": swap(COURSE, "if after != self.sides:", "if False:"),
@@ -321,11 +303,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
     },
     "online": {
-        "what has left the window has no gradient": swap(
-            TRACKER,
-            "Hypotheses(costs, costs, self.gradient + slope, matrices",
-            "Hypotheses(costs, costs, slope, matrices",
-        ),
         "what has left the window is a diagonal": swap(
             TRACKER, "(self.matrix + artificial)[None]", "(np.diag(np.diag(self.matrix)) + artificial)[None]"
         ),
@@ -340,11 +317,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "the old value still moves the state": swap(
             TRACKER, "tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0", "tangent[:, :entries] = 0.0"
-        ),
-        "a change costs nothing": swap(
-            TRACKER,
-            "found.scores + self.settings.penalty * switches",
-            "found.scores + 0 * self.settings.penalty * switches",
         ),
         "the hypotheses that decide are not propagated anew": swap(
             TRACKER, "found.records[chosen] = anew.records[good]", "anew.records[good]"
