@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -200,22 +199,6 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
 def test_room_for_fewer_transitions_than_there_are_is_refused():
     with pytest.raises(ValueError, match="max_transitions is 1, but a mode_sequence has 2 transitions"):
         problem(samples(), max_transitions=1)
-
-
-def test_arguments_go_to_the_device_once_and_again_when_they_change(monkeypatch):
-    """To put them there takes as long as half of an evaluation."""
-    given, other = problem(samples()), problem(sf.Measurements(TIMES, 1.0 - VALUES, sigma=0.5))
-    evaluator, puts = Evaluator(given), []
-    put = jax.device_put
-    monkeypatch.setattr(jax, "device_put", lambda *what: puts.append(what) or put(*what))
-    first, again = (evaluator(given.initial_theta, method="discrete-adjoint") for _ in range(2))
-    assert len(puts) == 1
-    assert again.cost == first.cost
-    evaluator.replace_arguments(Evaluator(other, meshes=evaluator.meshes).arguments)
-    changed = evaluator(given.initial_theta, method="discrete-adjoint")
-    assert len(puts) == 2
-    assert changed.cost == pytest.approx(evaluator(given.initial_theta).cost, rel=1e-12)
-    assert changed.cost != pytest.approx(first.cost, rel=1e-3)
 
 
 def test_the_problem_says_which_engine_it_wants():

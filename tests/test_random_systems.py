@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from itertools import combinations_with_replacement, pairwise
+from itertools import combinations_with_replacement, compress, pairwise
+from itertools import product as product_of
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -224,18 +225,12 @@ class System:
         entries = [(name, k) for name in names for k in (range(2) if self.parameters[name].shape else [None])]
         self.expressions = Expressions(rng, has.states, entries, self.inputs)
         depth = 1 if has.states > 4 else 2
-        self.modes = [
-            [self.expressions.rate(i, depth) for i in range(has.states)]
-            for _ in range(min(has.modes, 1 + has.transitions))
-        ]
-        pairs = [(a, b) for a in range(len(self.modes)) for b in range(len(self.modes))]
+        count, each = min(has.modes, 1 + has.transitions), range(has.states)
+        self.modes = [[self.expressions.rate(i, depth) for i in each] for _ in range(count)]
+        pairs = list(product_of(range(count), repeat=2))
         jumps, watched = (rng.random(len(pairs)) < on for on in (0.6 * has.resets, 0.6 * has.guards))
-        self.resets = {
-            pair: [self.expressions.jump(i) for i in range(has.states)]
-            for pair, on in zip(pairs, jumps, strict=True)
-            if on
-        }
-        self.guards = {pair: self.expressions.output() for pair, on in zip(pairs, watched, strict=True) if on}
+        self.resets = {pair: list(map(self.expressions.jump, each)) for pair in compress(pairs, jumps)}
+        self.guards = {pair: self.expressions.output() for pair in compress(pairs, watched)}
         self.initial = self._draw_initial()
         self.experiments: list[sf.Experiment] = []
         self.runs: list[Run] = []
@@ -262,10 +257,8 @@ class System:
             found["c"] = sf.Parameter(float(rng.normal()), fixed=True)
         if has.array:
             found["v"] = sf.Parameter(rng.normal(size=2), prior=self._prior(0.1, False))
-        if has.runs == 2:
-            found["other"] = self._parameter(
-                float(rng.uniform(0.3, 1.5)), positive=True
-            )  # what "a" is in the second run
+        if has.runs == 2:  # what "a" is in the second run
+            found["other"] = self._parameter(float(rng.uniform(0.3, 1.5)), positive=True)
         if has.noise in ("parameter", "mixed"):
             found["sigma"] = self._parameter(float(rng.uniform(0.2, 0.6)), positive=True)
         if has.late:
@@ -286,12 +279,8 @@ class System:
         count, span = self.has.transitions, self.tf - self.t0
         gaps = self.rng.uniform(0.3, 1.0, count + 1)
         times = self.t0 + span * np.cumsum(gaps)[:-1] / gaps.sum()
-        return [
-            sf.Parameter(float(t), fixed=True)
-            if self.rng.random() < 0.1 * self.has.fixed
-            else self._parameter(float(t))
-            for t in times
-        ]
+        # A draw decides for each whether it is fixed.
+        return [self._parameter(float(t), fixed=bool(self.rng.random() < 0.1 * self.has.fixed)) for t in times]
 
     def _draw_run(self, e: int) -> None:
         rng, has = self.rng, self.has
@@ -369,11 +358,9 @@ class System:
         root = rng.normal(size=(q, q))
         weights = root @ root.T if rng.random() < 0.5 else np.diag(rng.uniform(0.3, 2.0, q))
         trees = [self.expressions.output() for _ in range(q)]
-        signal = sf.ReferenceSignal.from_samples(times, values, observe=vector(trees, jnp), weights=weights)
-        data.append(signal)
-        run["tracking"].append(
-            reference.Tracking(reference.Signal.spline(times, values), vector(trees, np), np.asarray(weights))
-        )
+        data.append(sf.ReferenceSignal.from_samples(times, values, observe=vector(trees, jnp), weights=weights))
+        signal = reference.Signal.spline(times, values)
+        run["tracking"].append(reference.Tracking(signal, vector(trees, np), np.asarray(weights)))
 
     def _draw_input(self) -> tuple[Any, Any]:
         if not self.inputs:
@@ -388,17 +375,12 @@ class System:
     @cached_property
     def problem(self) -> sf.Problem:
         """The problem as switchfit takes it."""
-        arguments = "txpu" if self.inputs else "txp"
-        flat = self.inputs == 1
-        initial = self.initial
-        if self.has.initial == "function":
-            initial = vector(initial, jnp, arguments="p")
-        system = sf.HybridSystem(
-            {f"m{k}": vector(trees, jnp, arguments=arguments, flat_input=flat) for k, trees in enumerate(self.modes)},
-            initial,
-            {(f"m{a}", f"m{b}"): vector(trees, jnp) for (a, b), trees in self.resets.items()},
-            guards={(f"m{a}", f"m{b}"): number(tree, jnp) for (a, b), tree in self.guards.items()},
-        )
+        form = {"arguments": "txpu" if self.inputs else "txp", "flat_input": self.inputs == 1}
+        initial = vector(self.initial, jnp, arguments="p") if self.has.initial == "function" else self.initial
+        modes = {f"m{k}": vector(trees, jnp, **form) for k, trees in enumerate(self.modes)}
+        resets = {(f"m{a}", f"m{b}"): vector(trees, jnp) for (a, b), trees in self.resets.items()}
+        guards = {(f"m{a}", f"m{b}"): number(tree, jnp) for (a, b), tree in self.guards.items()}
+        system = sf.HybridSystem(modes, initial, resets, guards=guards)
         settings = {"solver": self.has.solver, "rtol": RTOL, "atol": ATOL}
         return sf.Problem(system, self.experiments, self.parameters, **settings)
 

@@ -16,7 +16,7 @@ from test_implicit import SQUARE, robertson, van_der_pol
 import switchfit as sf
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.engine.protocol import runs_of
-from switchfit.engine.stiffness import LIMITED, UNSTABLE, Choice, TooManyStepsError, Watch
+from switchfit.engine.stiffness import Choice, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.command_line import describe_steps
 from switchfit.problem.functions import use_float64
@@ -190,20 +190,6 @@ def test_rows_between_samples_count(samples, modes):
     assert [each.mode for each in refine_mesh(problem, 0, problem.initial_theta).stiffness] == modes
 
 
-def test_modes_are_chosen_by_work_and_not_by_the_number_of_steps():
-    explicit, choice = Watch(), Choice()
-    explicit.enter("m", 100.0)
-    explicit.add(3000)
-    assert choice.add({"m": 3.1}, explicit, 0)
-    watch = choice.watch(0)
-    watch.enter("m", 300.0)
-    watch.add(1)
-    most = int(UNSTABLE * 3000 * 100.0 / 300.0)
-    watch.add(most - 1)
-    with pytest.raises(TooManyStepsError):
-        watch.add(1)
-
-
 # By mode
 
 
@@ -326,22 +312,6 @@ def test_each_mode_is_judged_by_itself(rates, stiff):
 
 
 @pytest.mark.slow
-def test_a_mode_keeps_explicit_steps_if_implicit_ones_are_hardly_fewer():
-    """Stability limits them, but the vibration beside takes as many implicit steps."""
-    modes = {
-        "relax": lambda t, x, p: jnp.array([-p["rate"] * (x[0] - jnp.cos(t)), -x[1], -x[2]]),
-        "ring": lambda t, x, p: jnp.array([-1e4 * x[0], 100.0 * x[2], -100.0 * x[1]]),
-    }
-    system = sf.HybridSystem(modes, [0.0, 1.0, 0.0])
-    problem = sf.Problem(system, sf.Experiment(SQUARE, ("relax", "ring"), (1.0,), 0.0, 2.0), {"rate": 1e6})
-    evaluator = evaluator_of(problem)
-    assert evaluator.structures[0].list_implicit_modes() == ("relax",)
-    explicit = evaluator.meshes[0].times
-    assert np.sum(explicit > 1.0) > 2000
-    assert 1e4 * np.median(np.diff(explicit[explicit > 1.0])) > LIMITED
-
-
-@pytest.mark.slow
 def test_modes_that_are_stiff_at_one_of_several_thetas():
     """The mesh for both has implicit steps in both modes; that for the first has them in the first mode."""
     problem = relaxations((1e6, 3.0))
@@ -354,15 +324,6 @@ def test_modes_that_are_stiff_at_one_of_several_thetas():
     found = refine_if_unstable(runs_of(problem)[0], mesh, before, after)
     assert {each.mode for each in found.stiffness} == {"m0", "m1"}
     assert refine_if_unstable(runs_of(problem)[0], found, before, after) is None
-
-
-def test_meshes_keep_the_methods_of_their_modes():
-    problem = three()
-    evaluator = evaluator_of(problem)
-    theta = problem.initial_theta
-    for other in (evaluator.halved, evaluator.halve_rows(theta)):
-        assert other.structures == evaluator.structures
-        assert other.cost(theta) == pytest.approx(evaluator.cost(theta), abs=1e-6)
 
 
 # Where the choice goes
