@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from itertools import combinations_with_replacement, compress, pairwise
-from itertools import product as product_of
+from itertools import combinations_with_replacement, compress, pairwise, product
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -79,19 +78,19 @@ def total(*trees: Tree) -> Tree:
     return lambda e: sum(tree(e) for tree in trees)
 
 
-def product(*trees: Tree) -> Tree:
+def multiply(*trees: Tree) -> Tree:
     """The product of two expressions."""
     return lambda e: trees[0](e) * trees[1](e)
 
 
 def square(tree: Tree) -> Tree:
     """The square of an expression."""
-    return product(tree, tree)
+    return multiply(tree, tree)
 
 
 def scaled(factor: float, tree: Tree) -> Tree:
     """A multiple of an expression."""
-    return product(constant(factor, 3), tree)
+    return multiply(constant(factor, 3), tree)
 
 
 class Expressions:
@@ -135,7 +134,7 @@ class Expressions:
         j, k = self.rng.integers(self.n, size=2)
         damping = scaled(-self.rng.uniform(0.1, 1.2), entry(i))
         driven = scaled(self.rng.normal(), self.bounded(depth, inputs=True))
-        return total(damping, driven, scaled(0.15 * self.rng.normal(), product(entry(j), entry(k))))
+        return total(damping, driven, scaled(0.15 * self.rng.normal(), multiply(entry(j), entry(k))))
 
     def jump(self, i: int) -> Tree:
         """A state after a reset."""
@@ -225,11 +224,11 @@ class System:
         entries = [(name, k) for name in names for k in (range(2) if self.parameters[name].shape else [None])]
         self.expressions = Expressions(rng, has.states, entries, self.inputs)
         depth = 1 if has.states > 4 else 2
-        count, each = min(has.modes, 1 + has.transitions), range(has.states)
-        self.modes = [[self.expressions.rate(i, depth) for i in each] for _ in range(count)]
-        pairs = list(product_of(range(count), repeat=2))
+        count, states = min(has.modes, 1 + has.transitions), range(has.states)
+        self.modes = [[self.expressions.rate(i, depth) for i in states] for _ in range(count)]
+        pairs = list(product(range(count), repeat=2))
         jumps, watched = (rng.random(len(pairs)) < on for on in (0.6 * has.resets, 0.6 * has.guards))
-        self.resets = {pair: list(map(self.expressions.jump, each)) for pair in compress(pairs, jumps)}
+        self.resets = {pair: list(map(self.expressions.jump, states)) for pair in compress(pairs, jumps)}
         self.guards = {pair: self.expressions.output() for pair in compress(pairs, watched)}
         self.initial = self._draw_initial()
         self.experiments: list[sf.Experiment] = []
