@@ -808,7 +808,7 @@ ROOTS = {
 
 
 @pytest.mark.parametrize("start", [1.0, 0.0])
-@pytest.mark.parametrize("name", ROOTS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "where")) for name in ROOTS])
 def test_a_tank_that_is_or_ran_empty_is_filled_again(name, start):
     """sqrt(x) is not defined below zero, and its slope at zero is infinite: rows begin and end there all the same."""
     root, modes = ROOTS[name], ("drain", "fill") if start else ("fill", "drain")
