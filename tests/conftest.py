@@ -12,7 +12,6 @@ from hypothesis import settings
 
 import switchfit as sf
 from switchfit.batch import program as batch_program
-from switchfit.batch import program as layout
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 from switchfit.uncertainty import certificate
@@ -136,7 +135,7 @@ def fits_one_by_one():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch_program, "_minimize_fits", refuse)
-        patch.setattr(layout, "runs_natively", lambda *given: False)  # evaluations are done one by one too
+        patch.setattr(batch_program, "runs_natively", lambda *given: False)  # evaluations are done one by one too
         yield
 
 

@@ -209,9 +209,15 @@ def test_reset_begins_anew(problem, log):
     assert online.update(0.05).status is sf.OnlineStatus.WAITING
     online.reset()
     again = feed_all(online, log)[-1]
-    assert (again.best.theta == first.best.theta).all()
-    assert again.statistic == first.statistic
-    assert (again.transition_times == first.transition_times).all()
+    assert_same(again, first)
+
+
+def assert_same(now: sf.Now, other: sf.Now) -> None:
+    """To the last bit."""
+    np.testing.assert_array_equal(now.best.theta, other.best.theta)
+    np.testing.assert_array_equal(now.transition_times, other.transition_times)
+    np.testing.assert_array_equal(now.covariance, other.covariance)
+    assert now.statistic == other.statistic
 
 
 @pytest.mark.parametrize("settings", [{}, {"window": 4.0}])
@@ -227,11 +233,7 @@ def test_a_saved_estimator_goes_on_bit_by_bit(problem, log, tmp_path, settings):
     with (tmp_path / "journal").open("ab") as file:
         file.write(b'{"t": 13.1, "y": [0')  # the process was killed here
     again = sf.OnlineEstimator.load(tmp_path / "state", problem, journal=tmp_path / "journal", **settings).now
-    assert again is not None
-    assert (again.best.theta == last.best.theta).all()
-    assert again.statistic == last.statistic
-    assert (again.transition_times == last.transition_times).all()
-    np.testing.assert_array_equal(again.covariance, last.covariance)
+    assert_same(again, last)
 
 
 def test_a_file_of_something_else_is_refused(problem, log, tmp_path):
@@ -272,8 +274,7 @@ def test_missing_values_are_as_if_left_out(problem, log):
         a = one.update(t, y)
         named = {name: v for name, v in zip(("X", "Y", "heading"), y, strict=True) if not np.isnan(v)}
         b = other.update(t, named or None)
-    assert (a.best.theta == b.best.theta).all()
-    assert (a.transition_times == b.transition_times).all()
+    assert_same(a, b)
 
 
 def test_sensors_at_their_own_rates_with_a_delay():

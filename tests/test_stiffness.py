@@ -387,10 +387,6 @@ def test_each_experiment_has_steps_of_its_own():
     assert [structure.implicit for structure in evaluator.structures] == [(True,), (False,)]
     assert [each.engine.implicit_modes for each in evaluator.engines] == [("fast",), ()]
     assert str(evaluator.engine) == "Evaluated in machine code, with implicit steps in 'fast'."
-    pairs = zip(runs, ("stiff", "explicit"), strict=True)
-    alone = [sf.Problem(system, run, {"rate": 1e5}, solver=solver) for run, solver in pairs]
-    costs = [evaluator_of(each).cost(each.initial_theta) for each in alone]
-    assert evaluator.cost(problem.initial_theta) == pytest.approx(sum(costs), rel=1e-12)
 
 
 @pytest.mark.usefixtures("quick_certificates")
