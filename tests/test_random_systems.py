@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import combinations_with_replacement, compress, pairwise, product
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -200,15 +200,6 @@ def draw_features(rng: np.random.Generator, **given: Any) -> SimpleNamespace:
     return SimpleNamespace(**{**drawn, **given})
 
 
-class Run(NamedTuple):
-    """What was drawn for a run: modes, times, the other names of parameters, and what `reference.Run` has of data."""
-
-    sequence: list[int]
-    times: list[Any]
-    mapped: dict[str, str]
-    data: dict[str, Any]
-
-
 class System:
     """One random problem, for switchfit and for the reference."""
 
@@ -232,7 +223,7 @@ class System:
         self.guards = {pair: self.expressions.output() for pair in compress(pairs, watched)}
         self.initial = self._draw_initial()
         self.experiments: list[sf.Experiment] = []
-        self.runs: list[Run] = []
+        self.runs: list[reference.Run] = []  # without the places of their unknowns in theta
         for e in range(has.runs):
             self._draw_run(e)
 
@@ -308,7 +299,20 @@ class System:
         modes = tuple(f"m{k}" for k in sequence)
         settings = {"inputs": inputs, "parameter_map": mapped or None}
         self.experiments.append(sf.Experiment(data, modes, times, self.t0, self.tf, **settings))
-        self.runs.append(Run(sequence, times, mapped, run))
+        pairs = list(pairwise(sequence))
+        self.runs.append(
+            reference.Run(
+                modes=[vector(self.modes[k], np, arguments="txpu" if self.inputs else "txp") for k in sequence],
+                t0=self.t0,
+                tf=self.tf,
+                times=times,
+                initial=None,
+                names={name: mapped.get(name, name) for name in self.parameters},
+                resets=[vector(self.resets[pair], np) if pair in self.resets else None for pair in pairs],
+                guards=[number(self.guards[pair], np) if pair in self.guards else None for pair in pairs],
+                **run,
+            )
+        )
 
     def _add_samples(self, run: dict[str, Any], data: list[Any], *, late: bool) -> None:
         rng, has = self.rng, self.has
@@ -411,24 +415,8 @@ class System:
                 initials.append(vector(self.initial, np, arguments="p"))
             else:
                 initials.append([take(x) if isinstance(x, sf.Parameter) else float(x) for x in self.initial])
-        arguments = "txpu" if self.inputs else "txp"
-        modes = [vector(trees, np, arguments=arguments) for trees in self.modes]
-        runs = []
-        for run, own, initial in zip(self.runs, times, initials, strict=True):
-            pairs = list(pairwise(run.sequence))
-            runs.append(
-                reference.Run(
-                    modes=[modes[k] for k in run.sequence],
-                    t0=self.t0,
-                    tf=self.tf,
-                    times=own,
-                    initial=initial,
-                    names={name: run.mapped.get(name, name) for name in self.parameters},
-                    resets=[vector(self.resets[pair], np) if pair in self.resets else None for pair in pairs],
-                    guards=[number(self.guards[pair], np) if pair in self.guards else None for pair in pairs],
-                    **run.data,
-                )
-            )
+        placed = zip(self.runs, times, initials, strict=True)
+        runs = [replace(run, times=own, initial=initial) for run, own, initial in placed]
         return reference.Reference(runs, parameters, priors)
 
     @cached_property
@@ -442,10 +430,10 @@ class System:
 
         return np.array([kind(name) for name in self.problem.theta_names])
 
-    def nodes(self, data: dict[str, Any]) -> np.ndarray:
+    def nodes(self, run: reference.Run) -> np.ndarray:
         """Moments of a run at which a transition may tie with something: samples and knots."""
-        times = [item.times - item.delay for item in data["samples"] if not isinstance(item.delay, str)]
-        signals = [item.signal for item in data["tracking"]] + [data["input"]] * (data["input"] is not None)
+        times = [item.times - item.delay for item in run.samples if not isinstance(item.delay, str)]
+        signals = [signal for signal in (*[item.signal for item in run.tracking], run.input) if signal is not None]
         times = np.unique(np.concatenate([*times, *(signal.knots for signal in signals), [self.t0, self.tf]]))
         return times[(times >= self.t0) & (times <= self.tf)]
 
@@ -456,11 +444,11 @@ class System:
         is_time = self.kinds == "tau"
         theta = np.where(is_time, theta, theta * (1 + 0.03 * rng.normal(size=len(theta))))
         kind = str(rng.choice(["tie", "before", "after", "coincide", "first", "last", "all"]))
-        for run, where in zip(self.runs, self.reference.runs, strict=True):
-            free = [at for at in where.times if isinstance(at, int)]
-            if len(free) < len(where.times) or not free:
+        for run in self.reference.runs:
+            free = [at for at in run.times if isinstance(at, int)]
+            if len(free) < len(run.times) or not free:
                 continue
-            tau, nodes = theta[free], self.nodes(run.data)
+            tau, nodes = theta[free], self.nodes(run)
             k = int(rng.integers(len(tau)))
             node = float(nodes[np.argmin(np.abs(nodes - tau[k]))])
             if kind == "tie":
