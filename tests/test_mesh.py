@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.integrate import RK45, solve_ivp
 
 import switchfit as sf
+from switchfit.discretization import rows
 from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, find_row_ending_cell, pad_length
 from switchfit.discretization.rows import ADAPTIVE, ADAPTIVE_ERROR, Tolerances
 from switchfit.engine import adaptive
@@ -303,6 +304,31 @@ def test_both_engines_take_the_steps_of_scipy():
             assert len(steps) == len(expected) > 10
             np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))
             np.testing.assert_allclose(after, state, rtol=0, atol=1e-8)
+
+
+def test_the_last_step_ends_at_the_end_and_one_shorter_than_rounding_is_stuck():
+    slopes, y = np.zeros((len(ADAPTIVE_ERROR), 1)), np.zeros(1)
+    tolerances = Tolerances(1e-8, 1e-9)
+    third = 1.0 / 3.0
+
+    def judge_step(at, end, slopes):
+        return rows.judge_error(
+            at, end, tolerances, y, y, at.step * rows.combine(ADAPTIVE_ERROR, slopes), rows.EXPONENT, np
+        )
+
+    with np.errstate(divide="ignore"):
+        at = rows.Progress(third, rows.limit_step(third, 5.0, 0.7), False, False)
+        now, _ = judge_step(at, 0.7, slopes)
+        assert now.t == 0.7
+        bad = slopes + 1e100
+        short = rows.Progress(1.0, 3e-15, False, False)
+        now, _ = judge_step(short, 2.0, bad)
+        assert now.stuck
+        assert not judge_step(short._replace(step=1e-12), 2.0, bad)[0].stuck
+        undefined = rows.Progress(1.0, np.nan, False, False)
+        assert judge_step(undefined, 2.0, slopes)[0].stuck
+        after, _ = judge_step(short._replace(step=1e-30), 2.0, slopes)
+        assert 1.0 + after.step > 1.0, "a step after an accepted one changes t"
 
 
 def test_a_mesh_for_several_thetas_is_as_dense_as_the_densest():
