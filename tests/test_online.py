@@ -54,7 +54,7 @@ def feed_all(online: sf.OnlineEstimator, log: np.ndarray, times: np.ndarray = TI
 
 def track(modes: dict, start: list, data, parameters: dict, tf: float | None = None) -> sf.Problem:
     """Return the problem of a log that begins in the first mode."""
-    run = sf.Experiment(data, (next(iter(modes)),), (), 0.0, tf)
+    run = sf.Experiment(data, (next(iter(modes)),), (), 0.0, tf, name="log")
     return sf.Problem(sf.HybridSystem(modes, start), run, parameters)
 
 
@@ -114,7 +114,9 @@ def test_a_window_is_exact_for_a_linear_model():
     batch = sf.estimate(problem)
     for name in ("a", "b"):
         np.testing.assert_allclose(now.parameters[name], batch.parameters[name], rtol=1e-10, atol=1e-11)
-    np.testing.assert_allclose(online.estimate().theta[-3:-1], batch.theta[:2], rtol=1e-6)
+    fit = online.estimate()
+    np.testing.assert_allclose(fit.theta[-3:-1], batch.theta[:2], rtol=1e-6)
+    assert fit.problem.experiments[0].name == "log"
     np.testing.assert_allclose(now.standard_errors["a"], batch.standard_errors[0], rtol=1e-9)
 
 
