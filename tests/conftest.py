@@ -12,7 +12,6 @@ from hypothesis import settings
 
 import switchfit as sf
 from switchfit.batch import program as batch_program
-from switchfit.batch import program as layout
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 from switchfit.uncertainty import certificate
@@ -76,7 +75,7 @@ def pytest_configure(config):
     llvm.compile_modules = program.compile_modules = compile_quickly
 
 
-TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_jax_engine", "test_interrupt", "test_prediction")
+TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_interrupt", "test_prediction")
 """Files that share the programs of `systems.case`, which are most of what they take: one process runs them all."""
 
 LONGEST = (
@@ -136,7 +135,7 @@ def fits_one_by_one():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch_program, "_minimize_fits", refuse)
-        patch.setattr(layout, "runs_natively", lambda *given: False)  # evaluations are done one by one too
+        patch.setattr(batch_program, "runs_natively", lambda *given: False)  # evaluations are done one by one too
         yield
 
 

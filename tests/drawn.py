@@ -32,6 +32,7 @@ OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
     ast.Or: ("or", "and"),
 }
 
+<<<<<<< HEAD
 TESTS = {
     "batch": [
         "batch",
@@ -72,7 +73,33 @@ TESTS = {
     "runtime": ["progress", "save", "files", "threads", "bad_input"],
     "strategy": ["validate", "strategy", "known_order", "beam", "validation", "starts", "final_time"],
     "uncertainty": ["uncertainty", "profile", "prediction", "verdict"],
+=======
+NAMES = {
+    "batch": "batch sampling batch_intervals bootstrap many_logs verdict_many starts batch_guards",
+    "cli": "cli cli_modes cli_comparison cli_design online_cli init cli_pipe interrupt",
+    "discretization": "mesh implicit random_systems stiffness protocol",
+    "engine": "corners mesh stiffness following protocol native",
+    "engine/native": "native protocol random_systems beam implicit operations",
+    "estimation": "saved_problem estimate save mesh following bad_input",
+    "experiment_design": "design",
+    "fit": "estimate following finiteness accuracy starts strategy guards verdict",
+    "io": "io saved_problem init tables_out result_tables files log_times",
+    "io/logs": "logs log_formats units real_logs gps_drive dates log_times",
+    "io/problem_file": "io files dates saved_problem log_times bad_input cli_modes",
+    "models": "models vehicles vehicle_mechanics",
+    "modes": "modes schedule pulses insertion sharing",
+    "online": "online online_cli",
+    "optimize": "sqp qp equalities arrow batch strategy runs",
+    "paper": "paper closed_form",
+    "problem": "bad_input data corners dates validate functions finiteness zero_times_nan",
+    "report": "online_report report plots verdict tables_out modes validation verdict_many result_tables",
+    "report/html": "html",
+    "runtime": "progress save files threads bad_input",
+    "strategy": "validate strategy known_order beam validation compare starts final_time",
+    "uncertainty": "uncertainty profile prediction verdict derivative_check",
+>>>>>>> t6
 }
+TESTS = {room: names.split() for room, names in NAMES.items()}
 """What must notice the mistakes of each room: files of tests, one after the other until something does."""
 
 

@@ -19,32 +19,21 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS, IMPLICIT_ROWS = "paper_adjoint.py", "discretization/rows.py", "discretization/implicit_rows.py"
+MODEL, PROPAGATION = "discretization/model.py", "discretization/propagation.py"
+STRUCTURE, CORNERS = "problem/structure.py", "problem/corners.py"
 ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
 DIRECTION, POINT, QP, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "qp", "state"))
-MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
-BEAM, HYPOTHESES, HYPOTHESIS_LOOPS = (
-    "strategy/beam.py",
-    "engine/native/hypothesis_kernels.py",
-    "engine/native/hypothesis_loops.py",
+PROGRAMS, COURSE, SPLIT = "engine/jax.py", "engine/branches.py", "engine/choice.py"
+HYPOTHESES, HYPOTHESIS_LOOPS = "engine/native/hypothesis_kernels.py", "engine/native/hypothesis_loops.py"
+KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
+    f"engine/native/{name}.py" for name in ("kernels", "segments", "templates", "elimination", "llvm")
 )
-KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES, ELIMINATION, ROUTINES = (
-    f"engine/native/{name}.py" for name in ("kernels", "segments", "segments", "templates", "elimination", "llvm")
-)
-
-ONLINE, ONLINE_WINDOW, ONLINE_TRACKER = (f"online/{name}.py" for name in ("estimator", "tracker", "tracker"))
-
-CRITERION, GRADIENT, INPUTS, NOMINAL, EXCHANGE = (
-    f"experiment_design/{name}.py" for name in ("criterion", "criterion", "criterion", "criterion", "criterion")
-)
+BEAM, FITTER, MODE_POOL = "strategy/beam.py", "modes/fitter.py", "modes/hunt.py"
+ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design/criterion.py"
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
 FISHER = [*PROTOCOL, "-m", "slow or not slow", "-k", "derivatives_are_the_same and gauss"]
-PROGRAMS, GAUSS_NEWTON, PROPAGATION = (
-    "engine/jax.py",
-    "engine/jax.py",
-    "discretization/propagation.py",
-)
 TESTS = {
     "paper": [["tests/test_adjoint.py"]],
     "rows": [SYSTEMS],
@@ -74,443 +63,299 @@ SELECTIONS = TESTS | {
 }
 """The same, and of those that are drawn."""
 
-Replacements = list[tuple[str, str]]
 
-IN_PAPER: dict[str, Replacements] = {
-    "sign of X, (8)": [("X = f_im1 - f_i  # (8)", "X = f_i - f_im1  # (8)")],
-    "coefficient of X_ii 2 -> 1, (13)": [("- 2 * D1f_i @ f_im1", "- 1 * D1f_i @ f_im1")],
-    "dropped D ell X, (11)": [("second = second - here.Dell @ X + psi", "second = second + psi")],
-    "dropped psi . D1^2 f, (12)": [(" - contract(psi, d.D1D1f) - d.D1f.T", " - d.D1f.T")],
-    "dropped DpD1 f, (15)": [("d.D1D1f @ d.Dp_x + d.DpD1f)", "d.D1D1f @ d.Dp_x)")],
-    "dropped Dp f jump, (17)": [(" + here.Dpf_im1 - here.Dpf_i  # (17)", "  # (17)")],
-    "dropped D2 f jump, (13)": [(" + D2f_im1 - D2f_i  # (13)", "  # (13)")],
-    "dropped D1Dp f Dp_x, (14)": [(" + contract(psi, d.D1Dpf @ d.Dp_x)", "")],
-    "tau_j for tau_i, (13), the misprint": [
-        (
+Mistake = tuple[str, list[tuple[str, str]]]
+"""A file, and texts with what replaces them."""
+
+
+def swap(path: str, *texts: str) -> Mistake:
+    """Return the mistake in a file that replaces the first text by the second, the third by the fourth, and so on."""
+    return path, list(zip(texts[::2], texts[1::2], strict=True))
+
+
+BY_HAND: dict[str, dict[str, Mistake]] = {
+    "paper": {
+        "sign of X, (8)": swap(PAPER, "X = f_im1 - f_i  # (8)", "X = f_i - f_im1  # (8)"),
+        "coefficient of X_ii 2 -> 1, (13)": swap(PAPER, "- 2 * D1f_i @ f_im1", "- 1 * D1f_i @ f_im1"),
+        "dropped D ell X, (11)": swap(PAPER, "second = second - here.Dell @ X + psi", "second = second + psi"),
+        "dropped psi . D1^2 f, (12)": swap(PAPER, " - contract(psi, d.D1D1f) - d.D1f.T", " - d.D1f.T"),
+        "dropped DpD1 f, (15)": swap(PAPER, "d.D1D1f @ d.Dp_x + d.DpD1f)", "d.D1D1f @ d.Dp_x)"),
+        "dropped Dp f jump, (17)": swap(PAPER, " + here.Dpf_im1 - here.Dpf_i  # (17)", "  # (17)"),
+        "dropped D2 f jump, (13)": swap(PAPER, " + D2f_im1 - D2f_i  # (13)", "  # (13)"),
+        "dropped D1Dp f Dp_x, (14)": swap(PAPER, " + contract(psi, d.D1Dpf @ d.Dp_x)", ""),
+        "tau_j for tau_i, (13), the misprint": swap(
+            PAPER,
             "compute_tau_tau(i, here, adjoints, minus, plus)",
             "compute_tau_tau(i, here, adjoints, minus, plus, "
             "[evaluate_transition(model, path, i, tau[j], p).D1f_im1 for j in range(i)])",
-        ),
-        (
             "def compute_tau_tau("
             "i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities)",
             "def compute_tau_tau(i, here, adjoints, minus, plus, misprinted)",
+            "X_ij = D1f_im1 @ minus.Phi_X[:, j]",
+            "X_ij = misprinted[j] @ minus.Phi_X[:, j]",
         ),
-        ("X_ij = D1f_im1 @ minus.Phi_X[:, j]", "X_ij = misprinted[j] @ minus.Phi_X[:, j]"),
-    ],
-    "zero cross block, (3)": [("        H = H.at[i, N:].set(row[N:]).at[N:, i].set(row[N:])\n", "")],
-}
-
-IN_ROWS: dict[str, Replacements] = {
-    "h' in the tangents of the stages": [
-        ("X_d = X_d if h_d is None else X_d + h_d * combine(tableau.a[j], slopes)", "X_d = X_d")
-    ],
-    "h' in the tangent behind a row": [("after if h_d is None else after + h_d * combine(tableau.b, slopes)", "after")],
-    "D_1 f in the tangents": [("times_vector(f_x[j], X_d) + forcing[j]", "times_vector(f_x[j], x_d) + forcing[j]")],
-    "later stages in the adjoint": [("(b[j] * psi + later)", "(b[j] * psi)")],
-    "a transposed in the adjoint": [("[a[m][j] for m in range(j + 1, s)]", "[a[m][m - 1] for m in range(j + 1, s)]")],
-    "psi in the adjoint": [("psi + sum(mu[1:], mu[0])", "sum(mu[1:], mu[0])")],
-    "ell in what the length multiplies": [("((psi * slopes[j]).sum() + densities[j])", "(psi * slopes[j]).sum()")],
-    "mu in what the length multiplies": [
-        ("(mu[j] * combine(tableau.a[j], slopes)).sum()", "0.0 * combine(tableau.a[j], slopes).sum()")
-    ],
-    "times of the stages": [("[start_d + c * h_d for c", "[end_d - c * h_d for c")],
-}
-
-IN_NATIVE: dict[str, tuple[str, Replacements]] = {
-    "the time of a transition in a node": (
-        KERNELS,
-        [('g = g + g_t.item() * graph.load("moves", 0, vector=True)', "g = g + 0.0")],
-    ),
-    "the jump of the costate at a node": (
-        KERNELS,
-        [
-            (
-                '        stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])\n'
-                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
-                "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
-            )
-        ],
-    ),
-    "the multiplier of a terminal constraint": (
-        KERNELS,
-        [
-            (
-                "graph.loads(name, lengths[name]) for name in names",
-                'graph.loads("constraint" if lengths.get("multiplier", 1) > 1 and name == "multiplier" else name, '
-                "lengths[name]) for name in names",
-            )
-        ],
-    ),
-    "functions of another stage of a row": (
-        KERNELS,
-        [('graph.load("kept", j * len(kept) + k, certain', 'graph.load("kept", k, certain')],
-    ),
-    "half of the mixed entries in Z' S Z": (
-        KERNELS,
-        [("for one, other in {(k, m), (m, k)}:", "for one, other in {(k, m)}:")],
-    ),
-    "the length of a row in the Hessian": (
-        KERNELS,
-        [('+ graph.load("length", d) * (end_d - start_d)', "+ 0.0 * (end_d - start_d)")],
-    ),
-    "the reset map of another transition": (
-        SEGMENTS,
-        [
-            (
-                '"moves": writer.at(found["units"], segment, width),\n        "x_after"',
-                '"moves": found["units"],\n        "x_after"',
-            )
-        ],
-    ),
-    "the sample behind a transition": (
-        SAMPLE_LOOPS,
-        [("(cell >= begin)", "(cell > begin)")],
-    ),
-    "the costate of a late sample": (
-        SAMPLE_LOOPS,
-        [('"late": writer.at(found["late"], row, writer.sizes.n)', '"late": found["late"]')],
-    ),
-    "W in the Gauss-Newton matrix": (TEMPLATES, [("hb * apply_weights(W, A)", "hb * A")]),
-}
-
-IN_JAX: dict[str, tuple[str, Replacements]] = {
-    "weights of the stages": (
-        PROPAGATION,
-        [("[model.mode_of_segment][layout.segment]", "[model.mode_of_segment][layout.segment, ::-1]")],
-    ),
-    "samples at t0 in the costates": (PROGRAMS, [("jnp.where(s.cell[:, None] < 0, 0.0, s.weight)", "s.weight")]),
-    "the Fisher information of sigma": (GAUSS_NEWTON, [("H + 2.0 * jnp", "H + 1.0 * jnp")]),
-    "rho' in the Gauss-Newton matrix": (GAUSS_NEWTON, [("r_d, weight, r_d", "r_d, jnp.sign(weight), r_d")]),
-    "W in the Gauss-Newton matrix": (GAUSS_NEWTON, [("jax.vmap(partial(apply_weights, W))(at_stages)", "at_stages")]),
-}
-
-IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
-    "D_1 f x' in the tangents": (
-        IMPLICIT_ROWS,
-        [("[forcing[j] + times_vector(f_x[j], at(j, ())) for", "[forcing[j] for")],
-    ),
-    "h' in the tangents of the stages": (
-        IMPLICIT_ROWS,
-        [("x_d if h_d is None else x_d + h_d * combine(a[j], slopes[:s])", "x_d")],
-    ),
-    "a transposed in the adjoint": (IMPLICIT_ROWS, [("combine(a[:s, j], costs)", "combine(a[j, :s], costs)")]),
-    "the transposed equations": (IMPLICIT_ROWS, [(".solve(right, transposed=True)", ".solve(right)")]),
-    "f in the error of a row": (
-        IMPLICIT_ROWS,
-        [("damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)")],
-    ),
-    "the damping of the error": (
-        IMPLICIT_ROWS,
-        [("factorize(np.array([[damping]]), h, [f_x])", "factorize(np.array([[damping]]), 0.0 * h, [f_x])")],
-    ),
-    "a Jacobian of an earlier iteration": (
-        KERNELS,
-        [
-            (
-                "of_x = [J[1] for J in jacobians]",
-                "of_x = [stage(graph, *at(start, x), only=(F_X,))[0] if k else J[1] for J in jacobians]",
-            )
-        ],
-    ),
-    "the factors of the last row": (SEGMENTS, [('at(found["kept"], row,', 'at(found["kept"], 0,')]),
-    "the place of the factors": (ELIMINATION, [("graph.load(KEPT, k, certain", "graph.load(KEPT, k + 1, certain")]),
-    "the wrong stage at a late sample": (
-        KERNELS,
-        [
-            (
-                "x + (combine(tableau.b, k) if k",
-                'x + (combine(tableau.a[1] if "late" in name else tableau.b, k) if k',
-            )
-        ],
-    ),
-    "no second derivative of Newton's map": (
-        KERNELS,
-        [
-            (
-                "second[j] = list_entries(S, with_time=moving)",
-                "second[j] = list_entries(S * (not tableau.coupled), with_time=moving)",
-            )
-        ],
-    ),
-    "the order of the states": (ELIMINATION, [("x[np.argsort(self._order)]", "x")]),
-    "pivots of a routine": (ROUTINES, [("is_larger.choose(row,", "is_larger.choose(k,")]),
-    "a row that does not converge": (SEGMENTS, [('store(float("nan"),', "store(0.0,")]),
-    "too few of Newton's iterations": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-2, 1e-2")]),
-    "rounding errors of a state": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0")]),
-    "slopes of a row that moves": (
-        KERNELS,
-        [("(found.slopes if moving else [])", "([] if moving else [])")],
-    ),
-    "the length of a row in the Hessian": (
-        KERNELS,
-        [('K_d.append(graph.loads("XZ", n, (count + j) * n, vector=True))', "K_d.append(X_d)")],
-    ),
-}
-
-IN_SQP: dict[str, tuple[str, Replacements]] = {
-    "absolute values of eigenvalues": (
-        ALGEBRA,
-        [("replaced = xp.maximum(xp.abs(values), EIGENVALUE_REPLACEMENT)", "replaced = xp.maximum(values, 1e-3)")],
-    ),
-    "the decrease that a step must achieve": (
-        ALGEBRA,
-        [("((decrease <= noise) | (cost <= before - fraction * decrease))", "(cost <= before + 1e300 * fraction)")],
-    ),
-    "the size in what is active": (ALGEBRA, [("16 * EPS * (abs_b + abs_A @ size)", "0.0 * (abs_b + abs_A @ size)")]),
-    "bounds that press are reached exactly": (
-        QP,
-        [("np.where(own > 0.0, lower, np.where(own < 0.0, upper, step))", "np.where(own > 0.0, 0.999 * lower, step)")],
-    ),
-}
-
-IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
-    "second-order correction": (MERIT, [("if found is not None or not first:", "if True:")]),
-    "the penalty is raised": (
-        MERIT,
-        [("return penalty if penalty >= needed else RAISED * needed", "return penalty")],
-    ),
-    "a violation that does not change ends it": (
-        MERIT,
-        [
-            (
-                "return equalities.predict(normal) > FALL * point.violation",
-                "return False",
-            )
-        ],
-    ),
-    "constraints are measured anew": (POINT, [("grown = lengths > GROWN", "grown = lengths < 0.0")]),
-    "a violation that stays the same for a while is no end": (
-        MERIT,
-        [("return equalities.predict(normal) > FALL * point.violation", "return True")],
-    ),
-    "the constraints in the Hessian of the Lagrangian": (POINT, [("self.multipliers / units)", "0.0 * units)")]),
-    "bounds of the normal step": (
-        COMPOSITE,
-        [("if cube.holds(shortest):", "if True:")],
-    ),
-    "dependent rows": (COMPOSITE, [("self.triangular[:k] if self.rank == k else None", "self.triangular[:k]")]),
-    "curvature along the constraints alone": (
-        STATE,
-        [
-            (
-                "np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])",
-                "constraints.rows(rows)",
-            )
-        ],
-    ),
-    "kinks that keep constraints from being met": (
-        DIRECTION,
-        [("if best.left > max(HALF * point.violation, MET):", "if False:")],
-    ),
-}
-
-IN_FINAL_TIME: dict[str, tuple[str, Replacements]] = {
-    "the running cost at tf": (MODEL, [("if self.structure.is_rest(mode):", "if False:")]),
-    "rest after tf": (STRUCTURE, [("return jnp.zeros_like(x)", "return 0.1 * x")]),
-    "ell(tf) in (6)": (
-        PAPER,
-        [("ell_before(t, x, p) - ell_after(t, R(t, x, p), p)", "ell_before(t, x, p) - ell_before(t, R(t, x, p), p)")],
-    ),
-    "D ell behind tf in (11)": (PAPER, [("jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)")]),
-}
-
-FITTER, MODE_POOL = "modes/fitter.py", "modes/hunt.py"
-
-IN_MODES: dict[str, tuple[str, Replacements]] = {
-    "parameters that do not act are free": (FITTER, [("lower[held] = upper[held] = theta[held]", "pass")]),
-    "guarded times count": (MODE_POOL, [('if name == "cost" else fitted.free_switches', "if name else 0")]),
-    "a switch counts once in mBIC": ("modes/criterion.py", [('each = 2 if name == "mbic" else 1', "each = 1")]),
-    "what follows a pulse": (
-        "modes/schedule.py",
-        [("append(name, max(knots[k], end), knots[k + 1])", "append(name, knots[k], knots[k + 1])")],
-    ),
-    "reset maps of another sequence": (
-        "engine/native/experiment.py",
-        [("self._named[name][:] = which", "self._named[name][:] = which if name == 'modes' else -1")],
-    ),
-}
-
-
-IN_BEAM: dict[str, tuple[str, Replacements]] = {
-    "sign of the jump in Z": (HYPOTHESES, [("+ sign * graph.loads(", "- sign * graph.loads(")]),
-    "dropped F_p": (
-        HYPOTHESES,
-        [("self._along_p(graph, each) for each", "self._along_p(graph, 0.0 * each) for each")],
-    ),
-    "no column for tau": (HYPOTHESES, [("+ sign * graph.loads(", "+ 0.0 * sign * graph.loads(")]),
-    "column one slot off": (HYPOTHESIS_LOOPS, [("Column.SLOT) + 1", "Column.SLOT) + 2")]),
-    "a birth before the sample at its time": (
-        HYPOTHESIS_LOOPS,
-        [('self.invoke("at_node", table, record, here + 1)', 'self.invoke("at_node", table, record, here)')],
-    ),
-    "the highest scores of a place are kept": (
-        HYPOTHESIS_LOOPS,
-        [("leave(score >= self._load_score", "leave(score <= self._load_score")],
-    ),
-    "dropped penalty": (BEAM, [(" + self.penalty * switches", "")]),
-    "dropped limit for each sequence": ("strategy/library.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
-    "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),
-    "scores for costs": (BEAM, [("costs = states.costs + ((g", "costs = states.scores + 0 * ((g")]),
-    "sign of what other runs say": ("strategy/known_order.py", [("Q, Q @ center - g", "Q, Q @ center + g")]),
-    "own parameters of other runs that do not follow": (
-        "strategy/beam.py",
-        [
-            (
-                "solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)",
-                "solved = np.zeros((len(others), len(others)))",
-            )
-        ],
-    ),
-    "the rate of a guard": (HYPOTHESES, [('weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate")]),
-}
-
-CORNERS, COURSE, SPLIT = "problem/corners.py", "engine/branches.py", "engine/choice.py"
-
-IN_CORNERS: dict[str, tuple[str, Replacements]] = {
-    "the tangent of a crossing's time": (
-        SPLIT,
-        [("T[times] = -np.linalg.solve(square, A[rows[:, None], others])", "T[times] = 0.0")],
-    ),
-    "the multipliers of guards in the Hessian": (
-        SPLIT,
-        [('if matrix == "exact" and len(split.guards):', "if False:")],
-    ),
-    "times of crossings at another theta": (SPLIT, [("times[split.guarded] -= step", "pass")]),
-    "a path that does not hold any more": (
-        SPLIT,
-        [("if found is not None and self._holds(last, found[1], tau, p):", "if found is not None:")],
-    ),
-    "rows end at crossings": (
-        "engine/choice.py",
-        [("build(base) if run.branches is None else SplitEngine(", "build(base) if True else SplitEngine(")],
-    ),
-    "the side behind a crossing": (COURSE, [("behind if after == self.sides else after", "self.sides")]),
-    "sliding": (COURSE, [("\n            )\n        return 0", "\n            )\n        return 1")]),
-    "a jump of the input": (COURSE, [("if after != self.sides:", "if False:")]),
-    "the end of sliding": (CORNERS, [("[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]")]),
-    "motion of a corner in time": (CORNERS, [("(jnp.ones_like(t), f)", "(jnp.zeros_like(t), f)")]),
-    "both corners in the convex combination": (
-        CORNERS,
-        [("(b[0] * e - c * b[1]) / whole", "(b[0] * e + c * b[1]) / whole")],
-    ),
-    "the other case of a selection": (
-        CORNERS,
-        [("found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))")],
-    ),
-    "corners that are one": (CORNERS, [("tuple(sorted(pair))", "pair")]),
-    "the margin of a steep corner": (CORNERS, [("if sides[k] == side:", "if False:")]),
-    "rates at a steep corner": (COURSE, [("if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:")]),
-    "passed by an error of the solver": (
-        COURSE,
-        [("if found is not None and not self._returns(found, inside):", "if found:")],
-    ),
-    "a Gauss-Newton matrix called exact": (
-        SPLIT,
-        [('if split.has_gauss_newton and matrix == "exact":', "if False:")],
-    ),
-    "the size of a corner where a mode begins": (
-        COURSE,
-        [("= self._guess_scale(t, x, inside)", "= np.zeros(self.corners.count)")],
-    ),
-}
-
-IN_ONLINE = {
-    "what has left the window has no gradient": (
-        ONLINE_WINDOW,
-        [("Hypotheses(costs, costs, self.gradient + slope, matrices", "Hypotheses(costs, costs, slope, matrices")],
-    ),
-    "what has left the window is a diagonal": (
-        ONLINE_WINDOW,
-        [("(self.matrix + artificial)[None]", "(np.diag(np.diag(self.matrix)) + artificial)[None]")],
-    ),
-    "what has left the window counts half": (
-        ONLINE_WINDOW,
-        [("slope = along[:, :D]", "slope = 0.5 * along[:, :D]")],
-    ),
-    "no minimum along what has no effect": (
-        ONLINE_WINDOW,
-        [("H -= row[:, :, None] * row[:, None, :] / pivot", "H -= 0 * row[:, :, None] * row[:, None, :] / pivot")],
-    ),
-    "a new value is not joined to the old one": (
-        ONLINE_WINDOW,
-        [("[[1.0, -1.0], [-1.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]")],
-    ),
-    "the old value still moves the state": (
-        ONLINE_WINDOW,
-        [("tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0", "tangent[:, :entries] = 0.0")],
-    ),
-    "a change costs nothing": (
-        ONLINE_TRACKER,
-        [
-            (
-                "found.scores + self.settings.penalty * switches",
-                "found.scores + 0 * self.settings.penalty * switches",
-            )
-        ],
-    ),
-    "the hypotheses that decide are not propagated anew": (
-        ONLINE_TRACKER,
-        [("found.records[chosen] = anew.records[good]", "anew.records[good]")],
-    ),
-    "a late sample changes nothing before it": (
-        ONLINE,
-        [("changed = min(changed, node)", "changed = min(changed, node + 1)")],
-    ),
-    "a late sample keeps its time stamp": (
-        ONLINE,
-        [("t - float(self._sensors[k].delay)", "t - 0 * float(self._sensors[k].delay)")],
-    ),
-    "a reset keeps the number of values": (
-        ONLINE,
-        [
-            (
-                "self._values, self._fitted = 0, (0.0, 0)",
-                "self._values, self._fitted = getattr(self, '_values', 0), (0.0, 0)",
-            )
-        ],
-    ),
-    "a model that has lost the samples recovers": (ONLINE, [("self._lost = now", "self._lost = None")]),
-    "inputs hold before they come": (ONLINE, [("return given if before is None else before", "return given")]),
-    "the journal forgets the inputs": ("online/saved.py", [('"u": _listed(u)', '"u": None')]),
-}
-
-IN_DESIGN = {
-    "sign of the criterion's slope": (CRITERION, [("return mean, -xp.swapaxes", "return mean, xp.swapaxes")]),
-    "A in place of D": (CRITERION, [('{"D": 0.0,', '{"D": 1.0,')]),
-    "information of one side": (CRITERION, [("SIDES = (1, -1)", "SIDES = (1, 1)")]),
-    "scales left out": (CRITERION, [("basis[self.chosen] / self.scales[:, None]", "basis[self.chosen]")]),
-    "priors and other runs left out": (NOMINAL, [("self.information - sum(found))", "0 * self.information)")]),
-    "guarded times stay where they are": (NOMINAL, [("= -np.linalg.solve(slopes", "= -0 * np.linalg.solve(slopes")]),
-    "weights of samples left out": (GRADIENT, [("taken, C, w, C)", "taken, C, w**0, C)")]),
-    "samples that are not taken count": (GRADIENT, [("taken, C, w, C)", "taken**0, C, w, C)")]),
-    "information of sigma once": (GRADIENT, [("+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum")]),
-    "gradient of one side": (GRADIENT, [(".mean(0)", "[0]")]),
-    "limits of inputs ignored": (INPUTS, [("bounds=[(0.0, 1.0)]", "bounds=[(-1.0, 2.0)]")]),
-    "samples of two sensors are exchanged": (EXCHANGE, [("~taken & (sensor == sensor[out])", "~taken")]),
-    "no exchange": (EXCHANGE, [("while improved:", "while not improved:")]),
-}
-
-MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
-    **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
-    **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
-    **{("native", name): mistake for name, mistake in IN_NATIVE.items()},
-    **{("jax", name): mistake for name, mistake in IN_JAX.items()},
-    **{("implicit", name): mistake for name, mistake in IN_IMPLICIT.items()},
-    **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
-    **{("equalities", name): mistake for name, mistake in IN_EQUALITIES.items()},
-    **{("beam", name): mistake for name, mistake in IN_BEAM.items()},
-    **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
-    **{("corners", name): mistake for name, mistake in IN_CORNERS.items()},
-    **{("online", name): mistake for name, mistake in IN_ONLINE.items()},
-    **{("design", name): mistake for name, mistake in IN_DESIGN.items()},
-    **{("modes", name): mistake for name, mistake in IN_MODES.items()},
-    **{
-        (f"room {room}", name): (path, [(text, mistaken)])
-        for room, name, path, text, mistaken in drawn.draw_mistakes(SOURCE)
+        "zero cross block, (3)": swap(PAPER, "        H = H.at[i, N:].set(row[N:]).at[N:, i].set(row[N:])\n", ""),
+    },
+    "rows": {
+        "h' in the tangents of the stages": swap(
+            ROWS, "X_d = X_d if h_d is None else X_d + h_d * combine(tableau.a[j], slopes)", "X_d = X_d"
+        ),
+        "h' in the tangent behind a row": swap(
+            ROWS, "after if h_d is None else after + h_d * combine(tableau.b, slopes)", "after"
+        ),
+        "D_1 f in the tangents": swap(
+            ROWS, "times_vector(f_x[j], X_d) + forcing[j]", "times_vector(f_x[j], x_d) + forcing[j]"
+        ),
+        "later stages in the adjoint": swap(ROWS, "(b[j] * psi + later)", "(b[j] * psi)"),
+        "a transposed in the adjoint": swap(
+            ROWS, "[a[m][j] for m in range(j + 1, s)]", "[a[m][m - 1] for m in range(j + 1, s)]"
+        ),
+        "psi in the adjoint": swap(ROWS, "psi + sum(mu[1:], mu[0])", "sum(mu[1:], mu[0])"),
+        "ell in what the length multiplies": swap(
+            ROWS, "((psi * slopes[j]).sum() + densities[j])", "(psi * slopes[j]).sum()"
+        ),
+        "mu in what the length multiplies": swap(
+            ROWS, "(mu[j] * combine(tableau.a[j], slopes)).sum()", "0.0 * combine(tableau.a[j], slopes).sum()"
+        ),
+        "times of the stages": swap(ROWS, "[start_d + c * h_d for c", "[end_d - c * h_d for c"),
+    },
+    "native": {
+        "the time of a transition in a node": swap(
+            KERNELS, 'g = g + g_t.item() * graph.load("moves", 0, vector=True)', "g = g + 0.0"
+        ),
+        "functions of another stage of a row": swap(
+            KERNELS, 'graph.load("kept", j * len(kept) + k, certain', 'graph.load("kept", k, certain'
+        ),
+        "half of the mixed entries in Z' S Z": swap(
+            KERNELS, "for one, other in {(k, m), (m, k)}:", "for one, other in {(k, m)}:"
+        ),
+        "the length of a row in the Hessian": swap(
+            KERNELS, '+ graph.load("length", d) * (end_d - start_d)', "+ 0.0 * (end_d - start_d)"
+        ),
+        "the sample behind a transition": swap(SEGMENTS, "(cell >= begin)", "(cell > begin)"),
+        "W in the Gauss-Newton matrix": swap(TEMPLATES, "hb * apply_weights(W, A)", "hb * A"),
+    },
+    "jax": {
+        "weights of the stages": swap(
+            PROPAGATION, "[model.mode_of_segment][layout.segment]", "[model.mode_of_segment][layout.segment, ::-1]"
+        ),
+        "samples at t0 in the costates": swap(PROGRAMS, "jnp.where(s.cell[:, None] < 0, 0.0, s.weight)", "s.weight"),
+        "the Fisher information of sigma": swap(PROGRAMS, "H + 2.0 * jnp", "H + 1.0 * jnp"),
+        "rho' in the Gauss-Newton matrix": swap(PROGRAMS, "r_d, weight, r_d", "r_d, jnp.sign(weight), r_d"),
+        "W in the Gauss-Newton matrix": swap(PROGRAMS, "jax.vmap(partial(apply_weights, W))(at_stages)", "at_stages"),
+    },
+    "implicit": {
+        "D_1 f x' in the tangents": swap(
+            IMPLICIT_ROWS, "[forcing[j] + times_vector(f_x[j], at(j, ())) for", "[forcing[j] for"
+        ),
+        "h' in the tangents of the stages": swap(
+            IMPLICIT_ROWS, "x_d if h_d is None else x_d + h_d * combine(a[j], slopes[:s])", "x_d"
+        ),
+        "a transposed in the adjoint": swap(IMPLICIT_ROWS, "combine(a[:s, j], costs)", "combine(a[j, :s], costs)"),
+        "the transposed equations": swap(IMPLICIT_ROWS, ".solve(right, transposed=True)", ".solve(right)"),
+        "f in the error of a row": swap(
+            IMPLICIT_ROWS, "damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)"
+        ),
+        "the factors of the last row": swap(SEGMENTS, 'at(found["kept"], row,', 'at(found["kept"], 0,'),
+        "no second derivative of Newton's map": swap(
+            KERNELS,
+            "second[j] = list_entries(S, with_time=moving)",
+            "second[j] = list_entries(S * (not tableau.coupled), with_time=moving)",
+        ),
+        "the order of the states": swap(ELIMINATION, "x[np.argsort(self._order)]", "x"),
+        "pivots of a routine": swap(ROUTINES, "is_larger.choose(row,", "is_larger.choose(k,"),
+        "a row that does not converge": swap(SEGMENTS, 'store(float("nan"),', "store(0.0,"),
+        "rounding errors of a state": swap(KERNELS, "CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0"),
+        "slopes of a row that moves": swap(KERNELS, "(found.slopes if moving else [])", "([] if moving else [])"),
+        "the length of a row in the Hessian": swap(
+            KERNELS, 'K_d.append(graph.loads("XZ", n, (count + j) * n, vector=True))', "K_d.append(X_d)"
+        ),
+    },
+    "sqp": {
+        "absolute values of eigenvalues": swap(
+            ALGEBRA,
+            "replaced = xp.maximum(xp.abs(values), EIGENVALUE_REPLACEMENT)",
+            "replaced = xp.maximum(values, 1e-3)",
+        ),
+        "the decrease that a step must achieve": swap(
+            ALGEBRA,
+            "((decrease <= noise) | (cost <= before - fraction * decrease))",
+            "(cost <= before + 1e300 * fraction)",
+        ),
+        "the size in what is active": swap(
+            ALGEBRA, "16 * EPS * (abs_b + abs_A @ size)", "0.0 * (abs_b + abs_A @ size)"
+        ),
+        "bounds that press are reached exactly": swap(
+            QP,
+            "np.where(own > 0.0, lower, np.where(own < 0.0, upper, step))",
+            "np.where(own > 0.0, 0.999 * lower, step)",
+        ),
+    },
+    "equalities": {
+        "second-order correction": swap(MERIT, "if found is not None or not first:", "if True:"),
+        "the penalty is raised": swap(
+            MERIT, "return penalty if penalty >= needed else RAISED * needed", "return penalty"
+        ),
+        "a violation that does not change ends it": swap(
+            MERIT, "return equalities.predict(normal) > FALL * point.violation", "return False"
+        ),
+        "constraints are measured anew": swap(POINT, "grown = lengths > GROWN", "grown = lengths < 0.0"),
+        "a violation that stays the same for a while is no end": swap(
+            MERIT, "return equalities.predict(normal) > FALL * point.violation", "return True"
+        ),
+        "the constraints in the Hessian of the Lagrangian": swap(POINT, "self.multipliers / units)", "0.0 * units)"),
+        "bounds of the normal step": swap(COMPOSITE, "if cube.holds(shortest):", "if True:"),
+        "dependent rows": swap(COMPOSITE, "self.triangular[:k] if self.rank == k else None", "self.triangular[:k]"),
+        "curvature along the constraints alone": swap(
+            STATE,
+            "np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])",
+            "constraints.rows(rows)",
+        ),
+        "kinks that keep constraints from being met": swap(
+            DIRECTION, "if best.left > max(HALF * point.violation, MET):", "if False:"
+        ),
+    },
+    "final time": {
+        "the running cost at tf": swap(MODEL, "if self.structure.is_rest(mode):", "if False:"),
+        "rest after tf": swap(STRUCTURE, "return jnp.zeros_like(x)", "return 0.1 * x"),
+        "ell(tf) in (6)": swap(
+            PAPER,
+            "ell_before(t, x, p) - ell_after(t, R(t, x, p), p)",
+            "ell_before(t, x, p) - ell_before(t, R(t, x, p), p)",
+        ),
+        "D ell behind tf in (11)": swap(PAPER, "jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)"),
+    },
+    "modes": {
+        "parameters that do not act are free": swap(FITTER, "lower[held] = upper[held] = theta[held]", "pass"),
+        "guarded times count": swap(MODE_POOL, 'if name == "cost" else fitted.free_switches', "if name else 0"),
+        "a switch counts once in mBIC": swap("modes/criterion.py", 'each = 2 if name == "mbic" else 1', "each = 1"),
+        "what follows a pulse": swap(
+            "modes/schedule.py",
+            "append(name, max(knots[k], end), knots[k + 1])",
+            "append(name, knots[k], knots[k + 1])",
+        ),
+        "reset maps of another sequence": swap(
+            "engine/native/experiment.py",
+            "self._named[name][:] = which",
+            "self._named[name][:] = which if name == 'modes' else -1",
+        ),
+    },
+    "beam": {
+        "sign of the jump in Z": swap(HYPOTHESES, "+ sign * graph.loads(", "- sign * graph.loads("),
+        "dropped F_p": swap(
+            HYPOTHESES, "self._along_p(graph, each) for each", "self._along_p(graph, 0.0 * each) for each"
+        ),
+        "no column for tau": swap(HYPOTHESES, "+ sign * graph.loads(", "+ 0.0 * sign * graph.loads("),
+        "column one slot off": swap(HYPOTHESIS_LOOPS, "Column.SLOT) + 1", "Column.SLOT) + 2"),
+        "a birth before the sample at its time": swap(
+            HYPOTHESIS_LOOPS,
+            'self.invoke("at_node", table, record, here + 1)',
+            'self.invoke("at_node", table, record, here)',
+        ),
+        "the highest scores of a place are kept": swap(
+            HYPOTHESIS_LOOPS, "leave(score >= self._load_score", "leave(score <= self._load_score"
+        ),
+        "dropped penalty": swap(BEAM, " + self.penalty * switches", ""),
+        "dropped limit for each sequence": swap("strategy/library.py", "PER_SEQUENCE = 3", "PER_SEQUENCE = 3000"),
+        "sign of the shift": swap(HYPOTHESES, 'graph.load("x", i) + (', 'graph.load("x", i) - ('),
+        "scores for costs": swap(BEAM, "costs = states.costs + ((g", "costs = states.scores + 0 * ((g"),
+        "sign of what other runs say": swap("strategy/known_order.py", "Q, Q @ center - g", "Q, Q @ center + g"),
+        "own parameters of other runs that do not follow": swap(
+            "strategy/beam.py",
+            "solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)",
+            "solved = np.zeros((len(others), len(others)))",
+        ),
+        "the rate of a guard": swap(HYPOTHESES, 'weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate"),
+    },
+    "corners": {
+        "the tangent of a crossing's time": swap(
+            SPLIT, "T[times] = -np.linalg.solve(square, A[rows[:, None], others])", "T[times] = 0.0"
+        ),
+        "the multipliers of guards in the Hessian": swap(
+            SPLIT, 'if matrix == "exact" and len(split.guards):', "if False:"
+        ),
+        "times of crossings at another theta": swap(SPLIT, "times[split.guarded] -= step", "pass"),
+        "a path that does not hold any more": swap(
+            SPLIT, "if found is not None and self._holds(last, found[1], tau, p):", "if found is not None:"
+        ),
+        "the side behind a crossing": swap(COURSE, "behind if after == self.sides else after", "self.sides"),
+        "sliding": swap(COURSE, "\n            )\n        return 0", "\n            )\n        return 1"),
+        "a jump of the input": swap(COURSE, "if after != self.sides:", "if False:"),
+        "the end of sliding": swap(CORNERS, "[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]"),
+        "motion of a corner in time": swap(CORNERS, "(jnp.ones_like(t), f)", "(jnp.zeros_like(t), f)"),
+        "both corners in the convex combination": swap(
+            CORNERS, "(b[0] * e - c * b[1]) / whole", "(b[0] * e + c * b[1]) / whole"
+        ),
+        "the other case of a selection": swap(
+            CORNERS, "found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))"
+        ),
+        "corners that are one": swap(CORNERS, "tuple(sorted(pair))", "pair"),
+        "the margin of a steep corner": swap(CORNERS, "if sides[k] == side:", "if False:"),
+        "rates at a steep corner": swap(COURSE, "if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:"),
+        "passed by an error of the solver": swap(
+            COURSE, "if found is not None and not self._returns(found, inside):", "if found:"
+        ),
+        "a Gauss-Newton matrix called exact": swap(
+            SPLIT, 'if split.has_gauss_newton and matrix == "exact":', "if False:"
+        ),
+        "the size of a corner where a mode begins": swap(
+            COURSE, "= self._guess_scale(t, x, inside)", "= np.zeros(self.corners.count)"
+        ),
+    },
+    "online": {
+        "what has left the window is a diagonal": swap(
+            TRACKER, "(self.matrix + artificial)[None]", "(np.diag(np.diag(self.matrix)) + artificial)[None]"
+        ),
+        "what has left the window counts half": swap(TRACKER, "slope = along[:, :D]", "slope = 0.5 * along[:, :D]"),
+        "no minimum along what has no effect": swap(
+            TRACKER,
+            "H -= row[:, :, None] * row[:, None, :] / pivot",
+            "H -= 0 * row[:, :, None] * row[:, None, :] / pivot",
+        ),
+        "a new value is not joined to the old one": swap(
+            TRACKER, "[[1.0, -1.0], [-1.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]"
+        ),
+        "the old value still moves the state": swap(
+            TRACKER, "tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0", "tangent[:, :entries] = 0.0"
+        ),
+        "the hypotheses that decide are not propagated anew": swap(
+            TRACKER, "found.records[chosen] = anew.records[good]", "anew.records[good]"
+        ),
+        "a late sample changes nothing before it": swap(
+            ONLINE, "changed = min(changed, node)", "changed = min(changed, node + 1)"
+        ),
+        "a late sample keeps its time stamp": swap(
+            ONLINE, "t - float(self._sensors[k].delay)", "t - 0 * float(self._sensors[k].delay)"
+        ),
+        "a model that has lost the samples recovers": swap(ONLINE, "self._lost = now", "self._lost = None"),
+        "inputs hold before they come": swap(ONLINE, "return given if before is None else before", "return given"),
+        "the journal forgets the inputs": swap("online/saved.py", '"u": _listed(u)', '"u": None'),
+    },
+    "design": {
+        "sign of the criterion's slope": swap(CRITERION, "return mean, -xp.swapaxes", "return mean, xp.swapaxes"),
+        "A in place of D": swap(CRITERION, '{"D": 0.0,', '{"D": 1.0,'),
+        "information of one side": swap(CRITERION, "SIDES = (1, -1)", "SIDES = (1, 1)"),
+        "scales left out": swap(CRITERION, "basis[self.chosen] / self.scales[:, None]", "basis[self.chosen]"),
+        "priors and other runs left out": swap(CRITERION, "self.information - sum(found))", "0 * self.information)"),
+        "guarded times stay where they are": swap(
+            CRITERION, "= -np.linalg.solve(slopes", "= -0 * np.linalg.solve(slopes"
+        ),
+        "weights of samples left out": swap(CRITERION, "taken, C, w, C)", "taken, C, w**0, C)"),
+        "samples that are not taken count": swap(CRITERION, "taken, C, w, C)", "taken**0, C, w, C)"),
+        "information of sigma once": swap(CRITERION, "+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum"),
+        "gradient of one side": swap(CRITERION, ".mean(0)", "[0]"),
+        "limits of inputs ignored": swap(CRITERION, "bounds=[(0.0, 1.0)]", "bounds=[(-1.0, 2.0)]"),
+        "samples of two sensors are exchanged": swap(CRITERION, "~taken & (sensor == sensor[out])", "~taken"),
+        "no exchange": swap(CRITERION, "while improved:", "while not improved:"),
     },
 }
-"""All mistakes by part and name: the file, and what is replaced in it."""
+"""Those that were thought of, by part and name."""
+
+MISTAKES = {(part, name): mistake for part, found in BY_HAND.items() for name, mistake in found.items()} | {
+    (f"room {room}", name): swap(path, text, mistaken)
+    for room, name, path, text, mistaken in drawn.draw_mistakes(SOURCE)
+}
+"""All of them, with those that are drawn."""
 
 
 def mutate(part: str, name: str) -> tuple[str, str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from typing import Any
 
 import jax
@@ -187,6 +187,11 @@ class Case:
         self.structure = structure if implicit is None else replace(structure, implicit=implicit)
         self.tau = problem.experiments[0].initial_times
         self.N = len(self.tau)
+        self._paper = compiled(lambda given, *at: compute_paper_derivatives(Model(self.structure, given), *at))
+        self._discrete = compiled(self._differentiate("discrete-adjoint"))
+        self._forward = compiled(self._differentiate("forward"))
+        self._gauss_newton = compiled(self._differentiate("forward", "gauss-newton"))
+        self._cost = compiled(self._simulate)
 
     def arguments(self, kind: str = "all", *, halvings: int = 0, equal: float = 0.0) -> Arguments:
         """Arguments of one of `SYSTEMS`, on the mesh of `NODES` with each cell halved some times."""
@@ -195,31 +200,11 @@ class Case:
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
         return weighted(build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
 
-    @cached_property
-    def _paper(self) -> Callable[..., Any]:
-        return compiled(lambda arguments, *at: compute_paper_derivatives(Model(self.structure, arguments), *at))
-
-    @cached_property
-    def _discrete(self) -> Callable[..., Any]:
-        return compiled(self._differentiate("discrete-adjoint"))
-
-    @cached_property
-    def _forward(self) -> Callable[..., Any]:
-        return compiled(self._differentiate("forward"))
-
-    @cached_property
-    def _gauss_newton(self) -> Callable[..., Any]:
-        return compiled(self._differentiate("forward", "gauss-newton"))
-
     def _differentiate(self, method: Any, matrix: Any = "exact") -> Callable[..., Any]:
         return lambda *at: derivatives(*at, structure=self.structure, method=method, matrix=matrix)
 
-    @cached_property
-    def _cost(self) -> Callable[..., Any]:
-        return compiled(lambda arguments, tau, p, side: self._simulate(arguments, jnp.concatenate([tau, p]), side))
-
-    def _simulate(self, arguments, theta, side):
-        model, tau, p = Model(self.structure, arguments), theta[: self.N], theta[self.N :]
+    def _simulate(self, arguments: Arguments, tau: Any, p: Any, side: int) -> Any:
+        model = Model(self.structure, arguments)
         return compute_path_cost(model, propagate(model, tau, p, side), p)
 
     def cost(self, *given: Any) -> float:

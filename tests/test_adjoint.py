@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from systems import KINDS, KNOTS, NODES, P0, Case, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
+from systems import KINDS, KNOTS, NODES, P0, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
 
 from switchfit.discretization.mesh import build_arguments
 from switchfit.discretization.model import Model
@@ -56,13 +56,8 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
         paper, discrete = this.paper(*given), this.discrete(*given)
         assert paper.cost == pytest.approx(discrete.cost, rel=1e-12)
         gradient, hessian = np.abs(discrete.gradient).max(), np.abs(discrete.hessian).max()
-        found.append(
-            blocks(
-                this.N,
-                (paper.gradient - discrete.gradient) / gradient,
-                (paper.hessian - discrete.hessian) / hessian,
-            )
-        )
+        away = (paper.gradient - discrete.gradient) / gradient, (paper.hessian - discrete.hessian) / hessian
+        found.append(blocks(this.N, *away))
     return found
 
 
@@ -123,43 +118,31 @@ def test_one_sided_derivatives_at_a_sample_differ_by_dell_x(method: str) -> None
     np.testing.assert_allclose((left - right)[1], expected, rtol=1e-6)
 
 
-def test_derivatives_at_a_sample_converge_from_both_sides() -> None:
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("nodes", [[4, 9, 14], [4, 4, 13]], ids=["at a sample", "coinciding"])
+def test_derivatives_converge_from_both_sides(nodes: list[int], side: int) -> None:
     this = case("resets")
-    tau = np.array([NODES[4], NODES[9], NODES[14]])
-    for side in (-1, 1):
-        given = this.arguments(halvings=3), tau, P0, side
-        paper, discrete = this.paper(*given), this.discrete(*given)
-        np.testing.assert_allclose(paper.gradient, discrete.gradient, atol=1e-7)
-        np.testing.assert_allclose(paper.hessian, discrete.hessian, atol=1e-6)
+    given = this.arguments(halvings=3), NODES[nodes], P0, side
+    paper, discrete = this.paper(*given), this.discrete(*given)
+    np.testing.assert_allclose(paper.gradient, discrete.gradient, atol=1e-7)
+    np.testing.assert_allclose(paper.hessian, discrete.hessian, atol=1e-6)
 
 
-def test_coinciding_transitions() -> None:
-    this = case("resets")
-    given = this.arguments(halvings=3), NODES[[4, 4, 13]], P0
-    np.testing.assert_allclose(this.paper(*given).hessian, this.discrete(*given).hessian, atol=1e-6)
+CLOSED = {
+    "with a reset map": (1, False, lambda z: closed_form(z[0], z[1]), [0.9, 0.7], (1e-8, 1e-6)),
+    "without parameters": (1, True, lambda z: closed_form(z[0], 0.7), [0.9], (1e-8, 1e-6)),
+    "without transitions": (0, False, lambda z: z[0] ** 2 * 4 / 3, [0.7], (1e-12, 1e-12)),
+}
 
 
-def closed_form_arguments(this: Case):
-    return build_arguments(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
-
-
-def test_closed_form_with_reset_map() -> None:
-    this = closed_form_case(transitions=1, q=Parameter(0.7))
-    found = this.paper(closed_form_arguments(this), [0.9], [0.7])
-    _, gradient, hessian = differentiate(lambda z: closed_form(z[0], z[1]), [0.9, 0.7])
-    np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
-    np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)
-
-
-def test_without_parameters() -> None:
-    this = closed_form_case(transitions=1, q=Parameter(0.7, fixed=True))
-    found = this.paper(closed_form_arguments(this), [0.9], np.zeros(0))
-    _, _, expected = differentiate(lambda tau: closed_form(tau, 0.7), 0.9)
-    assert found.hessian.shape == (1, 1)
-    np.testing.assert_allclose(found.hessian[0, 0], expected, rtol=1e-6)
-
-
-def test_without_transitions() -> None:
-    this = closed_form_case(transitions=0, q=Parameter(0.7))
-    found = this.paper(closed_form_arguments(this), np.zeros(0), [0.7])
-    np.testing.assert_allclose([found.gradient[0], found.hessian[0, 0]], [0.7 * 8 / 3, 8 / 3], rtol=1e-12)
+@pytest.mark.parametrize("name", CLOSED)
+def test_closed_forms(name: str) -> None:
+    transitions, fixed, cost, theta, (first, second) = CLOSED[name]
+    tau, p = np.split(np.array(theta), [transitions])
+    this = closed_form_case(transitions=transitions, q=Parameter(0.7, fixed=fixed))
+    mesh = padded_mesh(np.linspace(0.0, 2.0, 41), 40)
+    found = this.paper(build_arguments(this.problem, 0, mesh), tau, p)
+    J, gradient, hessian = differentiate(cost, theta)
+    assert found.cost == pytest.approx(J, rel=1e-8)
+    np.testing.assert_allclose(found.gradient, gradient, rtol=first)
+    np.testing.assert_allclose(found.hessian, hessian, rtol=second)

@@ -1,5 +1,8 @@
 """Corners of the state inside a mode: sign, abs, where, maximum, clip, interp."""
 
+import inspect
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,8 +38,8 @@ def problem_of(mode, start, parameters, tf=4.0, data=None, inputs=None, count=40
 # --- finding them -----------------------------------------------------------------------------------------------------
 
 
-def corners_of(mode, inputs=None, n=2, **parameters):
-    problem = problem_of(mode, np.ones(n), {"w": 0.7, **parameters}, tf=1.0, count=1, inputs=inputs)
+def corners_of(mode, inputs=None, n=2):
+    problem = problem_of(mode, np.ones(n), {"w": 0.7}, tf=1.0, count=1, inputs=inputs)
     return find_corners(problem.structures[0].modes[0])
 
 
@@ -73,24 +76,6 @@ MODES = {
 """Slopes of (x, p), and how many corners they have."""
 
 
-@pytest.mark.parametrize("name", MODES)
-def test_each_corner_is_found_once(name):
-    slope, count = MODES[name]
-    found = corners_of(stacked(slope))
-    assert found.count == count
-    assert all(line.startswith("test_corners.py:") for line in found.lines)
-
-
-def test_what_does_not_change_with_the_state_has_no_corner():
-    assert corners_of(stacked(lambda x, p: -p["w"] * x[0] * jnp.sin(x[1]))).count == 0
-    assert corners_of(lambda t, x, p: jnp.where(t > p["w"], 1.0, -1.0) * jnp.maximum(p["w"], 0.0) * x).count == 0
-    inputs = sf.Input(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-    assert corners_of(lambda t, x, p, u: jnp.abs(u - p["w"]) * jnp.where(u > t, 1.0, x[0]) * x, inputs).count == 0
-
-
-# --- branches ---------------------------------------------------------------------------------------------------------
-
-
 def sides_at(corners, given):
     """The sides at a point; where an operation is inside another, its g depends on the side of the other."""
     sides = (1,) * corners.count
@@ -100,9 +85,12 @@ def sides_at(corners, given):
 
 
 @pytest.mark.parametrize("name", MODES)
-def test_a_branch_is_the_mode_where_its_sides_are_those_of_the_state(name):
+def test_each_corner_is_found_once_and_a_branch_is_the_mode_on_its_sides(name):
     """With its derivatives; and it has no corner that could be crossed, wherever the state is."""
-    corners = corners_of(stacked(MODES[name][0]))
+    slope, count = MODES[name]
+    corners = corners_of(stacked(slope))
+    assert corners.count == count
+    assert all(line.startswith("test_corners.py:") for line in corners.lines)
     mode, seen = corners.function, set()
     rng = np.random.default_rng(3)
     w = [np.array(0.7)] * len(mode.parameters)
@@ -118,6 +106,13 @@ def test_a_branch_is_the_mode_where_its_sides_are_those_of_the_state(name):
             found, expected = (jax.jacfwd(lambda x, f=f: f.evaluate([0.3, x, *w]))(x) for f in (branch, mode))
             np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
     assert len(seen) > 1
+
+
+def test_what_does_not_change_with_the_state_has_no_corner():
+    assert corners_of(stacked(lambda x, p: -p["w"] * x[0] * jnp.sin(x[1]))).count == 0
+    assert corners_of(lambda t, x, p: jnp.where(t > p["w"], 1.0, -1.0) * jnp.maximum(p["w"], 0.0) * x).count == 0
+    inputs = sf.Input(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    assert corners_of(lambda t, x, p, u: jnp.abs(u - p["w"]) * jnp.where(u > t, 1.0, x[0]) * x, inputs).count == 0
 
 
 def test_a_branch_leaves_out_what_has_no_slope_on_the_other_side():
@@ -156,33 +151,16 @@ def test_sliding_stays_on_its_corners_and_is_a_convex_combination(seed):
             rates = normals @ f - np.array([0.4, -0.2]) * 0.4
             np.testing.assert_allclose(rates[kept], 0.0, atol=1e-12 * np.abs(f).max())
             np.testing.assert_allclose(corners.rates(sides).evaluate(given), rates, rtol=1e-12, atol=1e-12)
-            values = np.asarray(corners.ends(sides).evaluate(given))
-            parts = {
-                k: value
-                for (k, side), value in zip(corners.list_ends(sides), values, strict=True)
-                if side == -1 and sides[k] == 0
-            }
+            ends = dict(zip(corners.list_ends(sides), np.asarray(corners.ends(sides).evaluate(given)), strict=True))
             base = tuple(side or -1 for side in sides)
-            expected = fields[base] + sum(
-                part * (fields[(*base[:k], 1, *base[k + 1 :])] - fields[base]) for k, part in parts.items()
-            )
+            expected = fields[base].copy()
+            for k in kept:
+                expected += ends[k, -1] * (fields[(*base[:k], 1, *base[k + 1 :])] - fields[base])
+                assert ends[k, 1] == pytest.approx(1.0 - ends[k, -1], rel=1e-12)
             np.testing.assert_allclose(f, expected, rtol=1e-12, atol=1e-12)
-            for k, part in parts.items():
-                there = [v for (j, s), v in zip(corners.list_ends(sides), values, strict=True) if (j, s) == (k, 1)]
-                np.testing.assert_allclose(there, [1.0 - part], rtol=1e-12, atol=1e-12)
-
-
-def value_of(solution, times, q):
-    """A solution at times, in float64."""
-    with use_float64():
-        return np.asarray(solution(jnp.asarray(times), jnp.asarray(q)))
 
 
 # --- closed forms -----------------------------------------------------------------------------------------------------
-
-
-def sample_cost(x, times):
-    return 0.5 * jnp.sum((x - jnp.cos(times)) ** 2)
 
 
 def spring(t, x, p):
@@ -216,64 +194,16 @@ def heater_at(t, q):
     return jnp.minimum(b / a * (1.0 - jnp.exp(-a * t)), reached)
 
 
-TABLE_X, TABLE_Y = np.array([0.0, 0.5, 1.0, 2.5]), np.array([0.1, 0.2, 1.0, 1.6])
-
-
-def table(t, x, p):
-    return jnp.stack([-p["a"] * jnp.interp(x[0], TABLE_X, TABLE_Y)])
-
-
-def table_at(t, q):
-    """An exponential between each two knots, from the last but half a unit downwards; below the first, a line."""
-    (a,), start, begin, found = q, 2.0, 0.0, 0.0
-    for left, right, low, high in zip(TABLE_X[-2::-1], TABLE_X[:0:-1], TABLE_Y[-2::-1], TABLE_Y[:0:-1], strict=True):
-        slope = (high - low) / (right - left)
-        still = left - low / slope  # where the line of this piece is 0
-        x = still + (start - still) * jnp.exp(-a * slope * (t - begin))
-        found = jnp.where(t >= begin, x, found)
-        begin, start = begin + jnp.log((start - still) / (left - still)) / (a * slope), left
-    return jnp.where(t >= begin, -a * TABLE_Y[0] * (t - begin), found)
-
-
-CLOSED = {
-    "spring": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.9}, spring_at),
-    "heater": (heater, [0.0], {"a": 0.5, "b": 1.2, "set": 1.3}, heater_at),
-    "table": (table, [2.0], {"a": 0.9}, table_at),
-}
-
-
-def compare(problem, expected, relative):
-    found = sf.evaluate(problem)
-    J, g, H = expected
-    assert found.cost == pytest.approx(float(J), rel=relative)
-    np.testing.assert_allclose(found.gradient, g, rtol=0, atol=relative * np.abs(g).max())
-    np.testing.assert_allclose(found.hessian, H, rtol=0, atol=relative * np.abs(H).max())
-
-
-def expected_of(solution, parameters):
-    times = np.linspace(0.0, 4.5, 46)[1:]
-    return differentiate(lambda q: sample_cost(solution(times, q), times), list(parameters.values()))
-
-
-@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", CLOSED)
-def test_closed_forms(name, engine):
-    mode, start, parameters, solution = CLOSED[name]
-    problem = problem_of(mode, start, parameters, 4.5, count=45, engine=engine, **TIGHT)
-    compare(problem, expected_of(solution, parameters), 1e-8)
-
-
-def block(tau, parameters, values=None, **settings):
+def block(tau, parameters, values=None, sigma=1.0):
     """A block is pushed until tau, and comes to rest."""
     modes = {
         "push": lambda t, x, p: jnp.stack([x[1], p["a"] - p["mu"] * 9.81 * jnp.sign(x[1])]),
         "slide": lambda t, x, p: jnp.stack([x[1], -p["mu"] * 9.81 * jnp.sign(x[1])]),
     }
     times = np.linspace(0.0, 2.0, 41)[1:]
-    values = np.cos(times) if values is None else values
-    data = sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=1.0)
+    data = sf.Measurements(times, np.cos(times) if values is None else values, lambda t, x, p: x[:1], sigma=sigma)
     run = sf.Experiment(data, ("push", "slide"), (tau,), 0.0, 2.0)
-    return sf.Problem(sf.HybridSystem(modes, [0.0, 0.0]), run, parameters, **settings)
+    return sf.Problem(sf.HybridSystem(modes, [0.0, 0.0]), run, parameters, **TIGHT)
 
 
 def block_at(t, q):
@@ -283,10 +213,46 @@ def block_at(t, q):
     return push * pushed**2 / 2 + push * tau * s - stop * s**2 / 2
 
 
-def test_a_pushed_block_comes_to_rest():
-    times = np.linspace(0.0, 2.0, 41)[1:]
-    expected = differentiate(lambda q: sample_cost(block_at(times, q), times), [0.63, 6.0, 0.3])
-    compare(block(0.63, {"a": 6.0, "mu": 0.3}, **TIGHT), expected, 1e-8)
+CLOSED = {
+    "spring": (problem_of(spring, [1.0, 0.0], {"k": 4.0, "c": 0.9}, 4.5, count=45, **TIGHT), spring_at),
+    "heater": (problem_of(heater, [0.0], {"a": 0.5, "b": 1.2, "set": 1.3}, 4.5, count=45, **TIGHT), heater_at),
+    "block": (block(0.63, {"a": 6.0, "mu": 0.3}), block_at),
+}
+
+
+def expect(solution, problem):
+    """J, its gradient, Hessian and Gauss-Newton matrix, of residuals of a closed form."""
+    times = problem.experiments[0].data[0].times
+    x, slopes, curvatures = differentiate(lambda q: solution(times, q), problem.initial_theta)
+    r = x - np.cos(times)
+    return 0.5 * r @ r, r @ slopes, slopes.T @ slopes + np.einsum("k,kij->ij", r, curvatures), slopes.T @ slopes
+
+
+def value_of(solution, times, q):
+    """A solution at times, in float64."""
+    with use_float64():
+        return np.asarray(solution(jnp.asarray(times), jnp.asarray(q)))
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", CLOSED)
+def test_closed_forms(name, engine):
+    """J with all its derivatives, and states on both sides of crossings."""
+    problem, solution = replace(CLOSED[name][0], engine=engine), CLOSED[name][1]
+    evaluator, theta = Evaluator(problem), problem.initial_theta
+    J, g, H, gauss_newton = expect(solution, problem)
+    found = evaluator(theta)
+    assert found.cost == pytest.approx(J, rel=1e-8)
+    np.testing.assert_allclose(found.gradient, g, rtol=0, atol=1e-8 * np.abs(g).max())
+    np.testing.assert_allclose(found.hessian, H, rtol=0, atol=1e-8 * np.abs(H).max())
+    np.testing.assert_allclose(evaluator(theta, matrix="gauss-newton").hessian, gauss_newton, rtol=1e-8, atol=1e-8)
+    times = np.linspace(0.0, problem.experiments[0].tf, 200)[1:]
+    states = sf.simulate(problem, times=times).states[:, 0]
+    np.testing.assert_allclose(states, value_of(solution, times, theta), rtol=0, atol=1e-9)
+    path = sf.simulate(problem)
+    assert (np.diff(path.times) >= 0.0).all()
+    for time in evaluator.engines[0]._times:
+        assert np.abs(path.times - time).min() < 1e-12
 
 
 # --- derivatives against differences of J -----------------------------------------------------------------------------
@@ -305,21 +271,30 @@ def differences(cost, theta, directions):
     return size, *map(np.array, zip(*found, strict=True))
 
 
-def check_derivatives(problem, relative, theta=None, cost=None):
-    """Compare with differences of J along each unknown and each two of them; the best of three steps counts."""
-    theta = problem.initial_theta if theta is None else theta
-    evaluator = Evaluator(problem, theta)
-    found, d = evaluator(theta), len(theta)
-    directions = [np.eye(d)[i] + (np.eye(d)[j] if j > i else 0.0) for i in range(d) for j in range(i, d)]
-    size, first, second = differences(cost or evaluator.cost, theta, np.array(directions))
-    along = size * np.array(directions)
-    for mine, theirs in (
-        (along @ found.gradient, first),
-        (np.einsum("li,ij,lj->l", along, found.hessian, along), second),
-    ):
-        errors = np.abs(theirs - mine).min(axis=0) / np.abs(theirs).max()
-        assert errors.max() < relative, errors
+def measure_errors(theta, cost, gradient, hessian):
+    """Largest errors of first and second derivatives against differences of J along each unknown and each two of them,
+    relative to the largest of these; the best of three steps counts.
+    """
+    d = len(theta)
+    directions = np.array([np.eye(d)[i] + (np.eye(d)[j] if j > i else 0.0) for i in range(d) for j in range(i, d)])
+    size, first, second = differences(cost, theta, directions)
+    along = size * directions
+    own = along @ gradient, np.einsum("li,ij,lj->l", along, hessian, along)
+    off = (np.abs(theirs - mine).min(axis=0).max() for theirs, mine in zip((first, second), own, strict=True))
+    return np.array(list(off)) / [np.abs(first).max(), np.abs(second).max()]
+
+
+def check_derivatives(problem):
+    """Compare with differences of J, and return the evaluator."""
+    evaluator, theta = Evaluator(problem), problem.initial_theta
+    found = evaluator(theta)
+    errors = measure_errors(theta, evaluator.cost, found.gradient, found.hessian)
+    assert errors.max() < 1e-6, errors
     return evaluator
+
+
+def table(t, x, p):
+    return jnp.stack([-p["a"] * jnp.interp(x[0], np.array([0.0, 0.5, 1.0, 2.5]), np.array([0.1, 0.2, 1.0, 1.6]))])
 
 
 def contact(t, x, p):
@@ -333,33 +308,12 @@ def backlash(t, x, p):
     return jnp.stack([x[2], x[3], 3.0 * jnp.cos(2.0 * t) - torque - 0.2 * x[2], torque - p["d"] * x[3]])
 
 
-def follower(t, x, p):
-    """Which of the states is larger says how they go on."""
-    return jnp.stack([-p["a"] * x[1], jnp.where(x[0] > x[1], p["b"] * x[0], 1.5 * x[0]) - 0.1 * x[1]])
-
-
-def dead_zone(t, x, p):
-    return jnp.stack([x[1], -p["k"] * jnp.sign(x[0]) * jnp.maximum(jnp.abs(x[0]) - p["w"], 0.0) - 0.1 * x[1]])
-
-
 def clipped(t, x, p):
     return jnp.stack([x[1], -p["k"] * jnp.clip(x[0], -p["s"], p["s"]) - 0.1 * x[1]])
 
 
 def driven(t, x, p, u):
     return jnp.stack([x[1], u - p["d"] * x[1] - p["mu"] * 9.81 * jnp.sign(x[1])])
-
-
-def two_modes():
-    """A block is pushed, then held by friction in both modes: the second begins at its corner, and slides along it."""
-    modes = {
-        "weak": lambda t, x, p: jnp.stack([x[1], p["a"] * (2.0 * t) - 3.0 * jnp.sign(x[1])]),
-        "strong": lambda t, x, p: jnp.stack([x[1], p["a"] * (1.0 + t) - p["mu"] * jnp.sign(x[1]) * (1.0 + x[1] ** 2)]),
-    }
-    times = np.linspace(0.0, 3.0, 31)[1:]
-    data = sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1], sigma=1.0)
-    run = sf.Experiment(data, ("weak", "strong"), (0.83,), 0.0, 3.0)
-    return sf.Problem(sf.HybridSystem(modes, [0.0, 0.5]), run, {"a": 1.0, "mu": 3.35}, **TIGHT)
 
 
 def everything(**settings):
@@ -407,12 +361,9 @@ def samples(first=0, **more):
     return sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1], sigma=1.0, **more)
 
 
-def late():
-    return with_spring(samples(2, delay="late"), late=sf.Parameter(0.05, lower=0.0, upper=0.2))
-
-
-def jumping():
-    return with_spring(samples(), jumps=[sf.Jump(2.5, lambda t, x, p: jnp.stack([x[0], x[1] + p["c"]]))])
+def late_and_jumping():
+    jump = sf.Jump(2.5, lambda t, x, p: jnp.stack([x[0], x[1] + p["c"]]))
+    return with_spring(samples(2, delay="late"), jumps=[jump], late=sf.Parameter(0.05, lower=0.0, upper=0.2))
 
 
 def free_end():
@@ -428,29 +379,26 @@ PUSHES = sf.Input(np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.array([5.0, 1.0, -5.0,
 CASES = {
     "contact": (lambda: problem_of(contact, [1.0, 0.0], {"k": 1e3, "c": 3.0}, 2.9, **TIGHT), 6),
     "backlash": (lambda: problem_of(backlash, np.zeros(4), {"k": 30.0, "w": 0.1, "d": 0.3}, **TIGHT), 5),
-    "two states compared": (lambda: problem_of(follower, [1.0, 0.3], {"a": 0.9, "b": 0.8}, 6.0, **TIGHT), 2),
-    "dead zone": (lambda: problem_of(dead_zone, [1.0, 0.0], {"k": 4.0, "w": 0.3}, 5.0, **TIGHT), 4),
+    "table": (lambda: problem_of(table, [2.0], {"a": 0.9}, 4.5, **TIGHT), 2),
     "clip": (lambda: problem_of(clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 5.0, **TIGHT), 4),
     "driven": (lambda: problem_of(driven, np.zeros(2), {"mu": 0.3, "d": 0.3}, 5.0, inputs=PUSHES, **TIGHT), 4),
-    "two modes": (two_modes, 2),
     "everything": (everything, 2),
     "stiff": (lambda: problem_of(contact, [1.0, 0.0], {"k": 1e3, "c": 3.0}, 1.1, solver="stiff", **TIGHT), 2),
     "written twice": (lambda: problem_of(written_twice, [1.0, 0.0], {"k": 4.0, "c": 0.5, "w": 0.31}, 5.0, **TIGHT), 3),
     "two springs": (lambda: problem_of(two_springs, [1.0, 1.0, 0.0, 0.0], {"k": 4.0, "c": 0.9}, count=7, **TIGHT), 2),
-    "late samples": (late, 2),
-    "a jump": (jumping, 2),
+    "late samples, a jump": (late_and_jumping, 2),
     "a free end": (free_end, 1),
 }
 """Problems, and how many crossings their first experiments have at least."""
 
 
-QUICK = ("contact", "two states compared", "dead zone", "clip", "driven", "two modes", "everything")
+QUICK = ("contact", "table", "clip", "driven", "everything")
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in CASES])
 def test_derivatives_are_those_of_differences(name):
     build, crossings = CASES[name]
-    evaluator = check_derivatives(build(), 1e-6)
+    evaluator = check_derivatives(build())
     assert len(evaluator.engines[0]._times) >= crossings
     assert evaluator.engine.name == "native"
 
@@ -469,30 +417,23 @@ def test_the_lagrangian_of_guards_and_terminal_constraints_has_its_derivatives()
         there = evaluator.constrained(theta, multipliers=multipliers)
         return there.cost + multipliers @ there.constraints
 
-    size, first, second = differences(lagrangian, problem.initial_theta, np.eye(4))
-    gradient = size * (found.gradient + multipliers @ found.jacobian)
-    assert np.abs(first - gradient).min(axis=0).max() < 1e-7 * np.abs(gradient).max()
-    hessian = size**2 * np.diag(found.hessian)
-    assert np.abs(second - hessian).min(axis=0).max() < 1e-6 * np.abs(hessian).max()
+    gradient = found.gradient + multipliers @ found.jacobian
+    assert measure_errors(problem.initial_theta, lagrangian, gradient, found.hessian).max() < 1e-6
 
 
 # --- order ------------------------------------------------------------------------------------------------------------
 
 
-def turning(k, c=0.3):
+def turning_on(cells):
     """A spring with friction that turns twice, at pi / sqrt(k) and twice that, and is far from rest."""
-    return problem_of(spring, [1.0, 0.0], {"k": k, "c": c}, 4.0, count=4)
-
-
-def turning_on(cells, k, c=0.3):
-    problem = turning(k, c)
+    problem = problem_of(spring, [1.0, 0.0], {"k": 3.0, "c": 0.3}, 4.0, count=4)
     return Evaluator(problem, meshes=[Mesh.from_times(np.linspace(0.0, 4.0, cells + 1))])
 
 
 def test_costs_and_derivatives_keep_the_order_of_the_steps_across_crossings():
     """On average over many places of the crossings in their cells."""
     counts, thetas = (20, 40, 80), [np.array([k, 0.3]) for k in np.linspace(3.0, 3.7, 12)]
-    evaluators = {cells: turning_on(cells, 3.0) for cells in (*counts, 640)}
+    evaluators = {cells: turning_on(cells) for cells in (*counts, 640)}
     sizes = np.zeros((3, 3))
     for theta in thetas:
         exact = evaluators[640](theta)
@@ -507,7 +448,7 @@ def test_costs_and_derivatives_keep_the_order_of_the_steps_across_crossings():
 
 def test_costs_go_on_where_a_crossing_passes_a_node():
     """It is on the node 1.8 where k = (pi / 1.8)^2; the gradient jumps by the error of a row at most."""
-    evaluator, k = turning_on(40, 3.0), (np.pi / 1.8) ** 2
+    evaluator, k = turning_on(40), (np.pi / 1.8) ** 2
     before, on, after = (evaluator(np.array([k * (1.0 + s), 0.3])) for s in (-1e-13, 0.0, 1e-13))
     for one in (before, after):
         assert one.cost == pytest.approx(on.cost, rel=1e-12)
@@ -516,21 +457,6 @@ def test_costs_go_on_where_a_crossing_passes_a_node():
 
 
 # --- states -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["spring", "heater", "table"])
-def test_simulated_states_are_right_on_both_sides_of_a_crossing(name):
-    mode, start, parameters, solution = CLOSED[name]
-    problem = problem_of(mode, start, parameters, 4.5, count=5, **TIGHT)
-    times = np.linspace(0.0, 4.5, 200)[1:]
-    expected = value_of(solution, times, list(parameters.values()))
-    np.testing.assert_allclose(sf.simulate(problem, times=times).states[:, 0], expected, rtol=0, atol=1e-9)
-    path = sf.simulate(problem)
-    assert (np.diff(path.times) >= 0.0).all()
-    crossings = Evaluator(problem)
-    crossings.cost(problem.initial_theta)
-    for time in crossings.engines[0]._times:
-        assert np.abs(path.times - time).min() < 1e-12
 
 
 def relay(t, x, p):
@@ -547,7 +473,7 @@ def test_a_relay_keeps_the_state_on_a_set_point_that_moves():
     decays = (times > 1.26) & (times < 2.5)
     expected = np.where(decays, decay, 0.8 + 0.3 * np.sin(2 * times))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
-    evaluator = check_derivatives(problem, 1e-6)
+    evaluator = check_derivatives(problem)
     assert evaluator.engines[0]._split.path.sides == (((-1,), (0,), (1,), (0,), (1,)),)
 
 
@@ -579,10 +505,7 @@ def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
     times = np.linspace(0.0, 2.0, 41)[1:]
     rng = np.random.default_rng(1)
     values = value_of(block_at, times, [0.63, 6.0, 0.3]) + 1e-3 * rng.standard_normal(40)
-    plain = block(0.6, {"a": 5.5, "mu": 0.33}, values)
-    data = sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=1e-3)
-    run = sf.Experiment(data, ("push", "slide"), (0.6,), 0.0, 2.0)
-    fit = sf.estimate(sf.Problem(plain.system, run, {"a": 5.5, "mu": 0.33}, **TIGHT))
+    fit = sf.estimate(block(0.6, {"a": 5.5, "mu": 0.33}, values, 1e-3))
     assert fit.success
     assert fit.verdict.level != "bad"
     _, slopes, _ = differentiate(lambda q: block_at(times, q), fit.theta)
@@ -602,18 +525,9 @@ def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
 # --- other matrices and methods ---------------------------------------------------------------------------------------
 
 
-def test_the_gauss_newton_matrix_is_that_of_the_slopes():
-    problem, times = block(0.63, {"a": 6.0, "mu": 0.3}, **TIGHT), np.linspace(0.0, 2.0, 41)[1:]
-    _, slopes, _ = differentiate(lambda q: block_at(times, q), problem.initial_theta)
-    evaluator = Evaluator(problem)
-    found = evaluator(problem.initial_theta, matrix="gauss-newton")
-    np.testing.assert_allclose(found.hessian, slopes.T @ slopes, rtol=1e-9)
-    np.testing.assert_allclose(found.gradient, evaluator(problem.initial_theta).gradient, rtol=1e-12)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint", "autodiff"])
-@pytest.mark.parametrize("name", ["driven", "backlash", "two modes"])
+@pytest.mark.parametrize("name", ["driven", "backlash", "contact"])
 def test_all_methods_agree(name, method):
     problem = CASES[name][0]()
     found, expected = sf.evaluate(problem, method=method), sf.evaluate(problem)
@@ -640,47 +554,38 @@ def test_where_crossings_are_too_many_rows_are_not_split():
     assert whole(theta).cost == pytest.approx(whole.divide(4)(theta).cost, rel=1e-7)
 
 
-def test_too_many_crossings_at_a_trial_refuse_it():
-    line = spring.__code__.co_firstlineno + 1
-    problem = problem_of(spring, [1.0, 0.0], {"k": 1.0, "c": 0.001}, 20.0)
-    evaluator = Evaluator(problem)
-    assert np.isfinite(evaluator(problem.initial_theta).cost)
-    there = np.array([100.0, 0.001])
-    assert np.isnan(evaluator(there).cost)
-    message = rf"mode 'm' passes corners of the state \(test_corners.py:{line}\) more than {MOST_CROSSINGS} times up to"
-    with pytest.raises(NotIntegrableError, match=message):
-        refine_mesh(problem, 0, there)
-
-
-def test_a_mode_that_switches_ever_faster_names_its_corner():
-    """A heater without a dead band, whose sensor lags, settles at its setpoint by switching ever faster."""
-
-    def heat(t, x, p):
-        return jnp.stack([p["h"] * jnp.where(x[1] < 20.0, 1.0, 0.0) - 0.12 * (x[0] - 5.0), (x[0] - x[1]) / 4.0])
-
-    line = heat.__code__.co_firstlineno + 1
-    problem = problem_of(heat, [25.0, 22.0], {"h": 2.5}, 100.0)
-    message = rf"passes corners of the state \(test_corners.py:{line}\) more than .* give them a dead band"
-    with pytest.raises(NotIntegrableError, match=message):
-        sf.evaluate(problem)
-
-
 def still(t, x, p):
     return -p["c"] * jnp.sign(x) * jnp.array([1.0, 0.6, 0.5])
 
 
-def test_sliding_along_three_corners_is_refused():
-    line = still.__code__.co_firstlineno + 1
-    problem = problem_of(still, [1.0, 1.0, 1.0], {"c": 1.0}, 3.0)
-    message = rf"mode 'm' slides along more than 2 corners of the state at a time \(test_corners.py:{line}\) at t = 2"
-    with pytest.raises(NotIntegrableError, match=message):
-        sf.evaluate(problem)
+def heat(t, x, p):
+    # Without a dead band, and with a sensor that lags: it settles at its setpoint by switching ever faster.
+    return jnp.stack([p["h"] * jnp.where(x[1] < 20.0, 1.0, 0.0) - 0.12 * (x[0] - 5.0), (x[0] - x[1]) / 4.0])
+
+
+@pytest.mark.parametrize(
+    ("mode", "start", "parameters", "theta", "tf", "message"),
+    [
+        (spring, [1.0, 0.0], {"k": 1.0, "c": 0.001}, [100.0, 0.001], 20.0, f"than {MOST_CROSSINGS} times up to"),
+        (heat, [25.0, 22.0], {"h": 0.0}, [2.5], 100.0, "than .* give them a dead band"),
+        (still, [1.0, 1.0, 1.0], {"c": 0.1}, [1.0], 3.0, "slides along more than 2 .* at a time .* at t = 2"),
+    ],
+    ids=["too many", "ever faster", "three at a time"],
+)
+def test_what_cannot_be_followed_at_a_trial_is_refused_with_its_corner(mode, start, parameters, theta, tf, message):
+    problem, (lines, first) = problem_of(mode, start, parameters, tf), inspect.getsourcelines(mode)
+    evaluator = Evaluator(problem)
+    assert np.isfinite(evaluator.cost(problem.initial_theta))
+    with pytest.raises(NotIntegrableError, match=message) as refused:
+        refine_mesh(problem, 0, np.array(theta))
+    assert "mode 'm'" in str(refused.value)
+    assert f"(test_corners.py:{first + len(lines) - 1})" in str(refused.value)
 
 
 def test_two_bodies_may_rest():
     problem = problem_of(still, [1.0, 1.0, 1.0], {"c": 1.0}, 1.9, **TIGHT)
     np.testing.assert_allclose(sf.simulate(problem, times=[1.9]).states, [[0.0, 0.0, 1.0 - 0.95]], atol=1e-9)
-    check_derivatives(problem, 1e-6)
+    check_derivatives(problem)
 
 
 def rooted(t, x, p):
@@ -691,21 +596,17 @@ def rooted(t, x, p):
     ("problem", "theta"),
     [
         (problem_of(still, [1.0, 1.0, 1.0], {"c": 0.9}, 1.9), [1.3]),
-        (problem_of(spring, [1.0, 0.0], {"k": 4.0, "c": 0.01}, 45.0), [16.0, 0.01]),
         (problem_of(rooted, [1.0, 0.0], {"k": 4.0, "c": 0.01}), [4.0, 0.0]),
     ],
-    ids=["rest", "crossings", "infinite derivative"],
+    ids=["rest", "infinite derivative"],
 )
 def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monkeypatch):
     """JAX is not asked for a program of each path, to find that a derivative is infinite."""
     monkeypatch.setattr(jax_programs, "derivatives", None)
     evaluator = Evaluator(problem)
-    assert np.isfinite(evaluator.cost(problem.initial_theta))
     for _ in range(2):
-        found = evaluator(np.array(theta))
-        assert np.isnan(found.cost)
-        assert np.isnan(evaluator.cost(np.array(theta)))
         assert np.isfinite(evaluator.cost(problem.initial_theta))
+        assert np.isnan([evaluator(np.array(theta)).cost, evaluator.cost(np.array(theta))]).all()
 
 
 def test_a_solver_that_is_stuck_makes_no_corner_steep_beyond_which_the_field_is_defined():
@@ -735,19 +636,25 @@ def fit_of(mode, start, truth, guess, tf, count, sigma, seed=0):
     return sf.estimate(given(clean + sigma * np.random.default_rng(seed).standard_normal(count), guess))
 
 
+def slowing(t, x, p):
+    """A decay that stops being fast below 0.5, unless the time is over before."""
+    return jnp.stack([-p["a"] * jnp.where(x[0] > 0.5, x[0], 0.25)])
+
+
 FITS = {
-    "friction": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.3}, 4.0, 80, 1e-3),
-    "rest": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.9}, 8.0, 160, 1e-3),
-    "contact": (contact, [1.0, 0.0], {"k": 1e4, "c": 5.0}, 2.0, 200, 2e-3),
-    "clip": (clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 5.0, 100, 1e-2),
-    "tank": (tank, [1.5], {"k": 0.8}, 5.0, 60, 1e-2),
+    "friction": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.3}, 0.7, 4.0, 80, 1e-3),
+    "rest": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.9}, 1.3, 8.0, 160, 1e-3),
+    "contact": (contact, [1.0, 0.0], {"k": 1e4, "c": 5.0}, 0.7, 2.0, 200, 2e-3),
+    "clip": (clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 1.3, 5.0, 100, 1e-2),
+    "crossed at the guess alone": (slowing, [1.2], {"a": 0.7}, 2.0, 0.9, 30, 1e-3),
+    "crossed at the truth alone": (slowing, [1.2], {"a": 1.4}, 0.5, 0.9, 30, 1e-3),
 }
+"""The factor is that of the guess."""
 
 
-@pytest.mark.parametrize("factor", [0.7, 1.3])
 @pytest.mark.parametrize("name", FITS)
-def test_fits_from_guesses_that_are_30_percent_off(name, factor):
-    mode, start, truth, tf, count, sigma = FITS[name]
+def test_fits_from_guesses_that_are_far_off(name):
+    mode, start, truth, factor, tf, count, sigma = FITS[name]
     fit = fit_of(mode, start, truth, {q: factor * value for q, value in truth.items()}, tf, count, sigma)
     assert fit.success, fit.message
     assert fit.verdict.level != "bad", str(fit)
@@ -769,30 +676,16 @@ def test_a_tank_that_empties_is_fitted_with_the_errors_of_its_closed_form():
     assert (np.abs(fit.theta - [1.5, 0.8]) < 4.0 * expected).all()
 
 
-@pytest.mark.parametrize(("true", "guess"), [(0.7, 1.4), (1.4, 0.7)])
-def test_fits_where_the_corner_is_crossed_at_the_truth_or_at_the_guess_alone(true, guess):
-    """A decay to `rest` stops being fast below 0.5, unless the time is over before."""
-    mode = lambda t, x, p: jnp.stack([-p["a"] * jnp.where(x[0] > 0.5, x[0], 0.25)])  # noqa: E731
-    fit = fit_of(mode, [1.2], {"a": true}, {"a": guess}, 0.9, 30, 1e-3)
-    assert fit.success
-    assert fit.verdict.level != "bad"
-    assert fit.theta[0] == pytest.approx(true, abs=4 * fit.standard_errors[0])
-
-
-# --- a tank that empties ----------------------------------------------------------------------------------------------
-
-
 def test_a_tank_that_empties_has_a_right_and_finite_gradient():
     """Beyond its corner sqrt(x) is not defined. The slope of x in x(0) is sqrt(x / x(0)), which no step resolves
     where the tank is nearly empty: there the accuracy falls, and is better on finer meshes.
     """
     start, parameters = lambda p: jnp.stack([p["x0"]]), {"x0": 1.5, "k": 0.8}
-    J, g, _ = expected_of(tank_at, parameters)
     for rtol, relative in ((1e-8, 3e-3), (1e-12, 3e-5)):
         problem = problem_of(tank, start, parameters, 4.5, count=45, rtol=rtol, atol=rtol)
-        found = sf.evaluate(problem)
+        (J, g, *_), found = expect(tank_at, problem), sf.evaluate(problem)
         assert evaluator_of(problem).engine.name == "native"
-        assert found.cost == pytest.approx(float(J), rel=0.1 * relative)
+        assert found.cost == pytest.approx(J, rel=0.1 * relative)
         np.testing.assert_allclose(found.gradient, g, rtol=0, atol=relative * np.abs(g).max())
         assert np.isfinite(found.hessian).all()
     times = np.linspace(0.1, 4.5, 45)
@@ -867,19 +760,12 @@ def test_random_systems():
         found = evaluator(theta)
         if seed // 2 % 2 == 0:
             assert found.cost == pytest.approx(integrate_with_one_corner(problem, theta), rel=1e-7), seed
-        directions = np.array([np.eye(3)[i] + (np.eye(3)[j] if j > i else 0.0) for i in range(3) for j in range(i, 3)])
-        size, first, second = differences(cost, theta, directions)
+        errors = measure_errors(theta, cost, found.gradient, found.hessian)
         if len(paths) > 1:
             skipped.append(seed)
             continue
         slid += any(0 in sides for sides in engine._split.path.sides[0])
         crossed += len(engine._times)
-        along = size * directions
-        own = along @ found.gradient, np.einsum("li,ij,lj->l", along, found.hessian, along)
-        errors = [
-            (np.abs(theirs - mine).min(axis=0) / np.abs(theirs).max()).max()
-            for mine, theirs in zip(own, (first, second), strict=True)
-        ]
         worst = np.maximum(worst, errors)
     assert worst[0] < 1e-7
     assert worst[1] < 1e-5
@@ -922,7 +808,7 @@ ROOTS = {
 
 
 @pytest.mark.parametrize("start", [1.0, 0.0])
-@pytest.mark.parametrize("name", ROOTS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "where")) for name in ROOTS])
 def test_a_tank_that_is_or_ran_empty_is_filled_again(name, start):
     """sqrt(x) is not defined below zero, and its slope at zero is infinite: rows begin and end there all the same."""
     root, modes = ROOTS[name], ("drain", "fill") if start else ("fill", "drain")
@@ -954,16 +840,6 @@ def valve(t, x, p):
     return jnp.stack([p["q"] - flow, flow - 0.3 * x[1]])
 
 
-def test_the_gradient_behind_a_valve_that_opens_is_that_of_differences():
-    problem = problem_of(valve, [0.0, 0.3], {"c": 0.6, "q": 0.4}, 5.0, **TIGHT)
-    evaluator, theta = Evaluator(problem), problem.initial_theta
-    found = evaluator(theta).gradient
-    assert len(evaluator.engines[0]._times) == 1
-    steps = 1e-5 * np.eye(2)
-    differences = [(evaluator.cost(theta + h) - evaluator.cost(theta - h)) / 2e-5 for h in steps]
-    np.testing.assert_allclose(found, differences, rtol=1e-6)
-
-
 def test_a_valve_that_nearly_shuts_is_fitted():
     """From this guess, x0 - x1 creeps along 2e-8, beside the margin of the corner and nearer than errors of the solver:
     what passes the corner is led back, until the margin is reached and the trajectory slides.
@@ -975,11 +851,15 @@ def test_a_valve_that_nearly_shuts_is_fitted():
     assert estimate.cost < case.judge(case.truth)
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
-def test_beside_an_infinite_slope_both_matrices_are_what_they_are_called(engine):
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_derivatives_behind_a_valve_that_opens_are_those_of_differences(engine):
+    """Beside an infinite slope, both matrices are what they are called."""
     problem = problem_of(valve, [0.0, 0.3], {"c": 0.6, "q": 0.4}, 5.0, engine=engine, **TIGHT)
     evaluator, theta = Evaluator(problem), problem.initial_theta
     exact, gauss_newton = (evaluator(theta, matrix=matrix).hessian for matrix in ("exact", "gauss-newton"))
+    assert len(evaluator.engines[0]._times) == 1
+    slopes = [(evaluator.cost(theta + h) - evaluator.cost(theta - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
+    np.testing.assert_allclose(evaluator(theta).gradient, slopes, rtol=1e-6)
     times, steps = problem.experiments[0].data[0].times, 1e-4 * np.eye(2)
 
     def seen(theta):

@@ -22,37 +22,41 @@ TIMES = np.arange(1, 101) * 0.02
 TRUTH = {"tau": 0.6, "mu": 0.3, "a": 6.0}
 
 
-def friction(v, p):
-    return p["mu"] * G * v / jnp.sqrt(v**2 + SLOW**2)
+def block(values, guess, runs=1, slow=SLOW, **settings):
+    """A block, pushed for a while, then sliding to rest; its position is measured. Runs share friction and push."""
 
+    def friction(v, p):
+        return p["mu"] * G * v / jnp.sqrt(v**2 + slow**2)
 
-def push(t, x, p):
-    return jnp.stack([x[1], p["a"] - friction(x[1], p)])
-
-
-def slide(t, x, p):
-    return jnp.stack([x[1], -friction(x[1], p)])
-
-
-def block(values, guess, runs=1, **settings):
-    """The block, pushed for a while; its position is measured. Several runs share friction and push."""
-    system = sf.HybridSystem({"push": push, "slide": slide}, [0.0, SLOW])
+    modes = {
+        "push": lambda t, x, p: jnp.stack([x[1], p["a"] - friction(x[1], p)]),
+        "slide": lambda t, x, p: jnp.stack([x[1], -friction(x[1], p)]),
+    }
     data = sf.Measurements(TIMES, values, observe=lambda t, x, p: x[:1], sigma=1e-3)
     run = sf.Experiment(data, ("push", "slide"), (guess["tau"],), t0=0.0, tf=2.0)
     parameters = {"mu": guess["mu"], "a": guess["a"]}
-    return sf.Problem(system, [run] * runs, parameters, **settings)
+    return sf.Problem(sf.HybridSystem(modes, [0.0, slow]), [run] * runs, parameters, **settings)
 
 
 @pytest.fixture(scope="module")
 def measured():
     clean = block(np.zeros((len(TIMES), 1)), TRUTH)
     noise = 1e-3 * np.random.default_rng(0).standard_normal((len(TIMES), 1))
-    return _simulate(clean) + noise
+    evaluator = Evaluator(clean).divide(4)
+    return evaluator.simulate(clean.initial_theta)[0].seen[0][: len(TIMES)] + noise
 
 
-def _simulate(problem):
-    evaluator = Evaluator(problem).divide(4)
-    return evaluator.simulate(problem.initial_theta)[0].seen[0][: len(TIMES)]
+@pytest.fixture
+def made(monkeypatch):
+    """The runs for which a mesh is made anew."""
+    runs = []
+
+    def refine(run, *at, **more):
+        runs.append(run.e)
+        return refine_mesh_of_run(run, *at, **more)
+
+    monkeypatch.setattr(accuracy, "refine_mesh_of_run", refine)
+    return runs
 
 
 def test_the_errors_of_rows_are_those_of_the_embedded_method():
@@ -76,13 +80,9 @@ def test_the_errors_of_rows_are_those_of_the_embedded_method():
         largest = np.maximum(largest, np.maximum(errors, jumps))
     found = evaluator.judge_rows()(theta).row_errors[0]
     # They are made of differences of states, which are of size 1 and have rounding errors.
-    np.testing.assert_allclose(read_errors(evaluator), largest, rtol=1e-9, atol=1e-15)
+    errors = evaluator.engines[0].at(Order.HESSIAN)._named["errors"]
+    np.testing.assert_allclose(errors, largest, rtol=1e-9, atol=1e-15)
     assert found == pytest.approx((largest / np.abs(path.after).max(axis=0)).max())
-
-
-def read_errors(evaluator):
-    """The largest errors of rows of the last evaluation, of each state."""
-    return evaluator.engines[0].at(Order.HESSIAN)._named["errors"]
 
 
 def judge(h, slopes, states, f_x, weights):
@@ -177,14 +177,8 @@ def test_a_trial_that_cannot_be_integrated_is_refused():
     assert not np.isfinite(Follower(evaluator_of(problem))(np.array([1.5])).cost)
 
 
-def test_only_the_runs_that_need_it_get_another_mesh(measured, monkeypatch):
+def test_only_the_runs_that_need_it_get_another_mesh(measured, made):
     problem = block(measured, TRUTH, runs=2)
-    made = []
-    monkeypatch.setattr(
-        accuracy,
-        "refine_mesh_of_run",
-        lambda run, *at, **more: made.append(run.e) or refine_mesh_of_run(run, *at, **more),
-    )
     follower = Follower(evaluator_of(problem))
     theta = problem.initial_theta.copy()
     follower(theta)
@@ -194,24 +188,18 @@ def test_only_the_runs_that_need_it_get_another_mesh(measured, monkeypatch):
     assert made == [1]
 
 
-def test_meshes_of_smooth_models_stay(monkeypatch):
+def test_meshes_of_smooth_models_stay(made):
     """A fit of a smooth model from a fair guess makes no mesh anew."""
-    monkeypatch.setattr(accuracy, "refine_mesh_of_run", None)
     decay = sf.HybridSystem({"fast": lambda t, x, p: -p["a"] * x, "slow": lambda t, x, p: -p["b"] * x}, [1.0])
     times = np.linspace(0.1, 4.0, 40)
     values = np.where(times < 1.55, np.exp(-times), np.exp(-1.55 - 0.3 * (times - 1.55)))[:, None]
     run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("fast", "slow"), (1.2,), t0=0.0, tf=4.0)
     fit = sf.estimate(sf.Problem(decay, run, {"a": 0.8, "b": 0.5}), strategy="local")
     np.testing.assert_allclose(fit.theta, [1.55, 1.0, 0.3], rtol=1e-6)
+    assert not made
 
 
-def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, monkeypatch):
-    made = []
-    monkeypatch.setattr(
-        accuracy,
-        "refine_mesh_of_run",
-        lambda run, *at, **more: made.append(run.e) or refine_mesh_of_run(run, *at, **more),
-    )
+def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, made):
     problem = block(measured, TRUTH, rtol=1e-2, atol=1e-3)
     follower = Follower(evaluator_of(problem))
     for mu in (0.3, 0.31, 0.32, 0.33):
@@ -223,22 +211,12 @@ def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, monkeypatch):
 def test_intervals_of_times_are_not_too_narrow_where_a_layer_moves():
     """On one mesh J rises with the first step of tau, since the layer leaves its short cells: a profile ends there."""
 
-    def resist(v, p):
-        return p["mu"] * G * v / jnp.sqrt(v**2 + 1e-12)
-
-    modes = {
-        "push": lambda t, x, p: jnp.stack([x[1], p["a"] - resist(x[1], p)]),
-        "slide": lambda t, x, p: jnp.stack([x[1], -resist(x[1], p)]),
-    }
-    system = sf.HybridSystem(modes, [0.0, 1e-6])
     ahead, after = 6.0 - 0.3 * G, 0.3 * G
     speed, rest = 0.6 * ahead, 0.6 + 0.6 * ahead / after
     sliding = np.minimum(TIMES, rest) - 0.6
     exact = np.where(TIMES < 0.6, 0.5 * ahead * TIMES**2, 0.18 * ahead + speed * sliding - 0.5 * after * sliding**2)
     values = (exact + 1e-3 * np.random.default_rng(0).standard_normal(len(TIMES)))[:, None]
-    data = sf.Measurements(TIMES, values, observe=lambda t, x, p: x[:1], sigma=1e-3)
-    run = sf.Experiment(data, ("push", "slide"), (0.6,), t0=0.0, tf=2.0)
-    fit = sf.estimate(sf.Problem(system, run, {"mu": 0.3, "a": 6.0}), strategy="local")
+    fit = sf.estimate(block(values, TRUTH, slow=1e-6), strategy="local")
     low, high = fit.confidence_intervals(0.95)[0]
     np.testing.assert_allclose(high - low, 2 * 1.96 * fit.standard_errors[0], rtol=0.02)
     assert low < 0.6 < high

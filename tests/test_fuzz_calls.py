@@ -120,7 +120,6 @@ WORDS = {
     "parameters": ("parameter", "mode"),
     "path": ("file", "path", "folder"),
     "problem": ("problem", "sf.Problem"),
-    "range_error": ("range_error", "latitude"),
     "columns": ("columns", "column", "unwrap"),
     "reset_maps": ("reset",),
     "start": ("start", "at the guess", "the guess leads"),

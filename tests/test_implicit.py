@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 from systems import P0, case
 
 import switchfit as sf
@@ -104,35 +105,62 @@ def assert_close(found, expected, relative):
 # JAX's results
 
 
-@pytest.mark.parametrize("matrix", ["exact", "gauss-newton", "none"])
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("van der Pol", "block"))) for name in PROBLEMS]
-)
-def test_derivatives_are_those_of_jax(name, matrix):
+@pytest.mark.parametrize("name", ["Robertson", "everything"])
+def test_derivatives_are_those_of_jax(name):
     native, by_jax = both(name)
     assert any(native.structures[0].implicit)
     theta = native.problem.initial_theta
-    found, expected = native(theta, matrix=matrix), by_jax(theta, matrix=matrix)
-    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
-    assert native.cost(theta) == pytest.approx(found.cost, rel=1e-13)
-    assert_close(found.gradient, expected.gradient, 1e-12)
-    if matrix != "none":
-        assert_close(found.hessian, expected.hessian, 1e-11)
+    for matrix in ("exact", "gauss-newton", "none") if name == "everything" else ("exact",):
+        found, expected = native(theta, matrix=matrix), by_jax(theta, matrix=matrix)
+        assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+        assert native.cost(theta) == pytest.approx(found.cost, rel=1e-13)
+        assert_close(found.gradient, expected.gradient, 1e-12)
+        if matrix != "none":
+            assert_close(found.hessian, expected.hessian, 1e-11)
 
 
-@pytest.mark.parametrize("short", [kernels.SHORT, 0])
-def test_a_mode_that_depends_on_time_beside_an_explicit_one(short, monkeypatch):
-    """A reset map and an initial state that depend on parameters; all stages of a row in one function, or one."""
-    monkeypatch.setattr(kernels, "SHORT", short)
+AT = np.array([0.6187, 1.2812]), P0
+"""Transition times and parameters of `case("mixed")`: a mode that depends on time takes implicit steps beside explicit
+ones; a reset map and an initial state depend on parameters.
+"""
+
+
+def assert_same(found, expected):
+    """J, gradient and Hessian."""
+    J, g, H = map(np.asarray, found)
+    assert pytest.approx(expected.cost, rel=1e-12) == J
+    assert_close(g, expected.gradient, 1e-11)
+    assert_close(H, expected.hessian, 1e-9)
+
+
+def test_stages_one_at_a_time(monkeypatch):
+    """As where functions would become too long."""
+    monkeypatch.setattr(kernels, "SHORT", 0)
     drop_programs()
     this = case("mixed")
-    at = this.arguments(), np.array([0.6187, 1.2812]), P0
-    expected, nodes = this.discrete(*at), np.unique(np.asarray(at[0].nodes))
-    found = native_experiment(this.structure, at[0], nodes, Order.HESSIAN)(*at[1:], 1)
-    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
-    assert_close(found.gradient, expected.gradient, 1e-11)
-    assert_close(found.hessian, expected.hessian, 1e-9)
+    arguments = this.arguments()
+    native = native_experiment(this.structure, arguments, np.unique(np.asarray(arguments.nodes)), Order.HESSIAN)
+    found = native(*AT, 1)
+    assert_same((found.cost, found.gradient, found.hessian), this.discrete(arguments, *AT))
     drop_programs()
+
+
+def test_inside_a_program_of_jax():
+    """The operation that batches use: alone, in a loop, and for several at once, on a padded mesh."""
+    this = case("mixed")
+    arguments, taus = this.arguments(), AT[0] + np.array([[0.0], [0.01]])
+    places = places_in_library(this.structure)
+
+    def evaluate(tau):
+        return derivatives_inside_program(this.structure, arguments, tau, P0, 1, places)
+
+    with use_float64():
+        alone = [jax.jit(evaluate)(tau) for tau in taus]
+        loop, at_once = jax.jit(lambda taus: (jax.lax.map(evaluate, taus), jax.vmap(evaluate)(taus)))(taus)
+    for k, tau in enumerate(taus):
+        expected = this.discrete(arguments, tau, P0)
+        for found in (alone[k], *([part[k] for part in each] for each in (loop, at_once))):
+            assert_same(found, expected)
 
 
 def test_constraints_costates_and_simulations_are_those_of_jax():
@@ -178,66 +206,6 @@ def test_derivatives_are_those_of_differences(name):
         assert_close(bend, found.hessian[k], 1e-3)
 
 
-def solve_rows(tau, mu, nodes):
-    """J of Van der Pol's oscillator, which decays from tau on, by Radau's method for complex tau and mu."""
-
-    def oscillate(x):
-        J = np.array([[0.0, 1.0], [-2.0 * mu * x[0] * x[1] - 1.0, mu * (1.0 - x[0] ** 2)]])
-        return np.array([x[1], mu * (1.0 - x[0] ** 2) * x[1] - x[0]]), J
-
-    def decay(x):
-        return -0.02 * x, -0.02 * np.eye(2)
-
-    x, cost = np.array([2.0, 0.0], dtype=complex), 0.0
-    before, after = nodes[nodes < tau.real], nodes[nodes > tau.real]
-    for field, times in ((oscillate, [*before, tau]), (decay, [tau, *after])):
-        for h in np.diff(times):
-            k = np.zeros((3, 2), dtype=complex)
-            for _ in range(15):
-                f, f_x = zip(*(field(X) for X in x + STIFF.a @ k), strict=True)
-                matrix = np.eye(6) - h * np.block([[STIFF.a[j, m] * f_x[j] for m in range(3)] for j in range(3)])
-                k += np.linalg.solve(matrix, (h * np.stack(f) - k).ravel()).reshape(3, 2)
-            cost += h * STIFF.b @ (x + STIFF.a @ k)[:, 0] ** 2
-            x = x + STIFF.b @ k
-    return cost
-
-
-def test_derivatives_are_those_of_complex_steps():
-    """Without differences, and so to rounding errors; those of second order are differences of them."""
-    modes = {"oscillate": van_der_pol, "decay": lambda t, x, p: -0.02 * x}
-    run = sf.Experiment(SQUARE, ("oscillate", "decay"), (170.3,), 0.0, 200.0)
-    settings = {"solver": "stiff", "engine": "native", "rtol": 1e-4}  # few rows
-    problem = sf.Problem(sf.HybridSystem(modes, [2.0, 0.0]), run, {"mu": 300.0}, **settings)
-    evaluator, theta = Evaluator(problem), problem.initial_theta
-    nodes, found = evaluator.meshes[0].times, evaluator(theta)
-
-    def differentiate(theta):
-        steps = 1e-30j * np.eye(2)
-        return np.array([solve_rows(*(theta + step), nodes).imag / 1e-30 for step in steps])
-
-    assert found.cost == pytest.approx(solve_rows(*theta.astype(complex), nodes).real, rel=1e-12)
-    assert_close(found.gradient, differentiate(theta), 1e-10)
-    for k, step in enumerate((3e-3, 1e-3)):
-        ends = [differentiate(theta + sign * step * np.eye(2)[k]) for sign in (-1, 1)]
-        assert_close(found.hessian[k], (ends[1] - ends[0]) / (2 * step), 1e-6)
-
-
-def test_inside_a_program_of_jax():
-    """As batches call it, on a padded mesh, whose last rows have no length."""
-    native = both("block")[0]
-    problem, structure = native.problem, native.structures[0]
-    tau, p = problem.vectors(problem.initial_theta, 0)
-    arguments = Evaluator(problem, meshes=[native.meshes[0].pad_to(native.meshes[0].cells + 7)]).arguments[0]
-    places = places_in_library(structure)
-    with use_float64():
-        program = jax.jit(lambda tau, p: derivatives_inside_program(structure, arguments, tau, p, 1, places))
-        J, g, H = map(np.asarray, program(tau, p))
-    found = native(problem.initial_theta)
-    assert pytest.approx(found.cost, rel=1e-13) == J
-    assert_close(g, found.gradient, 1e-12)
-    assert_close(H, found.hessian, 1e-11)
-
-
 def test_the_engine_names_the_modes():
     native, by_jax = both("everything")
     assert native.engine.implicit_modes == by_jax.engine.implicit_modes == ("follow",)
@@ -272,24 +240,11 @@ def test_the_backward_step_of_a_row_has_the_factors_of_its_forward_step(name):
         assert_close(found.gradient, expected.gradient, 1e-13)
 
 
-def differentiate_chain(n, k, c, times):
-    """Return the last state of a chain at times (K,), ``x_i' = k (x_{i-1} - 2 x_i + x_{i+1}) + c`` between walls at 0
-    from 1, and its first and second derivatives in (k, c): (K,), (K, 2), (K, 2, 2).
-    """
+def last_of_chain(n, times, q):
+    """The last of n states at times (K,), ``x_i' = k (x_{i-1} - 2 x_i + x_{i+1}) + c`` between walls at 0, from 1."""
     rates, V = np.linalg.eigh(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
-    weights, last = V.T @ np.ones(n), V[-1]
-    gone, rates = np.exp(-k * np.outer(times, rates)), rates[None]
-    t = times[:, None]
-    value = gone + c / k * (1 - gone) / rates
-    of_k = -t * rates * gone + c / k * t * gone - c / k**2 * (1 - gone) / rates
-    of_c = (1 - gone) / rates / k
-    of_kk = (t * rates) ** 2 * gone - c / k * t**2 * rates * gone - 2 * c / k**2 * t * gone
-    of_kk += 2 * c / k**3 * (1 - gone) / rates
-    of_kc = t * gone / k - (1 - gone) / rates / k**2
-    parts = [value, of_k, of_c, of_kk, of_kc]
-    x, x_k, x_c, x_kk, x_kc = (part @ (weights * last) for part in parts)
-    first = np.stack([x_k, x_c], axis=1)
-    return x, first, np.stack([x_kk, x_kc, x_kc, 0.0 * x_kk], axis=1).reshape(-1, 2, 2)
+    gone = jnp.exp(-q[0] * jnp.outer(times, rates))
+    return (gone + q[1] / q[0] * (1 - gone) / rates[None]) @ (V.T @ np.ones(n) * V[-1])
 
 
 @pytest.mark.parametrize("n", [12, pytest.param(40, marks=pytest.mark.slow)])
@@ -305,7 +260,7 @@ def test_many_states_have_the_derivatives_of_their_closed_form(n):
     system = sf.HybridSystem({"m": conduct}, np.ones(n))
     problem = sf.Problem(system, run, {"k": k, "c": c}, solver="stiff", engine="native", rtol=1e-10, atol=1e-12)
     found = Evaluator(problem)(problem.initial_theta)
-    x, first, second = differentiate_chain(n, k, c, times)
+    x, first, second = differentiate(lambda q: last_of_chain(n, times, q), problem.initial_theta)
     assert found.cost == pytest.approx(0.5 * x @ x, rel=1e-8)
     assert_close(found.gradient, x @ first, 1e-7)
     assert_close(found.hessian, first.T @ first + np.einsum("k,kij->ij", x, second), 1e-6)
@@ -341,34 +296,24 @@ def test_a_late_sample_in_a_row_that_does_not_converge_has_no_cost():
     problem = block(engine="native")
     run = problem.experiments[0]
     late = replace(run.data[0], times=np.array([2.0]), values=np.array([[0.3]]), delay="late")
-    problem = sf.Problem(
-        problem.system,
-        replace(run, data=late),
-        {"mu": 0.3, "a": 6.0, "late": sf.Parameter(0.01, 0.0, 0.5)},
-        solver="stiff",
-        engine="native",
-    )
-    coarse = Evaluator(problem)
-    assert np.isfinite(coarse(problem.initial_theta).cost)
-    assert np.isnan(coarse(problem.check_theta([0.9, 0.6, 9.0, 0.01])).cost)
+    parameters = problem.parameters | {"late": sf.Parameter(0.01, 0.0, 0.5)}
+    coarse = Evaluator(replace(problem, experiments=[replace(run, data=late)], parameters=parameters))
+    assert np.isfinite(coarse(coarse.problem.initial_theta).cost)
+    assert np.isnan(coarse(coarse.problem.check_theta([0.9, 0.6, 9.0, 0.01])).cost)
 
 
-def test_a_state_of_rounding_errors_converges():
+def hang(t, x, p):
     """A body at rest on a spring under a load: its velocity is the rest of forces that cancel, 1e-17 and less."""
-
-    def hang(t, x, p):
-        return jnp.stack([x[1], 1e6 * (p["load"] - 3.0 * x[0]) - 1e5 * x[1]])
-
-    problem = one_mode(hang, [0.1 / 3.0 + 1e-3, 0.0], {"load": 0.1}, 100.0, engine="native")
-    evaluator = Evaluator(problem)
-    found = evaluator(problem.initial_theta)
-    assert np.abs(evaluator.simulate(problem.initial_theta)[0].after[-1, 1]) < 1e-12
-    assert np.isfinite(found.cost)
+    return jnp.stack([x[1], 1e6 * (p["load"] - 3.0 * x[0]) - 1e5 * x[1]])
 
 
-def test_states_that_stay_zero_converge():
-    problem = one_mode(lambda t, x, p: -p["k"] * x, [0.0, 1.0], {"k": 1e3}, 1.0, engine="native")
-    assert Evaluator(problem)(problem.initial_theta).cost == 0.0
+def test_states_of_rounding_errors_and_zeros_converge():
+    evaluator = Evaluator(one_mode(hang, [0.1 / 3.0 + 1e-3, 0.0], {"load": 0.1}, 100.0, engine="native"))
+    theta = evaluator.problem.initial_theta
+    assert np.abs(evaluator.simulate(theta)[0].after[-1, 1]) < 1e-12
+    assert np.isfinite(evaluator(theta).cost)
+    zero = Evaluator(one_mode(lambda t, x, p: -p["k"] * x, [0.0, 1.0], {"k": 1e3}, 1.0, engine="native"))
+    assert zero(zero.problem.initial_theta).cost == 0.0
 
 
 # Elimination
@@ -391,10 +336,10 @@ def make_jacobian(rng, n, kind):
 
 def compile_solve(filled, kind):
     """Return a function that solves the coupled equations for Jacobians (3, n, n) with these entries."""
-    n, s = len(filled), len(STIFF.b)
+    n = len(filled)
     module, graph = llvm.Module(6), Graph()
-    f_x = [graph.loads("f_x", n * n, n * n * j).reshape(n, n) * filled for j in range(s)]
-    right = [graph.loads("right", n, n * j, vector=kind == "vectors") for j in range(s)]
+    f_x = [graph.loads("f_x", n * n, n * n * j).reshape(n, n) * filled for j in range(3)]
+    right = [graph.loads("right", n, n * j, vector=kind == "vectors") for j in range(3)]
     factors = elimination.eliminate(STIFF.a, graph.constant(1.0), f_x)
     x = np.concatenate(factors.solve(right, transposed=kind == "transposed"))
     module.write_straight_line("run", [("x", k, node) for k, node in enumerate(x)], ("f_x", "right", "x"))
@@ -414,10 +359,10 @@ def measure_backward_errors(solve, jacobians, kind, rng):
     """Return the largest backward error of a solution, and of LAPACK's."""
     worst = [0.0, 0.0]
     for J in jacobians:
-        n, s = len(J), len(STIFF.b)
-        f_x = np.stack([J * (1 + 0.01 * rng.normal()) for _ in range(s)])
-        A = np.block([[np.eye(n) * (i == j) - STIFF.a[i, j] * f_x[i] for j in range(s)] for i in range(s)])
-        b, M = rng.normal(size=(n * s, 6) if kind == "vectors" else n * s), A.T if kind == "transposed" else A
+        n = len(J)
+        f_x = np.stack([J * (1 + 0.01 * rng.normal()) for _ in range(3)])
+        A = np.block([[np.eye(n) * (i == j) - STIFF.a[i, j] * f_x[i] for j in range(3)] for i in range(3)])
+        b, M = rng.normal(size=(n * 3, 6) if kind == "vectors" else n * 3), A.T if kind == "transposed" else A
         for k, x in enumerate((solve(f_x, b), np.linalg.solve(M, b))):
             size = np.abs(M).max() * np.abs(x).max() + np.abs(b).max()
             worst[k] = max(worst[k], np.abs(M @ x - b).max() / size)

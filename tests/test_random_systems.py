@@ -9,9 +9,9 @@ transitions or a mode that lasts no time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from itertools import pairwise
+from dataclasses import replace
+from functools import cached_property
+from itertools import combinations_with_replacement, compress, pairwise, product
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,61 +33,64 @@ METHODS = ("discrete-adjoint", "forward", "autodiff", "adjoint")
 RTOL, ATOL = 1e-11, 1e-12
 """Tolerances of the meshes: integration errors are then below the tolerances of the comparison."""
 
-VALUE, GRADIENT, HESSIAN = 1e-10, 1e-8, 2e-7
+Tolerances = tuple[float, float, float]
+
+CLOSE: Tolerances = (1e-10, 1e-8, 2e-7)
 """Largest error of J and c, of first and of second derivatives: of a block, relative to its largest entry plus 1 % of
 the largest entry of all and of 1. What is left is integration error: of the meshes' tolerance in J, and larger by a
 power of the step's length with each derivative in a transition time, which is the end of a step."""
 
-PAPER = 1e-6
+PAPER: Tolerances = (1e-8, 1e-6, 1e-6)
 """The same for the paper's equations, whose derivatives are integrated by themselves, with larger error constants."""
 
 
 # Random expressions
 
 
-Tree = tuple[Any, ...]
+Tree = Callable[[SimpleNamespace], Any]
+"""Of a namespace with t, x, p, u and the functions of NumPy or of JAX, xp."""
+
+OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "+": (2, lambda xp, a, b: a + b),
+    "-": (2, lambda xp, a, b: a - b),
+    "*": (2, lambda xp, a, b: a * b),
+    "ratio": (2, lambda xp, a, b: a / (2.0 + b * b)),
+    "gauss": (1, lambda xp, a: xp.exp(-a * a)),
+    "square": (1, lambda xp, a: xp.sin(a) * xp.sin(a)),
+    **{name: (1, lambda xp, a, name=name: getattr(xp, name)(a)) for name in ("sin", "cos", "tanh")},
+}
+"""How many operands each has, and its value."""
 
 
-def value_of(tree: Tree, xp: Any, t: Any, x: Any, p: Any, u: Any = None) -> Any:
-    """The value of an expression, with the functions of NumPy or of JAX."""
-    kind, *rest = tree
-    if kind == "const":
-        return rest[0]
-    if kind == "t":
-        return t
-    if kind == "x":
-        return x[rest[0]]
-    if kind == "u":
-        return u[rest[0]]
-    if kind == "p":
-        return p[rest[0]] if rest[1] is None else p[rest[0]][rest[1]]
-    given = [value_of(part, xp, t, x, p, u) for part in rest]
-    if kind == "+":
-        return given[0] + given[1]
-    if kind == "-":
-        return given[0] - given[1]
-    if kind == "*":
-        return given[0] * given[1]
-    if kind == "square":
-        return given[0] * given[0]
-    if kind == "gauss":
-        return xp.exp(-given[0] * given[0])
-    if kind == "ratio":
-        return given[0] / (2.0 + given[1] * given[1])
-    return getattr(xp, kind)(given[0])
+def constant(value: float, digits: int = 2) -> Tree:
+    """A rounded number."""
+    value = round(float(value), digits)
+    return lambda e: value
+
+
+def entry(i: int) -> Tree:
+    """An entry of x."""
+    return lambda e: e.x[i]
 
 
 def total(*trees: Tree) -> Tree:
     """The sum of expressions."""
-    first, *others = trees
-    for other in others:
-        first = ("+", first, other)
-    return first
+    return lambda e: sum(tree(e) for tree in trees)
+
+
+def multiply(*trees: Tree) -> Tree:
+    """The product of two expressions."""
+    return lambda e: trees[0](e) * trees[1](e)
+
+
+def square(tree: Tree) -> Tree:
+    """The square of an expression."""
+    return multiply(tree, tree)
 
 
 def scaled(factor: float, tree: Tree) -> Tree:
     """A multiple of an expression."""
-    return ("*", ("const", round(float(factor), 3)), tree)
+    return multiply(constant(factor, 3), tree)
 
 
 class Expressions:
@@ -100,52 +103,56 @@ class Expressions:
         kinds = ["t", "p", "p", "const", *["x"] * (3 * state), *["u"] * (2 * inputs * bool(self.inputs))]
         kind = self.rng.choice(kinds)
         if kind == "x":
-            return ("x", int(self.rng.integers(self.n)))
+            return entry(int(self.rng.integers(self.n)))
         if kind == "p":
-            return ("p", *self.parameters[int(self.rng.integers(len(self.parameters)))])
+            name, k = self.parameters[int(self.rng.integers(len(self.parameters)))]
+            return lambda e: e.p[name] if k is None else e.p[name][k]
         if kind == "u":
-            return ("u", int(self.rng.integers(self.inputs)))
-        return ("t",) if kind == "t" else ("const", round(float(self.rng.normal()), 2))
+            place = int(self.rng.integers(self.inputs))
+            return lambda e: e.u[place]
+        return (lambda e: e.t) if kind == "t" else constant(self.rng.normal())
+
+    def apply(self, kind: str, depth: int, **leaves: bool) -> Tree:
+        """An operation of expressions of a depth."""
+        count, operation = OPERATIONS[kind]
+        parts = [self.tree(depth, **leaves) for _ in range(count)]
+        return lambda e: operation(e.xp, *(part(e) for part in parts))
 
     def tree(self, depth: int, **leaves: bool) -> Tree:
         """An expression of a depth."""
         if depth == 0:
             return self.leaf(**leaves)
-        kind = str(self.rng.choice(["+", "-", "*", "*", "ratio", "sin", "cos", "tanh", "gauss", "square"]))
-        if kind == "square":
-            return ("square", ("sin", self.tree(depth - 1, **leaves)))
-        count = 2 if kind in ("+", "-", "*", "ratio") else 1
-        return (kind, *(self.tree(depth - 1, **leaves) for _ in range(count)))
+        kinds = ["+", "-", "*", "*", "ratio", "sin", "cos", "tanh", "gauss", "square"]
+        return self.apply(str(self.rng.choice(kinds)), depth - 1, **leaves)
 
     def bounded(self, depth: int, **leaves: bool) -> Tree:
         """An expression between -1 and 1."""
-        return (str(self.rng.choice(["sin", "cos", "tanh"])), self.tree(depth, **leaves))
+        return self.apply(str(self.rng.choice(["sin", "cos", "tanh"])), depth, **leaves)
 
     def rate(self, i: int, depth: int) -> Tree:
         """The rate of a state: damped, driven by something bounded, with a quadratic term."""
         j, k = self.rng.integers(self.n, size=2)
-        damping = scaled(-self.rng.uniform(0.1, 1.2), ("x", i))
+        damping = scaled(-self.rng.uniform(0.1, 1.2), entry(i))
         driven = scaled(self.rng.normal(), self.bounded(depth, inputs=True))
-        return total(damping, driven, scaled(0.15 * self.rng.normal(), ("*", ("x", int(j)), ("x", int(k)))))
+        return total(damping, driven, scaled(0.15 * self.rng.normal(), multiply(entry(j), entry(k))))
 
     def jump(self, i: int) -> Tree:
         """A state after a reset."""
-        return total(scaled(self.rng.uniform(0.5, 1.0), ("x", i)), scaled(0.4, self.bounded(1)))
+        return total(scaled(self.rng.uniform(0.5, 1.0), entry(i)), scaled(0.4, self.bounded(1)))
 
     def output(self) -> Tree:
         """What a sensor sees, or what a constraint is made of."""
-        return total(("x", int(self.rng.integers(self.n))), scaled(0.5, self.bounded(1)))
+        return total(entry(int(self.rng.integers(self.n))), scaled(0.5, self.bounded(1)))
 
 
 def vector(trees: list[Tree], xp: Any, *, arguments: str = "txp", flat_input: bool = False) -> Callable[..., Any]:
     """A function that returns the values of expressions: an array for JAX, a list of arrays for the reference."""
 
     def function(*given: Any) -> Any:
-        named = dict(zip(arguments, given, strict=True))
-        u = named.get("u")
-        u = u[None] if flat_input and xp is jnp else u
-        x = named.get("x")
-        values = [value_of(tree, xp, named.get("t", 0.0), x, named["p"], u) for tree in trees]
+        e = SimpleNamespace(**{"xp": xp, "t": 0.0, **dict(zip(arguments, given, strict=True))})
+        if flat_input and xp is jnp:
+            e.u = e.u[None]
+        values = [tree(e) for tree in trees]
         return values if xp is np else jnp.stack([value + jnp.zeros(()) for value in values])
 
     return function
@@ -208,21 +215,15 @@ class System:
         entries = [(name, k) for name in names for k in (range(2) if self.parameters[name].shape else [None])]
         self.expressions = Expressions(rng, has.states, entries, self.inputs)
         depth = 1 if has.states > 4 else 2
-        self.modes = [
-            [self.expressions.rate(i, depth) for i in range(has.states)]
-            for _ in range(min(has.modes, 1 + has.transitions))
-        ]
-        pairs = [(a, b) for a in range(len(self.modes)) for b in range(len(self.modes))]
+        count, states = min(has.modes, 1 + has.transitions), range(has.states)
+        self.modes = [[self.expressions.rate(i, depth) for i in states] for _ in range(count)]
+        pairs = list(product(range(count), repeat=2))
         jumps, watched = (rng.random(len(pairs)) < on for on in (0.6 * has.resets, 0.6 * has.guards))
-        self.resets = {
-            pair: [self.expressions.jump(i) for i in range(has.states)]
-            for pair, on in zip(pairs, jumps, strict=True)
-            if on
-        }
-        self.guards = {pair: self.expressions.output() for pair, on in zip(pairs, watched, strict=True) if on}
+        self.resets = {pair: list(map(self.expressions.jump, states)) for pair in compress(pairs, jumps)}
+        self.guards = {pair: self.expressions.output() for pair in compress(pairs, watched)}
         self.initial = self._draw_initial()
         self.experiments: list[sf.Experiment] = []
-        self.runs: list[dict[str, Any]] = []
+        self.runs: list[reference.Run] = []  # without the places of their unknowns in theta
         for e in range(has.runs):
             self._draw_run(e)
 
@@ -246,10 +247,8 @@ class System:
             found["c"] = sf.Parameter(float(rng.normal()), fixed=True)
         if has.array:
             found["v"] = sf.Parameter(rng.normal(size=2), prior=self._prior(0.1, False))
-        if has.runs == 2:
-            found["other"] = self._parameter(
-                float(rng.uniform(0.3, 1.5)), positive=True
-            )  # what "a" is in the second run
+        if has.runs == 2:  # what "a" is in the second run
+            found["other"] = self._parameter(float(rng.uniform(0.3, 1.5)), positive=True)
         if has.noise in ("parameter", "mixed"):
             found["sigma"] = self._parameter(float(rng.uniform(0.2, 0.6)), positive=True)
         if has.late:
@@ -260,9 +259,7 @@ class System:
     def _draw_initial(self) -> Any:
         values = self.rng.normal(size=self.has.states)
         if self.has.initial == "function":
-            return [
-                total(("const", round(float(v), 2)), scaled(0.5, self.expressions.tree(1, state=False))) for v in values
-            ]
+            return [total(constant(v), scaled(0.5, self.expressions.tree(1, state=False))) for v in values]
         unknown = self.rng.random(self.has.states) < 0.5
         if self.has.initial == "numbers" or not unknown.any():
             return values.tolist()
@@ -272,12 +269,8 @@ class System:
         count, span = self.has.transitions, self.tf - self.t0
         gaps = self.rng.uniform(0.3, 1.0, count + 1)
         times = self.t0 + span * np.cumsum(gaps)[:-1] / gaps.sum()
-        return [
-            sf.Parameter(float(t), fixed=True)
-            if self.rng.random() < 0.1 * self.has.fixed
-            else self._parameter(float(t))
-            for t in times
-        ]
+        # A draw decides for each whether it is fixed.
+        return [self._parameter(float(t), fixed=bool(self.rng.random() < 0.1 * self.has.fixed)) for t in times]
 
     def _draw_run(self, e: int) -> None:
         rng, has = self.rng, self.has
@@ -291,11 +284,11 @@ class System:
         if has.tracking:
             self._add_tracking(run, data)
         if has.running:
-            tree = total(("square", self.expressions.output()), scaled(0.3, self.expressions.bounded(1)))
+            tree = total(square(self.expressions.output()), scaled(0.3, self.expressions.bounded(1)))
             run["running"].append(number(tree, np))
             data.append(sf.RunningCost(number(tree, jnp)))
         if has.terminal or not data:
-            tree = ("square", self.expressions.output())
+            tree = square(self.expressions.output())
             run["terminal"].append(number(tree, np, arguments="xp"))
             data.append(sf.TerminalCost(number(tree, jnp, arguments="xp")))
         if has.constraints:
@@ -303,19 +296,23 @@ class System:
             run["constraints"].append(vector(trees, np, arguments="xp"))
             data.append(sf.TerminalConstraint(vector(trees, jnp, arguments="xp")))
         inputs, run["input"] = self._draw_input()
-        self.experiments.append(
-            sf.Experiment(
-                data,
-                tuple(f"m{k}" for k in sequence),
-                times,
-                self.t0,
-                self.tf,
-                inputs=inputs,
-                parameter_map=mapped or None,
+        modes = tuple(f"m{k}" for k in sequence)
+        settings = {"inputs": inputs, "parameter_map": mapped or None}
+        self.experiments.append(sf.Experiment(data, modes, times, self.t0, self.tf, **settings))
+        pairs = list(pairwise(sequence))
+        self.runs.append(
+            reference.Run(
+                modes=[vector(self.modes[k], np, arguments="txpu" if self.inputs else "txp") for k in sequence],
+                t0=self.t0,
+                tf=self.tf,
+                times=times,
+                initial=None,
+                names={name: mapped.get(name, name) for name in self.parameters},
+                resets=[vector(self.resets[pair], np) if pair in self.resets else None for pair in pairs],
+                guards=[number(self.guards[pair], np) if pair in self.guards else None for pair in pairs],
+                **run,
             )
         )
-        run |= {"sequence": sequence, "times": times, "mapped": mapped}
-        self.runs.append(run)
 
     def _add_samples(self, run: dict[str, Any], data: list[Any], *, late: bool) -> None:
         rng, has = self.rng, self.has
@@ -327,7 +324,7 @@ class System:
         if rng.random() < 0.5:
             times[0], times[-1] = first, last
         q = whole or q
-        trees = [("x", k) for k in range(q)] if whole else [self.expressions.output() for _ in range(q)]
+        trees = [entry(k) for k in range(q)] if whole else [self.expressions.output() for _ in range(q)]
         values = rng.normal(size=(count, q))
         values[rng.random(values.shape) < 0.1] = np.nan
         values[0, 0] = 0.3
@@ -364,11 +361,9 @@ class System:
         root = rng.normal(size=(q, q))
         weights = root @ root.T if rng.random() < 0.5 else np.diag(rng.uniform(0.3, 2.0, q))
         trees = [self.expressions.output() for _ in range(q)]
-        signal = sf.ReferenceSignal.from_samples(times, values, observe=vector(trees, jnp), weights=weights)
-        data.append(signal)
-        run["tracking"].append(
-            reference.Tracking(reference.Signal.spline(times, values), vector(trees, np), np.asarray(weights))
-        )
+        data.append(sf.ReferenceSignal.from_samples(times, values, observe=vector(trees, jnp), weights=weights))
+        signal = reference.Signal.spline(times, values)
+        run["tracking"].append(reference.Tracking(signal, vector(trees, np), np.asarray(weights)))
 
     def _draw_input(self) -> tuple[Any, Any]:
         if not self.inputs:
@@ -383,17 +378,12 @@ class System:
     @cached_property
     def problem(self) -> sf.Problem:
         """The problem as switchfit takes it."""
-        arguments = "txpu" if self.inputs else "txp"
-        flat = self.inputs == 1
-        initial = self.initial
-        if self.has.initial == "function":
-            initial = vector(initial, jnp, arguments="p")
-        system = sf.HybridSystem(
-            {f"m{k}": vector(trees, jnp, arguments=arguments, flat_input=flat) for k, trees in enumerate(self.modes)},
-            initial,
-            {(f"m{a}", f"m{b}"): vector(trees, jnp) for (a, b), trees in self.resets.items()},
-            guards={(f"m{a}", f"m{b}"): number(tree, jnp) for (a, b), tree in self.guards.items()},
-        )
+        form = {"arguments": "txpu" if self.inputs else "txp", "flat_input": self.inputs == 1}
+        initial = vector(self.initial, jnp, arguments="p") if self.has.initial == "function" else self.initial
+        modes = {f"m{k}": vector(trees, jnp, **form) for k, trees in enumerate(self.modes)}
+        resets = {(f"m{a}", f"m{b}"): vector(trees, jnp) for (a, b), trees in self.resets.items()}
+        guards = {(f"m{a}", f"m{b}"): number(tree, jnp) for (a, b), tree in self.guards.items()}
+        system = sf.HybridSystem(modes, initial, resets, guards=guards)
         settings = {"solver": self.has.solver, "rtol": RTOL, "atol": ATOL}
         return sf.Problem(system, self.experiments, self.parameters, **settings)
 
@@ -414,7 +404,7 @@ class System:
             count += len(entries)
             return count - len(entries)
 
-        times = [[float(tau.value) if tau.fixed else take(tau) for tau in run["times"]] for run in self.runs]
+        times = [[float(tau.value) if tau.fixed else take(tau) for tau in run.times] for run in self.runs]
         parameters = {
             name: q.value if q.fixed else (slice(at := take(q), at + q.value.size), q.shape)
             for name, q in self.parameters.items()
@@ -425,30 +415,8 @@ class System:
                 initials.append(vector(self.initial, np, arguments="p"))
             else:
                 initials.append([take(x) if isinstance(x, sf.Parameter) else float(x) for x in self.initial])
-        arguments = "txpu" if self.inputs else "txp"
-        modes = [vector(trees, np, arguments=arguments) for trees in self.modes]
-        runs = []
-        for run, own, initial in zip(self.runs, times, initials, strict=True):
-            sequence = run["sequence"]
-            pairs = list(pairwise(sequence))
-            runs.append(
-                reference.Run(
-                    modes=[modes[k] for k in sequence],
-                    t0=self.t0,
-                    tf=self.tf,
-                    times=own,
-                    initial=initial,
-                    names={name: run["mapped"].get(name, name) for name in self.parameters},
-                    resets=[vector(self.resets[pair], np) if pair in self.resets else None for pair in pairs],
-                    guards=[number(self.guards[pair], np) if pair in self.guards else None for pair in pairs],
-                    samples=run["samples"],
-                    tracking=run["tracking"],
-                    running=run["running"],
-                    terminal=run["terminal"],
-                    constraints=run["constraints"],
-                    input=run["input"],
-                )
-            )
+        placed = zip(self.runs, times, initials, strict=True)
+        runs = [replace(run, times=own, initial=initial) for run, own, initial in placed]
         return reference.Reference(runs, parameters, priors)
 
     @cached_property
@@ -462,13 +430,11 @@ class System:
 
         return np.array([kind(name) for name in self.problem.theta_names])
 
-    def nodes(self, run: dict[str, Any]) -> np.ndarray:
+    def nodes(self, run: reference.Run) -> np.ndarray:
         """Moments of a run at which a transition may tie with something: samples and knots."""
-        times = [item.times - item.delay for item in run["samples"] if not isinstance(item.delay, str)]
-        times += [item.signal.knots for item in run["tracking"]]
-        if run["input"] is not None:
-            times.append(run["input"].knots)
-        times = np.unique(np.concatenate([*times, [self.t0, self.tf]]))
+        times = [item.times - item.delay for item in run.samples if not isinstance(item.delay, str)]
+        signals = [signal for signal in (*[item.signal for item in run.tracking], run.input) if signal is not None]
+        times = np.unique(np.concatenate([*times, *(signal.knots for signal in signals), [self.t0, self.tf]]))
         return times[(times >= self.t0) & (times <= self.tf)]
 
     def special_theta(self) -> tuple[str, np.ndarray]:
@@ -478,9 +444,9 @@ class System:
         is_time = self.kinds == "tau"
         theta = np.where(is_time, theta, theta * (1 + 0.03 * rng.normal(size=len(theta))))
         kind = str(rng.choice(["tie", "before", "after", "coincide", "first", "last", "all"]))
-        for run, where in zip(self.runs, self.reference.runs, strict=True):
-            free = [at for at in where.times if isinstance(at, int)]
-            if len(free) < len(where.times) or not free:
+        for run in self.reference.runs:
+            free = [at for at in run.times if isinstance(at, int)]
+            if len(free) < len(run.times) or not free:
                 continue
             tau, nodes = theta[free], self.nodes(run)
             k = int(rng.integers(len(tau)))
@@ -505,52 +471,50 @@ class System:
 # The comparison
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """What was found beside what the reference says, by blocks."""
+def list_blocks(kinds: np.ndarray, order: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield name and place of each block of a derivative of an order, (d,) or (d, d)."""
+    names = [*dict.fromkeys(kinds)]
+    if order == 1:
+        yield from ((name, kinds == name) for name in names)
+        return
+    diagonal = np.eye(len(kinds), dtype=bool)
+    for a, b in combinations_with_replacement(names, 2):
+        on = np.outer(kinds == a, kinds == b)
+        if a == b == "tau":
+            yield "tau-tau diagonal", on & diagonal
+            on &= ~diagonal
+        yield f"{a}-{b}", on
 
-    system: System
-    where: str
 
-    def errors(self, order: int, found: np.ndarray, expected: np.ndarray) -> Iterator[tuple[str, float]]:
-        """The relative error of each block of a derivative of an order, (d,) or (d, d) in its last axes."""
-        kinds = self.system.kinds
-        largest = np.max(np.abs(expected), initial=0.0)
-        names = [*dict.fromkeys(kinds)]
-        for k, a in enumerate(names):
-            if order == 1:
-                blocks = [(a, np.ix_(*[np.arange(m) for m in found.shape[:-1]], kinds == a))]
-            else:
-                lead = [np.arange(m) for m in found.shape[:-2]]
-                blocks = [(f"{a}-{b}", np.ix_(*lead, kinds == a, kinds == b)) for b in names[k:]]
-            for name, here in blocks:
-                off, size = np.abs(found[here] - expected[here]), np.abs(expected[here])
-                parts = {name: np.ones(off.shape, bool)}
-                if name == "tau-tau":
-                    diagonal = np.broadcast_to(np.eye(off.shape[-1], dtype=bool), off.shape)
-                    parts = {"tau-tau diagonal": diagonal, "tau-tau off-diagonal": ~diagonal}
-                for part, on in parts.items():
-                    scale = np.max(size[on], initial=0.0) + 0.01 * max(largest, 1.0)
-                    error = np.max(off[on], initial=0.0) / scale
-                    yield part, float(error if np.isfinite(found).all() else np.inf)
+def check(kinds: np.ndarray, what: str, order: int, found: Any, expected: Any, tolerance: float) -> list[str]:
+    """What is wrong with a derivative of an order, (..., d) or (..., d, d), as sentences."""
+    expected = np.asarray(expected)
+    off, size = np.abs(found - expected), np.abs(expected)
+    if order == 0:
+        errors = {"": np.max(off / np.maximum(size, 1.0), initial=0.0)}
+    else:
+        least = 0.01 * max(np.max(size, initial=0.0), 1.0)
+        errors = {
+            name: np.max(off[..., on], initial=0.0) / (np.max(size[..., on], initial=0.0) + least)
+            for name, on in list_blocks(kinds, order)
+        }
+    return [f"{what} {name} is off by {error:.1e}" for name, error in errors.items() if not error <= tolerance]
 
-    def check(self, what: str, order: int, found: Any, expected: Any, tolerance: float) -> list[str]:
-        """What is wrong, as sentences."""
-        found, expected = np.asarray(found), np.asarray(expected)
-        if order == 0:
-            errors = [("", float(np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1.0), initial=0.0)))]
-        else:
-            errors = list(self.errors(order, found, expected))
-        return [
-            f"{self.where}: {what} {block} is off by {error:.1e}" for block, error in errors if not error <= tolerance
-        ]
+
+def compare(kinds: np.ndarray, where: str, found: Any, expected: Any, tolerances: Tolerances = CLOSE) -> list[str]:
+    """What is wrong with J, gradient and Hessian."""
+    value, gradient, hessian = tolerances
+    wrong = check(kinds, f"{where}: J", 0, found.cost, expected.cost, value)
+    wrong += check(kinds, f"{where}: gradient", 1, found.gradient, expected.gradient, gradient)
+    wrong += check(kinds, f"{where}: Hessian", 2, found.hessian, expected.hessian, hessian)
+    return wrong
 
 
 def differences(
     system: System, methods: tuple[str, ...], engine: str = "auto", implicit: tuple[str, ...] = ()
 ) -> list[str]:
     """Everything in which switchfit differs from the reference, as sentences; `implicit` modes take implicit steps."""
-    problem = replace(system.problem, engine=engine, **({"solver": "auto"} if implicit else {}))
+    problem, kinds = replace(system.problem, engine=engine, **({"solver": "auto"} if implicit else {})), system.kinds
     stiffness = [Stiffness(name, 0, 0, 0.0) for name in implicit]
     special, other = system.special_theta()
     thetas = {"guess": problem.initial_theta, special: problem.check_theta(other)}
@@ -562,44 +526,29 @@ def differences(
     wrong: list[str] = []
     for name, theta in thetas.items():
         for side in (1, -1) if name == "tie" else (1,):
-            expected = system.reference.derivatives(theta, side)
+            expected, where = system.reference.derivatives(theta, side), f"{name}, side {side}"
             for method in ("auto", *methods):
-                found = evaluator(theta, side, method)
-                slack = PAPER / GRADIENT if method == "adjoint" else 1.0
-                check = partial(Comparison(system, f"{name}, side {side}, {method}").check)
-                label = "paper's " if method == "adjoint" else ""
-                wrong += check(f"{label}J", 0, found.cost, expected.cost, VALUE * slack)
-                wrong += check(f"{label}gradient", 1, found.gradient, expected.gradient, GRADIENT * slack)
-                wrong += check(
-                    f"{label}Hessian", 2, found.hessian, expected.hessian, PAPER if method == "adjoint" else HESSIAN
-                )
+                tolerances = PAPER if method == "adjoint" else CLOSE
+                wrong += compare(kinds, f"{where}, {method}", evaluator(theta, side, method), expected, tolerances)
             if len(problem.experiments) > 1:
-                check = Comparison(system, f"{name}, side {side}, arrow").check
                 arrow = evaluator.arrow(theta, side)
-                wrong += check("gradient", 1, arrow.gradient, expected.gradient, GRADIENT)
-                wrong += check("Hessian", 2, arrow.hessian.dense(), expected.hessian, HESSIAN)
+                wrong += compare(kinds, f"{where}, arrow", replace(arrow, hessian=arrow.hessian.dense()), expected)
             if problem.constraint_names:
-                wrong += _constrained(system, evaluator, theta, side, name, expected)
+                wrong += compare_constrained(kinds, f"{where}, constrained", evaluator, theta, side, expected)
     return wrong
 
 
-def _constrained(
-    system: System, evaluator: Evaluator, theta: np.ndarray, side: int, name: str, expected: reference.Derivatives
+def compare_constrained(
+    kinds: np.ndarray, where: str, evaluator: Evaluator, theta: np.ndarray, side: int, expected: reference.Derivatives
 ) -> list[str]:
-    """The same for constraints and the Hessian of their Lagrangian."""
-    rng = np.random.default_rng(1)
-    m = len(expected.constraints)
-    multipliers = rng.normal(size=m)
+    """The same with constraints, and the Hessian of their Lagrangian."""
+    multipliers = np.random.default_rng(1).normal(size=len(expected.constraints))
     found = evaluator.constrained(theta, side, multipliers)
-    c, A = expected.constraints, expected.jacobian
     hessian = expected.hessian + np.einsum("k,kij->ij", multipliers, expected.curvatures)
-    check = Comparison(system, f"{name}, side {side}, constrained").check
     return [
-        *check("J", 0, found.cost, expected.cost, VALUE),
-        *check("gradient", 1, found.gradient, expected.gradient, GRADIENT),
-        *check("constraints", 0, found.constraints, c, VALUE),
-        *check("Jacobian", 1, found.jacobian, A, GRADIENT),
-        *check("Hessian of the Lagrangian", 2, found.hessian, hessian, HESSIAN),
+        *compare(kinds, where, found, replace(expected, hessian=hessian)),
+        *check(kinds, f"{where}: constraints", 0, found.constraints, expected.constraints, CLOSE[0]),
+        *check(kinds, f"{where}: Jacobian", 1, found.jacobian, expected.jacobian, CLOSE[1]),
     ]
 
 

@@ -6,8 +6,6 @@ import ast
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-import pytest
-
 import switchfit as sf
 
 PACKAGE = Path(sf.__file__).parent
@@ -65,14 +63,11 @@ def imports_of(source: str) -> set[str]:
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative import"
             base = node.module or ""
-            found |= {whole if (whole := f"{base}.{a.name}") in named() else base for a in node.names}
+            wholes = (f"{base}.{a.name}" for a in node.names)
+            found |= {whole if whole.removeprefix("switchfit.") in MODULES else base for whole in wholes}
         elif isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
     return {name.removeprefix("switchfit").removeprefix(".") for name in found if name.split(".")[0] == "switchfit"}
-
-
-def named() -> set[str]:
-    return {f"switchfit.{name}" for name in MODULES}
 
 
 def room_of(module: str) -> str:
@@ -86,12 +81,12 @@ def violations(module: str, imported: set[str]) -> list[str]:
     return [f"{module} imports {other or 'switchfit'}" for other in imported if room_of(other) not in allowed]
 
 
-@pytest.mark.parametrize("module", [name for name in MODULES if name])
-def test_each_room_imports_only_those_before_it(module):
-    imported = imports_of(MODULES[module].read_text())
-    if room_of(module) == "cli":
-        imported -= {""}  # it is a user of what is public
-    assert not violations(module, imported)
+def test_each_room_imports_only_those_before_it():
+    for module, path in MODULES.items():
+        imported = imports_of(path.read_text())
+        if room_of(module) == "cli":
+            imported -= {""}  # it is a user of what is public
+        assert not module or not violations(module, imported)
 
 
 def test_logs_are_read_without_the_rest_of_the_library():
@@ -111,23 +106,8 @@ def test_libraries_of_the_extras_are_imported_where_they_are_needed():
 
 
 def test_no_module_imports_itself_by_way_of_others():
-    graph = {}
-    for module, path in MODULES.items():
-        graph[module] = imports_of(path.read_text()) - {module, ""} if module else set()
+    graph = {module: imports_of(path.read_text()) - {module, ""} for module, path in MODULES.items() if module}
     list(TopologicalSorter(graph).static_order())  # raises CycleError
-
-
-def test_a_violation_is_found():
-    """In an import for types alone, inside a function, and of a whole package."""
-    for source in (
-        "if TYPE_CHECKING:\n    from switchfit.report.text import report",
-        "def f():\n    from switchfit.report import text",
-        "import switchfit.report.text",
-        "from switchfit import report",
-    ):
-        assert violations("fit.result", imports_of(source)), source
-    assert not violations("fit.result", imports_of("from switchfit.problem.data import FloatArray"))
-    assert violations("optimize.sqp", imports_of("from switchfit.runtime.files import write_atomically"))
 
 
 def test_every_room_is_in_the_list_and_says_what_belongs_in_it():

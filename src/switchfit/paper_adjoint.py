@@ -205,11 +205,8 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
         minus, plus = pick(after, opening - 1), pick(before, opening)
         total = add(total, add_reset(here, adjoints, minus.Dp_x))
         D_tau_J.append(here.Lambda + adjoints.psi @ here.X)  # (6), Lambda = 0 without a reset map
-        rows_tau.append(
-            jnp.concatenate(
-                [compute_tau_tau(i, here, adjoints, minus, plus), compute_tau_p(here, adjoints, minus, plus)]
-            )
-        )
+        of_tau, of_p = compute_tau_tau(i, here, adjoints, minus, plus), compute_tau_p(here, adjoints, minus, plus)
+        rows_tau.append(jnp.concatenate([of_tau, of_p]))
 
     gradient = jnp.concatenate([jnp.array(D_tau_J), total.Dp_J])
     return compute_path_cost(model, path, p), gradient, assemble(rows_tau, total.DpDp_J)
@@ -280,26 +277,9 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
     D2Lambda, D1Lambda, DpLambda = jax.grad(Lambda, argnums=(0, 1, 2))(*minus)
     X = f_im1 - f_i  # (8)
     D1R, DpR, *second = differentiate_twice(R, *minus)
-    return Transition(
-        X,
-        f_before(*minus),
-        f_im1,
-        D1f_im1,
-        D2f_im1,
-        Dpf_im1,
-        f_i,
-        D1f_i,
-        D2f_i,
-        Dpf_i,
-        Lambda(*minus),
-        D1Lambda,
-        D2Lambda,
-        DpLambda,
-        jax.grad(ell_after, argnums=1)(*plus),
-        D1R,
-        DpR,
-        *second,
-    )
+    before, after = (f_im1, D1f_im1, D2f_im1, Dpf_im1), (f_i, D1f_i, D2f_i, Dpf_i)
+    costs = Lambda(*minus), D1Lambda, D2Lambda, DpLambda, jax.grad(ell_after, argnums=1)(*plus)
+    return Transition(X, f_before(*minus), *before, *after, *costs, D1R, DpR, *second)
 
 
 # The forward sweep: equation (10) and the columns of Phi
@@ -327,10 +307,7 @@ def integrate_sensitivities(
     # Column j is Phi(t, tau_j) X^j: zero before tau_j, X^j there, then z_dot = D_1 f z, as below (10).
     def rate(given: tuple[Array, Array], now: Sensitivities) -> Sensitivities:
         D1f, Dpf = given
-        return Sensitivities(
-            D1f @ now.Phi_X,
-            D1f @ now.Dp_x + Dpf,  # (10) as a differential equation
-        )
+        return Sensitivities(D1f @ now.Phi_X, D1f @ now.Dp_x + Dpf)  # (10) as a differential equation
 
     def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
         segment, opens, start, end, piece, states = given
@@ -562,10 +539,7 @@ def pass_reset(
 def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
     """Return the contributions of the reset map's own dependence on p to (9) and (14); `Dp_x` (n, M) is at tau_i-."""
     psi, _, Omega_p = adjoints
-    return Quadratures(
-        psi @ here.DpR,
-        here.DpR.T @ Omega_p + contract(psi, here.DpDpR + here.D1DpR @ Dp_x),
-    )
+    return Quadratures(psi @ here.DpR, here.DpR.T @ Omega_p + contract(psi, here.DpDpR + here.D1DpR @ Dp_x))
 
 
 def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:

@@ -189,9 +189,10 @@ def _run(
 ) -> Course:
     """Feed all samples, until Ctrl-C, and print what the estimator says."""
     from switchfit.io.command_line import summarize_now
-    from switchfit.online.log import Recorder
+    from switchfit.online.log import build_log
 
-    recorder, refused = Recorder(loaded.problem), list[int]()
+    recorded: list[Now] = []
+    refused: list[int] = []
     (run,) = loaded.problem.experiments
     with terminal.stop_on_interrupt(repr, "sample") as report:
         stopped = partial(report, None)
@@ -202,10 +203,10 @@ def _run(
                 page.show(terminal.format_json(line))
             terminal.print_json(line)
             if records:
-                recorder.said.append(now)
+                recorded.append(now)
             if stopped():
                 break
-    return Course(recorder.build() if recorder.said else None, refused, stopped())
+    return Course(build_log(loaded.problem, recorded) if recorded else None, refused, stopped())
 
 
 def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:

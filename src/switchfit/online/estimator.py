@@ -28,9 +28,9 @@ from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.library import build_library
 from switchfit.online.saved import Arrival, Journal, Kept, build_kept_problem, pack, read, read_journal, unpack
-from switchfit.online.state import Alarm, Best, Now, OnlineStatus, calibrate, read_sigma
+from switchfit.online.state import Alarm, Best, Now, OnlineStatus, calibrate, hold, read_sigma
 from switchfit.online.tracker import Feed, Settings, StoppedError, Tracker, invert
-from switchfit.problem.data import FloatArray, Input, Measurements
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import select_kind
@@ -273,9 +273,8 @@ class OnlineEstimator:
         self._renewed = float(self._feed.nodes[0])
         self._alarms: list[Alarm] = []
         self._values, self._fitted = 0, (0.0, 0)  # values so far; lowest cost and values at the last update
-        self._recent: list[
-            tuple[float, int]
-        ] = []  # what the last updates have added to twice the cost, with how many values
+        # What the last updates have added to twice the cost, with how many values.
+        self._recent: list[tuple[float, int]] = []
         self._stopped: float | None = None  # since when the model cannot be simulated
         self._lost: float | None = None  # when the samples were last far from what is predicted
         self._costs = {"births": 0.0, "polish": 0.0}
@@ -681,11 +680,8 @@ class OnlineEstimator:
         if run.inputs is not None:
             inputs = run.inputs
             if self.held is not None:
-                held = [feed.signal(cell)[0] for cell in range(first, feed.count - 1)]
-                columns = np.array(held)
-                names = run.inputs.names
-                shaped = dict(zip(names, columns.T, strict=True)) if names else columns.reshape(-1, *run.inputs.shape)
-                inputs = Input(feed.nodes[first:-1].copy(), shaped)
+                held = np.array([feed.signal(cell)[0] for cell in range(first, feed.count - 1)])
+                inputs = hold(run.inputs, feed.nodes[first:-1].copy(), held)
         past, horizon = len(tracker.left), (float(feed.nodes[first]), feed.last)
         sequence, times = now.mode_sequence[past:], now.transition_times[past:]
         return Kept(data, inputs, horizon, sequence, times, now.best.theta, self._describe_arrival())
@@ -706,11 +702,6 @@ class OnlineEstimator:
         into = np.zeros((S + len(beam.places), S + U))  # two names of the model may refer to one parameter
         into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
         return into
-
-    @cached_property
-    def _joined(self) -> FloatArray | None:
-        """`_into`, None if the unknowns of the engine are its times and the problem's parameters."""
-        return None if np.array_equal(self._into, np.eye(len(self._into))) else self._into
 
     @cached_property
     def _slices(self) -> dict[str, slice]:
@@ -837,7 +828,7 @@ class OnlineEstimator:
         of_engine, A = (found.matrices[b].copy(), found.tangents[b].copy()), self._settings.entries
         theta, times = self._read_theta(found.moved[b]), slice(A, A + count)
         artificial = self._tracker.artificial
-        return Best(theta, found.states[b].copy(), times, self._slices, of_engine, artificial, self._joined)
+        return Best(theta, found.states[b].copy(), times, self._slices, of_engine, artificial, self._into)
 
     def _measure_walks(self, best: Best) -> FloatArray:
         """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).

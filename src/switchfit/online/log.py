@@ -148,39 +148,33 @@ def _stack(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
     return {name: np.array([each[name] for each in given]) for name in given[-1]}
 
 
-class Recorder:
-    """Collects what an estimator says, for an `OnlineLog`."""
+def build_log(problem: Problem, said: list[Now]) -> OnlineLog:
+    """Return the log of what was said at updates; there must have been one."""
+    last, run = said[-1], problem.experiments[0]
+    modes = tuple(problem.system.modes)
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem, self.said = problem, list[Now]()
+    def collect(read: Callable[[Now], Any]) -> Any:
+        return np.array([read(now) for now in said])
 
-    def build(self) -> OnlineLog:
-        """Return what was said; there must have been an update."""
-        said, last, run = self.said, self.said[-1], self.problem.experiments[0]
-        modes = tuple(self.problem.system.modes)
-
-        def collect(read: Callable[[Now], Any]) -> Any:
-            return np.array([read(now) for now in said])
-
-        return OnlineLog(
-            times=collect(lambda now: now.time),
-            modes=modes,
-            mode=collect(lambda now: modes.index(now.mode)),
-            probability=collect(lambda now: [now.mode_probability.get(mode, 0.0) for mode in modes]),
-            since=collect(lambda now: now.since),
-            parameters=_stack([now.parameters for now in said]),
-            standard_errors=_stack([now.standard_errors for now in said]),
-            statistic=collect(lambda now: now.statistic),
-            threshold=last.threshold,
-            status=tuple(now.status for now in said),
-            seconds=collect(lambda now: now.seconds),
-            alarms=tuple(now.alarm for now in said if now.alarm is not None),
-            retracted=tuple(now.retracted for now in said if now.retracted is not None),
-            now=last,
-            time_unit=run.time_unit,
-            origin=run.origin,
-            units={name: parameter.unit for name, parameter in self.problem.parameters.items()},
-        )
+    return OnlineLog(
+        times=collect(lambda now: now.time),
+        modes=modes,
+        mode=collect(lambda now: modes.index(now.mode)),
+        probability=collect(lambda now: [now.mode_probability.get(mode, 0.0) for mode in modes]),
+        since=collect(lambda now: now.since),
+        parameters=_stack([now.parameters for now in said]),
+        standard_errors=_stack([now.standard_errors for now in said]),
+        statistic=collect(lambda now: now.statistic),
+        threshold=last.threshold,
+        status=tuple(now.status for now in said),
+        seconds=collect(lambda now: now.seconds),
+        alarms=tuple(now.alarm for now in said if now.alarm is not None),
+        retracted=tuple(now.retracted for now in said if now.retracted is not None),
+        now=last,
+        time_unit=run.time_unit,
+        origin=run.origin,
+        units={name: parameter.unit for name, parameter in problem.parameters.items()},
+    )
 
 
 def replay(
@@ -231,11 +225,12 @@ def replay(
         raise ValueError(f"the problem has {len(own)} Measurements; got {len(given)} as data.")
     if callback is not None:
         as_callable(callback, "callback", "a function callback(now)", arguments=1)
-    recorder, updates = Recorder(problem), list_updates([(item.times, item.values) for item in given])
+    said: list[Now] = []
+    updates = list_updates([(item.times, item.values) for item in given])
     if not updates:
         raise ValueError("the problem has no samples to replay: give data.")
     for t, y in updates:
-        recorder.said.append(online.update(t, y))
-        if callback is not None and callback(recorder.said[-1]):
+        said.append(online.update(t, y))
+        if callback is not None and callback(said[-1]):
             break
-    return recorder.build()
+    return build_log(problem, said)

@@ -16,7 +16,6 @@ import numpy as np
 
 from switchfit.online.tracker import Left, Start, Tracker
 from switchfit.problem.data import FloatArray, Input, Measurements
-from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
 from switchfit.runtime.files import write_atomically
@@ -95,16 +94,8 @@ def build_kept_problem(problem: Problem, kept: Kept) -> Problem:
         parameters |= {name: Parameter(np.zeros(size)) for name, size in known.items() if size}
     t0, tf = kept.horizon
     sequence, times = _drop_empty_modes(kept.sequence, np.clip(kept.times, t0, tf).tolist(), t0, tf)
-    now = Experiment(
-        tuple(data),
-        sequence,
-        times,
-        t0,
-        tf,
-        inputs=kept.inputs,
-        initial_state=initial,
-        parameter_map=run.parameter_map,
-    )
+    begins: dict[str, Any] = {"t0": t0, "initial_state": initial, "inputs": kept.inputs}
+    now = replace(run, data=tuple(data), mode_sequence=sequence, transition_times=times, tf=tf, **begins)
     return replace(problem, experiments=(now,), parameters=parameters)
 
 
@@ -132,10 +123,8 @@ def _describe_arrival(problem: Problem, arrival: Arrival, t0: float) -> tuple[An
     R = (vectors[:, there] * np.sqrt(values[there])).T
     s = (vectors[:, there] / np.sqrt(values[there])).T @ arrival.gradient
     own = {problem_name: name for name, problem_name in run.parameter_map.items()}
-    names, has_entries = (
-        [own.get(name, name) for name in unknowns.parameters],
-        len(arrival.gradient) > len(arrival.center),
-    )
+    names = [own.get(name, name) for name in unknowns.parameters]
+    has_entries = len(arrival.gradient) > len(arrival.center)
     if (unknowns.initial_states[0] >= 0).any():
         names.append(STATES)
 

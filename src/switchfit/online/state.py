@@ -96,8 +96,8 @@ class Best:
     parameters : dict of str to slice, of the free parameters
     of_engine, artificial : ((E, E), (n, E)), (E,)
         Second derivatives and tangent in the engine's E unknowns, and what the diagonal has that is no knowledge.
-    into : (E, D) or None
-        How these unknowns follow from the D; None if they are the same.
+    into : (E, D)
+        How these unknowns follow from the D.
     """
 
     theta: FloatArray
@@ -106,18 +106,17 @@ class Best:
     parameters: dict[str, slice]
     of_engine: tuple[FloatArray, FloatArray]
     artificial: FloatArray
-    into: FloatArray | None
+    into: FloatArray
 
     @cached_property
     def matrix(self) -> FloatArray:
         """Second derivatives of the cost, (D, D)."""
-        matrix = drop_artificial(self.of_engine[0], self.artificial)
-        return matrix if self.into is None else self.into.T @ matrix @ self.into
+        return self.into.T @ drop_artificial(self.of_engine[0], self.artificial) @ self.into
 
     @property
     def tangent(self) -> FloatArray:
         """Derivatives of the state, (n, D)."""
-        return self.of_engine[1] if self.into is None else self.of_engine[1] @ self.into
+        return self.of_engine[1] @ self.into
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,20 +418,19 @@ def build_quiet_problem(online: Estimator, length: float) -> Problem:
         times = t0 + item.delay + gap * np.arange(1, int(length / gap) + 1)
         values = np.zeros((len(times), item.values.shape[1]))
         data.append(replace(item, times=times, values=values, sigma=read_sigma(item)))
-    changes: dict[str, Any] = {
-        "data": tuple(data),
-        "transition_times": (),
-        "t0": t0,
-        "tf": t0 + length,
-        "mode_sequence": run.mode_sequence[:1],
-    }
+    changes: dict[str, Any] = {"mode_sequence": run.mode_sequence[:1]}
     if online.held is not None and run.inputs is not None:
-        names, held = run.inputs.names, online.held
-        by_name = dict(zip(names, held[:, None], strict=True))
-        changes["inputs"] = Input([t0], by_name or held.reshape(1, *run.inputs.shape))
+        changes["inputs"] = hold(run.inputs, np.array([t0]), online.held[None])
     parameters = dict(problem.parameters)
     if now is not None:
         changes |= {"mode_sequence": (now.mode,), "initial_state": now.state}
         for name in problem.unknowns.parameters:
             parameters[name] = replace(parameters[name], value=now.parameters[name])
-    return replace(problem, experiments=(replace(run, **changes),), parameters=parameters)
+    quiet = replace(run, data=tuple(data), transition_times=(), t0=t0, tf=t0 + length, **changes)
+    return replace(problem, experiments=(quiet,), parameters=parameters)
+
+
+def hold(inputs: Input, times: FloatArray, values: FloatArray) -> Input:
+    """Return inputs like those of an experiment that hold values (K, q) from times (K,) on."""
+    names = inputs.names
+    return Input(times, dict(zip(names, values.T, strict=True)) if names else values.reshape(-1, *inputs.shape))

@@ -561,7 +561,8 @@ class Tracker:
         gone = sum(time < end for time in times[0, : own.switches[0]].tolist())
         # The best hypothesis alone says what was before the new start: x, Z, J, g and H at the node, without moving on.
         there = self._propagate(own, moved, times, gone, following, recentres=False)
-        errors = np.sqrt(np.diag(invert(self.find_matrix(found, b))))[A : A + gone] if gone else np.zeros(0)
+        known = drop_artificial(found.matrices[b], self.artificial)
+        errors = np.sqrt(np.diag(invert(known)))[A : A + gone] if gone else np.zeros(0)
         there.moved[:, : A + S] = 0.0
         pasts = []
         # Transitions that are behind the new start become entries e, one after the other; for each one combination of n
@@ -569,15 +570,9 @@ class Tracker:
         for _ in range(gone):
             pasts.append(Past.of(there.tangents[0], A, S))
             pasts[-1].absorb(there, self.birth_information)
-        matrix = there.matrices[0] - self._artificial
-        self.start = Start(
-            there.moved[0].copy(),
-            float(there.costs[0]),
-            there.gradients[0].copy(),
-            matrix,
-            there.states[0].copy(),
-            there.tangents[0].copy(),
-        )
+        x, Z, g = there.states[0].copy(), there.tangents[0].copy(), there.gradients[0].copy()
+        H = there.matrices[0] - self._artificial
+        self.start = Start(there.moved[0].copy(), float(there.costs[0]), g, H, x, Z)
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
         self.behind -= moved[:, :A]
@@ -589,14 +584,7 @@ class Tracker:
         if gone:
             self.declared = self.declared[gone:]
 
-    def _follow(
-        self,
-        node: int,
-        pasts: list[Past],
-        modes: NDArray[np.int64],
-        times: FloatArray,
-        end: float,
-    ) -> None:
+    def _follow(self, node: int, pasts: list[Past], modes: NDArray[np.int64], times: FloatArray, end: float) -> None:
         """Drop the hypotheses of a node that disagree about what has left the window, and express the others by its
         new start.
 
@@ -698,10 +686,6 @@ class Tracker:
         self.feed.drop(self.first)
         self.dropped += self.first
         self.first = 0
-
-    def find_matrix(self, found: Hypotheses, b: int) -> FloatArray:
-        """Return H of a hypothesis without its artificial terms: (D, D); zeros where nothing else is left."""
-        return drop_artificial(found.matrices[b], self.artificial)
 
 
 def drop_artificial(matrix: FloatArray, artificial: FloatArray) -> FloatArray:
