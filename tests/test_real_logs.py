@@ -191,6 +191,12 @@ def test_robust_fit_stays_where_outliers_pull_the_other_away():
     assert f"{comparison.downweighted.sum()} outliers weighed down by the loss" in " ".join(str(held).split())
 
 
+def test_where_rho_bends_down_the_exact_hessian_is_indefinite_and_the_fit_converges():
+    far = problem(k=3.5, loss="cauchy", loss_scale=1.0)
+    assert np.linalg.eigvalsh(sf.evaluate(far).hessian).min() < 0
+    assert sf.estimate(far).status.is_strict_minimum
+
+
 # Priors
 
 

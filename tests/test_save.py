@@ -7,6 +7,7 @@ import random
 import re
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from types import GenericAlias
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from models import RAMP
+from numpy.typing import NDArray
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
@@ -22,7 +24,7 @@ from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
 from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.runtime.errors import Issue
-from switchfit.runtime.json_records import from_json, to_json
+from switchfit.runtime.json_records import find_dtype, from_json, to_json
 from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(
@@ -111,6 +113,12 @@ def test_loading_gives_the_same_fit(fit, tmp_path):
 
 
 FLOATS = st.floats(allow_nan=False) | st.just(np.nan)
+
+
+def test_arrays_are_found_by_what_either_numpy_calls_them():
+    """From 2.5 on `NDArray` is an alias that is its own origin."""
+    assert [find_dtype(kind) for kind in (NDArray[np.bool_], GenericAlias(NDArray, (np.float64,)))] == [bool, float]
+    assert find_dtype(float) is None
 
 
 @settings(max_examples=30)
