@@ -26,7 +26,7 @@ from switchfit import cli
 from switchfit.cli.terminal import write_figure
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
-from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, list_places
+from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, find_range, list_places
 from switchfit.report.plot import find_plane
 from switchfit.report.text import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
@@ -338,9 +338,9 @@ def test_a_delay_moves_the_samples_as_the_curve_in_time():
 def test_sliders_stop_at_bounds_and_at_what_can_be_seen(toss):
     runs = {0: collect_curves(toss, 0, list_places(toss, 0), 200)}
     sliders = build_sliders(toss, runs, list_places(toss, 0))
-    values = sliders[0]["values"]
-    assert toss.lower[0] <= values[0]
-    assert values[-1] < toss.trajectory.times[-1]
+    assert sliders[0]["values"][-1] < toss.trajectory.times[-1]
+    tight = replace(toss, lower=toss.theta - 1e-6, upper=toss.theta + 1e-6)
+    assert find_range(tight, runs, 1) == (tight.lower[1], tight.upper[1])
     for slider in sliders:
         reach, place = slider["values"][-1] - slider["theta"], slider["place"]
         curves = [(own.curve[f"d{place}_{k}"], own.curve[f"y{k}"]) for own in runs[0] for k in range(len(own.names))]
