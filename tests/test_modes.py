@@ -227,8 +227,7 @@ def test_a_fit_that_does_not_converge_is_said_to_be_so(monkeypatch):
 def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
     values = simulate(("rise", "fall"), (3.0,), system=system)
-    force = sf.Parameter(4.0, prior=sf.Normal(4.5, 0.5))  # which would move it to its mean
-    problem = make_problem(system=system, parameters=FREE | {"force": force}, values=values)
+    problem = make_problem(system=system, parameters=FREE | {"force": 4.0}, values=values)
     found = sf.find_modes(problem, max_switches=3)
     assert found.mode_sequence == ("rise", "fall")
     assert found.status is sf.ModeStatus.FOUND
@@ -434,6 +433,19 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters():
         _ = found.mode_sequence
     assert "one:" in str(found)
     assert "two:" in str(found)
+
+
+def test_what_acts_in_no_mode_is_held():
+    system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
+    force = sf.Parameter(4.0, prior=sf.Normal(4.0, 0.5))  # which would move it to its mean
+    problem = sf.Problem(system, make_run(), FREE | {"force": force})
+    library = build_library(problem, max_switches=3)
+    fitter = Fitter(problem, library)
+    assert fitter.find_acting([("rise", "fall")]).tolist() == [True, False]
+    assert fitter.find_acting([("rise", "pull")]).tolist() == [True, True]
+    fitted = fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], np.array([0.9, 3.21]))
+    assert fitted.parameters[1] == 3.21
+    assert np.isfinite(fitted.cost)
 
 
 def test_a_criterion_of_ones_own():
