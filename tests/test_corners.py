@@ -754,7 +754,8 @@ def test_random_systems():
 
         def cost(theta, evaluator=evaluator, engine=engine, paths=paths):
             J = evaluator.cost(theta)
-            paths.add((engine._split.path.sequence, tuple(np.searchsorted(engine._times, [0.71, 1.43]))))
+            path = engine._split.path
+            paths.add((path.sides, path.ends, tuple(np.searchsorted(engine._times, [0.71, 1.43]))))
             return J
 
         found = evaluator(theta)
