@@ -279,7 +279,11 @@ def list_doors():
             **{"problem": ONLINE, "successions": SUCCESSIONS, "window": 1.0, "min_duration": {"fall": 0.0}},
             **{"max_switches": 2, "renews": {"rise": "k"}, "drift": {"k": 0.1}},
         ),
-        "OnlineEstimator.update": door(sf.OnlineEstimator(ONLINE).update, t=0.5, y=[0.1, 0.2]),
+        "OnlineEstimator.update": door(
+            lambda **given: sf.OnlineEstimator(ONLINE).update(**given),
+            sf.OnlineEstimator(ONLINE).update,
+            **{"t": 0.5, "y": [0.1, 0.2]},
+        ),
         "replay": door(sf.replay, problem=ONLINE),
         "calibrate": door(lambda **given: sf.calibrate(sf.OnlineEstimator(ONLINE), **given), false_alarms=0.1),
         "insertion": door(sf.insertion, problem=GOOD, theta=START),
