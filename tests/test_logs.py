@@ -242,7 +242,11 @@ def test_text_that_cannot_be_read(write, text, message):
         ("", None, "is a folder; name a file in it"),
         ("a.bin", b"t,x\n\xff\xfe\x00", r"a\.bin is not a text file \(byte 6 is 0\); export it as CSV"),
         ("odd.csv", b"\xff\xfet", r"odd\.csv is not a text file in UTF-16 \(byte"),
-        ("a.csv.gz", gzip.compress(b"t,x\n0,1\n" * 100, mtime=0)[:-20], r"a\.csv\.gz is compressed by gzip, but damaged or cut"),
+        (
+            "a.csv.gz",
+            gzip.compress(b"t,x\n0,1\n" * 100, mtime=0)[:-20],
+            r"a\.csv\.gz is compressed by gzip, but damaged or cut",
+        ),
         ("word " * 1000, None, r"path must name a file, with at most 255 characters; got '.*word word"),
         ("/dev/zero", None, "is a device; name a file"),
     ],
