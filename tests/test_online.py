@@ -354,6 +354,21 @@ def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):
 # --- what is said -----------------------------------------------------------------------------------------------------
 
 
+def test_a_second_sensor_at_a_time_that_there_is():
+    """Its sample is put in by an update of its own."""
+    times = 0.1 * np.arange(1, 31)
+    values = np.exp(-times) + 0.01 * np.random.default_rng(0).standard_normal((2, 30))
+    sensors = [sf.Measurements(times, v, sigma=0.01, names=[n]) for v, n in zip(values, "ab", strict=True)]
+    problem = track({"on": decay}, [1.0], sensors, {"k": 0.7}, 3.0)
+    online = sf.OnlineEstimator(problem)
+    for t, y in zip(times, values.T, strict=True):
+        online.update(t, {"a": y[0]})
+        now = online.update(t, {"b": y[1]})
+    together = sf.replay(problem).now
+    np.testing.assert_allclose(now.parameters["k"], together.parameters["k"], rtol=1e-6)
+    np.testing.assert_allclose(now.standard_errors["k"], together.standard_errors["k"], rtol=1e-6)
+
+
 def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
     online = sf.OnlineEstimator(problem, threshold=8.0)
     wrong = log.copy()
