@@ -41,6 +41,8 @@ def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
     terminal = open_terminal(monkeypatch)
     before = set(threading.enumerate())
     with show_line("begins") as line:
+        assert line.is_started  # a fit writes to it
+        assert not progress.Line("no terminal").is_started
         assert wait_for("begins   ", terminal)
         line.write("many starts", 3.0)
         show_detail("start 3 of at most 127", 2.0)
