@@ -49,7 +49,7 @@ TESTS = {
             "tests/test_corners.py",
             "-k",
             "once or stays_on or leaves_out or closed_forms or differences or order or rest or predicts "
-            "or level or filled or cascade",
+            "or level or filled or cascade or nearly_shuts",
         ]
     ],
     "online": [["tests/test_online.py"]],
