@@ -23,7 +23,6 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.cli.terminal import write_figure
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
 from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, find_range, list_places
@@ -421,13 +420,6 @@ def test_many_runs_stay_small_and_the_worst_come_first():
     assert (shown.count("img"), shown.count("table")) == (0, 1)
     assert re.search(r"And \d+ more unknowns\.", shown.words)
     assert "And 35 more." in Reader(fit.problem._repr_html_()).words
-
-
-def test_the_figure_of_the_command_line_is_that_of_savefig(toss, tmp_path):
-    toss.plot().savefig(tmp_path / "savefig.png", dpi=150)
-    write_figure(toss, tmp_path / "fit.png")
-    expected, found = (matplotlib.image.imread(tmp_path / name) for name in ("savefig.png", "fit.png"))
-    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.fixture
