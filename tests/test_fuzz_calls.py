@@ -121,6 +121,7 @@ WORDS = {
     "path": ("file", "path", "folder"),
     "problem": ("problem", "sf.Problem"),
     "columns": ("columns", "column", "unwrap"),
+    "range_error": ("range_error", "latitude"),
     "reset_maps": ("reset",),
     "start": ("start", "at the guess", "the guess leads"),
     "starts": ("start",),

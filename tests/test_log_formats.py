@@ -60,16 +60,19 @@ def test_origin_and_columns_of_a_table(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("t,gps_lat,gps_lon,HDOP\n0,48,11,1.5\n1,,,\n2,48.001,11,2\n")
     assert sf.read_log(path).channels == ("gps_lat", "gps_lon", "HDOP")  # nothing is computed that is not asked for
-    log = sf.read_log(path, origin=[48.001, 11])
+    log = sf.read_log(path, origin=[48.001, 11], range_error=4)
     np.testing.assert_allclose(log["north"], [-111.2, np.nan, 0], atol=0.1)
+    np.testing.assert_allclose(log["sigma_east"], np.array([1.5, np.nan, 2]) * 4 / np.sqrt(2))
     assert "up" not in log
-    assert sf.read_log(path, columns=["north"]).channels == ("north",)
+    assert sf.read_log(path, columns=["sigma_north"], range_error=4).channels == ("sigma_north",)
     for text, options, message in (
         ("t,lat,lon\n0,480000000,110000000\n1,1,1\n", {"origin": [0, 0]}, "lat and lon must be in degrees; some"),
         ("t,lat,lon\n0,,\n1,,\n", {"origin": [0, 0]}, "has no position: all of lat and lon are missing"),
         ("t,x,y\n0,1,2\n1,1,1\n", {"origin": [0, 0]}, "has no latitude and longitude; its columns are x, y"),
         ("t,lat,lon\n0,1,1\n1,1,1\n", {"origin": [0, 95, 1, 1]}, r"origin must be \[latitude, longitude\] in degrees"),
         ("t,lat,lon\n0,1,1\n1,1,1\n", {"origin": [95, 0]}, r"origin must be \[latitude, longitude\] in degrees, or wi"),
+        ("t,lat,lon\n0,1,1\n1,1,1\n", {"range_error": 3}, "has no channel hdop, of which range_error makes a sigma"),
+        ("t,lat,lon\n0,1,1\n1,1,1\n", {"range_error": 0}, "range_error must be positive"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -94,11 +97,11 @@ def write_gpx(path):
 
 
 def test_gpx(tmp_path):
-    log = sf.read_log(write_gpx(tmp_path / "a.gpx"))
+    log = sf.read_log(write_gpx(tmp_path / "a.gpx"), range_error=5)
     np.testing.assert_array_equal(log.times, TIMES)
     assert (log.start, log.time_unit) == (START, "s")
     np.testing.assert_allclose(log[["east", "north"]], np.stack([X, 2 * X], axis=1), atol=1e-5)
-    np.testing.assert_array_equal(log["hdop"], 1.2)
+    np.testing.assert_allclose(log["sigma_north"], 1.2 * 5 / np.sqrt(2))
     np.testing.assert_allclose(log.origin, ORIGIN, atol=1e-8)
     assert log.events == ((0.5, "waypoint", "gate"),)
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from switchfit.io.logs import import_library
-from switchfit.io.logs.log import Log
+from switchfit.io.logs.log import FloatArray, Log
 from switchfit.problem.validation import as_array, shorten
 from switchfit.runtime.errors import InputError
 
@@ -21,6 +21,8 @@ LOCAL = ("east", "north", "up")
 """Names of the channels of the local frame, in metres."""
 SIGMA = ("sigma_east", "sigma_north", "sigma_up")
 """Names of the channels of their standard deviations, in metres."""
+FRAME = (*LOCAL, *SIGMA[:2])
+"""Channels that can be computed from a position and HDOP."""
 
 _POSITION = (
     re.compile(r"(.*[ ._])?lat(itude)?([ _.]?deg)?", re.IGNORECASE),
@@ -55,8 +57,8 @@ def check_origin(origin: Sequence[float] | None) -> tuple[float, float, float] |
     return (numbers[0], numbers[1], numbers[2] if len(numbers) == 3 else 0.0)
 
 
-def add_local_frame(log: Log, origin: tuple[float, float, float] | None) -> Log:
-    """Return the log with the channels east, north and up.
+def add_local_frame(log: Log, origin: tuple[float, float, float] | None, range_error: float | None) -> Log:
+    """Return the log with the channels east, north and up, and their standard deviations where they are known.
 
     Parameters
     ----------
@@ -64,6 +66,8 @@ def add_local_frame(log: Log, origin: tuple[float, float, float] | None) -> Log:
         With latitude and longitude in degrees, and maybe an altitude in metres.
     origin : (latitude, longitude, altitude) or None
         Left out, the first position.
+    range_error : float or None
+        Standard deviation of the distance to a satellite in metres: times HDOP, it is that of the position.
 
     Raises
     ------
@@ -93,4 +97,23 @@ def add_local_frame(log: Log, origin: tuple[float, float, float] | None) -> Log:
     units = {**log.units, **dict.fromkeys(LOCAL, "m")}
     if len(names) == 2:
         del values["up"], units["up"]
-    return replace(log, values=values, units=units, origin=origin)
+    log = replace(log, values=values, units=units, origin=origin)
+    return log if range_error is None else _add_sigma(log, range_error)
+
+
+def _add_sigma(log: Log, range_error: float) -> Log:
+    """Return the log with sigma_east and sigma_north from HDOP where they are not known otherwise.
+
+    HDOP**2 is the sum of the two variances in units of the squared range error.
+    """
+    hdop = next((log[name] for name in log.channels if name.lower() == "hdop"), None)
+    if hdop is None:
+        raise InputError(
+            f"{log.source} has no channel hdop, of which range_error makes a sigma; leave out range_error."
+        )
+    values, units = dict(log.values), dict(log.units)
+    for name in SIGMA[:2]:
+        known: FloatArray = values.get(name, np.full(len(log), np.nan))
+        values[name] = np.where(np.isfinite(known), known, hdop * range_error / np.sqrt(2))
+        units[name] = "m"
+    return replace(log, values=values, units=units)

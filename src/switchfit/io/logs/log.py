@@ -93,7 +93,7 @@ class Options(NamedTuple):
 
     Attributes
     ----------
-    columns, time, time_unit, topic, origin, repair
+    columns, time, time_unit, topic, origin, range_error, repair
         As of `read_log`.
     keep_epoch : bool
         Leave numbers that count from 1970 as they are.
@@ -104,6 +104,7 @@ class Options(NamedTuple):
     time_unit: str | None = None
     topic: str | None = None
     origin: Sequence[float] | None = None
+    range_error: float | None = None
     repair: str | Sequence[str] = ()
     keep_epoch: bool = False
 

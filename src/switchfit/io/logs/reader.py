@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.io.logs import BAGS
-from switchfit.io.logs.geodesy import LOCAL, add_local_frame, check_origin
+from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
 from switchfit.io.logs.log import SECONDS, FloatArray, Log, Options
-from switchfit.problem.validation import as_choice, as_name, as_names, as_path, join_names, shorten
+from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
 from switchfit.runtime.files import explain_read_errors, is_regular
 
@@ -209,6 +209,7 @@ def read_log(
     time_unit: str | None = None,
     topic: str | None = None,
     origin: Sequence[float] | None = None,
+    range_error: float | None = None,
     repair: str | Sequence[str] = (),
 ) -> Log:
     """Read a log: a table of text in any dialect, Parquet, MATLAB, GPX, NMEA 0183, a ROS bag or MCAP.
@@ -228,6 +229,9 @@ def read_log(
     origin : (latitude, longitude) or (latitude, longitude, altitude), optional
         Of the channels east, north and up, in degrees and metres; left out, the first position. In a table they are
         computed if `origin` is given or `columns` names them.
+    range_error : float, optional
+        Standard deviation of the distance to a satellite in metres, 3 to 6 for a receiver without corrections: HDOP
+        times it becomes sigma_east and sigma_north where the log has none.
     repair : str or sequence of str, optional
         What may be changed: "sort" (by time), "drop-duplicates" (of a time, the first sample is kept),
         "drop-missing-times", "drop-broken-lines", "unwrap:CHANNEL" (an angle, in rad or deg). Nothing is repaired
@@ -263,7 +267,7 @@ def read_log(
     path = as_path(path, "path")
     if len(path.name) > LONGEST_NAME:
         raise InputError(f"path must name a file, with at most {LONGEST_NAME} characters; got {shorten(str(path))}.")
-    return read_source(path, Options(columns, time, time_unit, topic, origin, repair))
+    return read_source(path, Options(columns, time, time_unit, topic, origin, range_error, repair))
 
 
 def read_source(path: Path, given: Options) -> Log:
@@ -276,9 +280,9 @@ def read_source(path: Path, given: Options) -> Log:
     """
     options, origin = _check_options(given), check_origin(given.origin)
     log = _read_format(path, options)
-    wanted = any(name in LOCAL and name not in log for name in options.columns or ())
-    if wanted or origin is not None or log.has_positions:
-        log = add_local_frame(log, origin)
+    wanted = any(name in FRAME and name not in log for name in options.columns or ())
+    if wanted or origin is not None or options.range_error is not None or log.has_positions:
+        log = add_local_frame(log, origin, options.range_error)
     log = log if options.columns is None else log[list(options.columns)]
     log = inspect_log(log, options.repair)
     return log if options.time_unit is None else convert_times(log, options.time_unit)
@@ -286,7 +290,7 @@ def read_source(path: Path, given: Options) -> Log:
 
 def _check_options(given: Options) -> Options:
     """Return arguments with names as tuples; raise InputError if one is wrong."""
-    columns = given.columns
+    columns, error = given.columns, given.range_error
     if columns is not None:
         columns = as_names((columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings")
     for what in ("time", "topic"):
@@ -294,7 +298,8 @@ def _check_options(given: Options) -> Options:
             as_name(getattr(given, what), what)
     if given.time_unit is not None:
         as_choice(given.time_unit, "time_unit", tuple(SECONDS))
-    return given._replace(columns=columns, repair=check_repairs(given.repair))
+    error = None if error is None else as_positive(error, "range_error")
+    return given._replace(columns=columns, range_error=error, repair=check_repairs(given.repair))
 
 
 def convert_times(log: Log, unit: str) -> Log:

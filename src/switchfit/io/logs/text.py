@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs.geodesy import LOCAL, find_position
+from switchfit.io.logs.geodesy import FRAME, find_position
 from switchfit.io.logs.log import Event, FloatArray, Log, Options, is_unit, split_unit, strip_brackets
 from switchfit.io.logs.tables import build_log, find_time_name
 from switchfit.problem.dates import read_date_text
@@ -523,9 +523,10 @@ def _find_column(table: _Table, name: str) -> int:
 def _find_columns(table: _Table, columns: Sequence[str]) -> list[int]:
     """Return the columns of some names; for east, north and up, those of the position on the globe."""
     names = table.header.names
-    own = [name for name in columns if name not in LOCAL or name in names or name in table.header.labels]
+    own = [name for name in columns if name not in FRAME or name in names or name in table.header.labels]
     if len(own) < len(columns):
-        own += [name for name in find_position(names) or [] if name not in own]
+        hdop = [name for name in names if name.lower() == "hdop"]
+        own += [name for name in [*(find_position(names) or []), *hdop] if name not in own]
     return [_find_column(table, name) for name in own]
 
 

@@ -209,7 +209,7 @@ def find_parameters(contents: Contents, table: ExperimentTable) -> frozenset[str
 def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str]) -> Log:
     if table.file is None:
         raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
-    given = table.model_dump(include={"time", "topic", "origin", "repair"})
+    given = table.model_dump(include={"time", "topic", "origin", "range_error", "repair"})
     columns = list(dict.fromkeys(list_columns(table, parameters)))
     log = read_source(folder / table.file, Options(columns=columns, keep_epoch=True, **given))
     return log if table.epoch is None else _count_from_1970(log, table.epoch)

@@ -200,6 +200,8 @@ class LogTable(Table):
     origin: Annotated[list[float], Field(min_length=2, max_length=3)] | None = None
     """[latitude, longitude] or [latitude, longitude, altitude] of the origin of east, north and up; left out, the first
     position"""
+    range_error: Positive | None = None
+    """standard deviation of the distance to a satellite in m; HDOP times it is sigma"""
     epoch: Literal["s", "ms", "us", "ns"] | None = None
     """the numbers in the time column count from 1970 (UTC) in this unit: they are dates"""
     window: Annotated[list[Time], Field(min_length=2, max_length=2)] | None = None
