@@ -120,6 +120,9 @@ def foreign_derivatives(
     return cost, jnp.where(there, gradient, 0.0), jnp.where(there[:, None] & there[None], hessian, 0.0)
 
 
+ORDERS: dict[Matrix, Order] = {"exact": Order.HESSIAN, "gauss-newton": Order.GAUSS_NEWTON, "none": Order.GRADIENT}
+
+
 class NativeEngine:
     """Evaluates one experiment on one mesh in machine code.
 
@@ -173,15 +176,11 @@ class NativeEngine:
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
         """Return J and its derivatives."""
-
-        def evaluate(native: NativeExperiment) -> Evaluation[FloatArray]:
-            found = native(tau, p, side)
-            if matrix != "none":
-                return found
-            return Evaluation(found.cost, found.gradient, np.full_like(found.hessian, np.nan))
-
-        order = Order.GAUSS_NEWTON if matrix == "gauss-newton" else Order.HESSIAN
-        return self._try(order, evaluate, lambda: self._fallback.derivatives(tau, p, side, matrix))
+        return self._try(
+            ORDERS[matrix],
+            lambda native: native(tau, p, side),
+            lambda: self._fallback.derivatives(tau, p, side, matrix),
+        )
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray

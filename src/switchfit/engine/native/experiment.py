@@ -223,7 +223,7 @@ class NativeExperiment:
     def __call__(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None
     ) -> Evaluation[FloatArray]:
-        """Return J, its gradient (D,) and its Hessian (D, D).
+        """Return J, its gradient (D,) and its Hessian (D, D), NaN at order GRADIENT.
 
         With multipliers (m,) the constraints too, and the Hessian of ``J + multipliers . c``.
         """
@@ -231,7 +231,8 @@ class NativeExperiment:
             self._evaluate(tau, p, side, multipliers)
             g, H = self._read_derivatives()
             if multipliers is None:
-                return Evaluation(self._J.item(0), g, H, row_errors=self._read_errors())
+                hessian = H if self.order > Order.GRADIENT else np.full_like(H, np.nan)
+                return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
             where = self._constraint_rows
             # The backward sweep has lam . c in it like a cost: g is that of the Lagrangian, and that of J is g - A'
             # lam.

@@ -136,6 +136,7 @@ class Kernels:
     ) -> None:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
         self.goes_back = goes_back and order > Order.COST  # else the functions forward check that they are finite
+        self.with_tangents = order > Order.GRADIENT  # the gradient takes the costate alone
         self.templates = Templates(library, sizes, order)
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
@@ -222,6 +223,13 @@ class Kernels:
             stores += store_all("X", 0, np.concatenate(at_points))
             if kept:
                 stores += store_all("kept", 0, np.concatenate([values[-1] for values in at_stages]))
+            of_x = [values[2] for values in at_stages]
+            if k:
+                # That the backward step reads them takes 12 to 15 % off (J, g, H) where 8 states depend on each other,
+                # 5 % where 4 do. With fewer, or a sparse Jacobian, to compute them again would take as long.
+                factors = eliminate(tableau.a, h, of_x, place=len(tableau.b) * len(kept))
+                stores += factors.stores
+        if self.with_tangents:
             # X_j', K_j' and x+' of `discretization.rows`, with one entry of each vector per unknown: for p this is (10)
             # of the paper discretized, and for tau the products with h' of the rows on both sides of it leave X^i, (8).
             Z = graph.loads("Z", n, vector=True)
@@ -234,13 +242,8 @@ class Kernels:
                 times_d = times_derivative(tableau, start_d, end_d)
                 # D_2 f t_j' + D_p f p', the part of K_j' that does not depend on X_j'.
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
-            of_x = [J[1] for J in jacobians]
             tangent: Callable[..., explicit_rows.Tangent] = explicit_rows.tangent
             if k:
-                # That the backward step reads them takes 12 to 15 % off (J, g, H) where 8 states depend on each other,
-                # 5 % where 4 do. With fewer, or a sparse Jacobian, to compute them again would take as long.
-                factors = eliminate(tableau.a, h, of_x, place=len(tableau.b) * len(kept))
-                stores += factors.stores
                 tangent = partial(implicit_rows.tangent, factors=factors)
             # Without `moving` h_d is None: the graph then has none of the products with h', which all other rows would
             # pay for.
@@ -485,7 +488,7 @@ class Kernels:
         given = t, x, p, np.full(n, graph.constant(0.0), dtype=object), *constants
         (after,) = template(graph, *given, only=(0,), checked=checked)
         stores = store_all("x_after", 0, after)
-        if self.order > Order.COST:
+        if self.with_tangents:
             # Z is the derivative of x(tau-) at a tau that moves, so that f_{i-1} dtau is in it, and Z+ that of x(tau+):
             #     Z+ = D_x R Z + D_p R p' + D_t R tau'
             # The term -f_i(x+) dtau of X^i, (8), comes from the row behind tau, which starts later.
@@ -550,7 +553,7 @@ class Kernels:
             # 0 times infinity or NaN is NaN: the sum is 0, or NaN if any factor is not finite. LARGE takes large ones
             # there too.
             total = total + graph.certain_product(0.0, x * LARGE)
-        if self.order > Order.COST:
+        if self.with_tangents:
             for k in range(n):
                 for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
                     total = total + graph.certain_product(0.0, Z)
@@ -653,10 +656,11 @@ class Kernels:
         _, c_t, c_x, c_p, *derivatives = found
         # The row of the Jacobian follows forward, by Z; lam . c goes backward with the costate, as a cost, for the
         # Lagrangian.
-        c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
-        if moving:
-            c_d = c_d + c_t * graph.load("moves", 0, vector=True)
-        stores += store_all("jacobian", 0, [as_vector(graph, value) for value in c_d])
+        if self.with_tangents:
+            c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
+            if moving:
+                c_d = c_d + c_t * graph.load("moves", 0, vector=True)
+            stores += store_all("jacobian", 0, [as_vector(graph, value) for value in c_d])
         stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 

@@ -230,7 +230,7 @@ _one_at_a_time = threading.Lock()
 
 log = logging.getLogger("switchfit")
 
-PREFIX = {Order.COST: "plain_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
+PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
 """Prefix of the names of functions, by the order of their derivatives."""
 
 
@@ -321,8 +321,9 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
         module.add(write_loop(writer, name))
     kernels.state()
-    kernels.outputs()
-    module.add(write_loop(writer, "outputs"))
+    if order != Order.GRADIENT:
+        kernels.outputs()
+        module.add(write_loop(writer, "outputs"))
     module.add(write_forward(writer))
     module.add(write_evaluation(writer))
     module.add(write_costs(writer) if order == Order.COST else write_backward(writer, curvatures))

@@ -35,11 +35,12 @@ SECOND = (11,)
 
 
 class Order(IntEnum):
-    """What a program computes: J alone, or with the gradient and the Hessian or the Gauss-Newton matrix."""
+    """What a program computes: J alone, with the gradient, and with the Hessian or the Gauss-Newton matrix too."""
 
     COST = 0
-    HESSIAN = 1
-    GAUSS_NEWTON = 2
+    GRADIENT = 1
+    HESSIAN = 2
+    GAUSS_NEWTON = 3
 
 
 @dataclass(frozen=True)
@@ -283,11 +284,13 @@ class Templates:
     def _differentiate(
         self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any]
     ) -> list[Any]:
-        """Return the derivatives of the order; at order GAUSS_NEWTON, the second ones are given."""
+        """Return the derivatives of the order; at order GAUSS_NEWTON the second ones are given, at GRADIENT zero."""
         if self.order == Order.COST:
             return []
-        # First, since the machine code of both is then a little faster.
-        second = gauss_newton() if self.order == Order.GAUSS_NEWTON else _differentiate_twice(value, t, x, p)
+        if self.order == Order.HESSIAN:
+            second = _differentiate_twice(value, t, x, p)  # first, since the machine code of both is then faster
+        else:
+            second = gauss_newton() if self.order == Order.GAUSS_NEWTON else self._no_second()
         return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), second]
 
     def _no_second(self) -> Any:
