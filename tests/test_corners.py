@@ -797,7 +797,7 @@ def test_a_branch_that_only_jax_evaluates_takes_an_input_too():
     problem = problem_of(pushed, [1.5, 1.0], {"mu": 0.3}, 1.0, inputs=sf.Input([0.0, 1.0], [[0.5], [2.0]]))
     branch = find_corners(problem.structures[0].modes[0]).branch((1,))
     function, states = trace_for_numpy(branch), np.array([[1.5, 1.0], [2.0, 0.7]])
-    found = function(np.array([0.1, 0.2]), states, [np.array([[0.5], [2.0]]), np.array(0.3)], 1)
+    found = function(np.array([0.1, 0.2]), [states, np.array([[0.5], [2.0]])], [np.array(0.3)])
     np.testing.assert_allclose(found, [[1.0, 0.5 - 0.3 * 2.25], [0.7, 2.0 - 0.3 * 4.0]])
 
 

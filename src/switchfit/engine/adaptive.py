@@ -175,7 +175,7 @@ class _NativeSteps:
 
     def slope(self, t: float, y: FloatArray) -> FloatArray:
         """Return the slope at a time."""
-        return self._native.slope(self._mode, t, y, self._p)
+        return self.slopes(np.array([t]), y[None])[0]
 
     def slopes(self, times: FloatArray, y: FloatArray) -> FloatArray:
         """Return the slopes at times (L,) and y (L, n + 1); NaN where the model is not defined."""

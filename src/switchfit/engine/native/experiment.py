@@ -381,8 +381,13 @@ class NativeExperiment:
     def slopes_in(
         self, mode: int, times: FloatArray, y: FloatArray, p: FloatArray, cells: NDArray[np.intp] | None = None
     ) -> FloatArray:
-        """Return what `slope` does at times (L,) and y (L, n + 1): (L, n + 1), NaN where a finiteness check failed."""
-        cells = self._find_cells(times) if cells is None else cells
+        """Return f and ell at times (L,) and y = (x, running cost so far), (L, n + 1): (L, n + 1).
+
+        They are NaN where a finiteness check failed. The signals are those of `cells`; by default, of those that hold
+        the times (at a node, of the later one).
+        """
+        if cells is None:
+            cells = np.clip(self.times.searchsorted(times, "right") - 1, 0, self._cells - 1)
         slopes = np.zeros(y.shape)
         given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
         checks = self._call(f"slope_{mode}", given | {"y": y, "K": slopes}, p, len(times))
@@ -413,17 +418,6 @@ class NativeExperiment:
         given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": after, "moves": moves}
         return after + self._call(f"reset_{int(self._named['resets'][i])}", given, p)
 
-    def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
-        """Return f and ell at t, y = (x, running cost so far): (n + 1,).
-
-        The signals are those of `cell`; by default, of the cell that holds t (at a node, of the later one).
-        """
-        if cell is None:
-            cell = min(max(int(self.times.searchsorted(t, "right")) - 1, 0), self._cells - 1)
-        slope, moment = np.zeros(len(y)), np.array([t, self.times[cell]])
-        given = {"moment": moment, "signal": self._signals[cell], "y": y, "K": slope}
-        return slope + self._call(f"slope_{mode}", given, p)
-
     def adaptive_steps(
         self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int
     ) -> tuple[FloatArray, FloatArray]:
@@ -451,10 +445,6 @@ class NativeExperiment:
     def _find(self, name: str, count: int) -> Any:
         """Return a function of the driver with a number of arguments: integers and addresses."""
         return self._program.function(f"{self._prefix}{name}", *[ctypes.c_int64] * count)
-
-    def _find_cells(self, times: FloatArray) -> NDArray[np.intp]:
-        """Return the cells that hold times (L,)."""
-        return np.clip(self.times.searchsorted(times, "right") - 1, 0, self._cells - 1)
 
     def _call(self, name: str, given: Mapping[str, FloatArray], p: FloatArray, count: int = 1) -> FloatArray:
         """Call a straight-line function at `count` points, with an array for each pointer that is not an argument.

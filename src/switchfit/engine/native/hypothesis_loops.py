@@ -230,7 +230,7 @@ class HypothesisWriter(Writer):
         self.put(self.get("double", found["nodes"], cell), row, 2)
         found |= {"row": row, "signal": self.at(found["signals"], cell, 4 * self.sizes.signals)}
         # Ends of steps do not move with theta.
-        found |= {"opens": found["units"], "closes": found["units"]}
+        found |= {"opens": found["units"], "closes": found["units"], "x_after": found["x"], "Z_after": found["Z"]}
         with self.loop(0, parts) as part:
             # Ends of steps are begin + length k / parts, and the last one is `end` itself: sums of steps would miss the
             # node.

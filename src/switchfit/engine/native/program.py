@@ -30,6 +30,7 @@ from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variab
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import (
     constraint_pointers,
+    count_rows,
     estimate_row,
     solve_stages,
     state_pointers,
@@ -61,7 +62,7 @@ def write_handler(writer: Writer) -> str:
     Arguments are those of `writer.GIVEN`, then those of the samples; results are all accumulators in one array, and
     the scratch space.
     """
-    N, measurements = writer.sizes.N, len(writer.library.measurements)
+    measurements = len(writer.library.measurements)
     names = [*GIVEN, *(f"{name} {k}" for k in range(measurements) for name in OF_SAMPLES)]
     (frame,) = writer.begin("ptr @xla_handler(ptr %frame)")
     table = writer.allocate("ptr", len(writer.names) + len(OF_SAMPLES) * measurements)
@@ -83,7 +84,7 @@ def write_handler(writer: Writer) -> str:
     for name, length in writer.layout.sums.items():
         found[name] = writer.at(totals, position)
         position += length
-    rows = writer.get("i64", found["first_cell"], N + 1) + (N + 1)
+    rows = count_rows(writer, found)
     place: Operand = 0
     for name, extent in writer.layout.memory.items():
         found[name] = writer.at(between, place)
@@ -103,7 +104,7 @@ def write_evaluation(writer: Writer) -> str:
     of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
     table, *counts = writer.begin(f"void @evaluate(ptr %table{of_samples})")
     found, layout = writer.pointers(), writer.layout
-    rows = writer.get("i64", found["first_cell"], N + 1) + (N + 1)
+    rows = count_rows(writer, found)
     # The sums are one block of memory, so that one call clears all of them.
     writer.zero(found[next(iter(layout.sums))], sum(layout.sums.values()))
     for name in ZEROED:
@@ -124,8 +125,7 @@ def write_evaluation(writer: Writer) -> str:
 
 def _call_end(writer: Writer, found: Pointers) -> None:
     """Call the terminal cost and constraints."""
-    N, library = writer.sizes.N, writer.library
-    last = state_pointers(writer, found, writer.get("i64", found["first_cell"], N + 1) + (N + 1))
+    library, last = writer.library, state_pointers(writer, found, count_rows(writer, found))
     # No row follows the end: what the terminal terms add to the costate goes to psi itself.
     given = (
         found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
