@@ -275,15 +275,3 @@ def list_transition_functions(model: Model, kind: str) -> list[tuple[int, NodeFu
     """Return the functions of a kind, each with its transition (from 0)."""
     found = [(i, get_transition_function(model, kind, i)) for i in range(model.structure.N)]
     return [(i, function) for i, function in found if function is not None]
-
-
-def get_end_cost(model: Model) -> NodeFunction | None:
-    """Return the sum of the terminal costs; None without any."""
-    return (lambda t, x, p: model.terminal(x, p)) if model.structure.terminal else None
-
-
-def get_end_constraints(model: Model) -> NodeFunction | None:
-    """Return all terminal constraints as one function, which returns (m,); None without any."""
-    if not model.structure.terminal_constraints:
-        return None
-    return lambda t, x, p: model.terminal_constraint(x, p)

@@ -124,17 +124,17 @@ def find_path(
     # was followed with the final library, and its steps are those that machine code will take.
     while True:
         known = branches.get_structure(run.structure) if branches.count else run.structure
-        solve, count = _Solve(run, known, coarse, settings, branches), branches.count
+        course, count = Course(branches, known, run.build_arguments(coarse), p), branches.count
         steps = None
         try:
-            steps = solve(tau, p)
+            steps = _Solve(run, known, coarse, settings, course)(tau, p)
         except SteepError:
             continue  # nothing is compiled yet with its margin
         except BranchError:
             pass
-        branches.add(run.structure, solve.path)
+        branches.add(run.structure, course.path)
         if steps is not None and branches.count == count:
-            return steps, solve.path
+            return steps, course.path
 
 
 class _NativeError(Exception):
@@ -248,7 +248,7 @@ class _Solve:
     Parameters
     ----------
     structure : Structure
-        Of the library whose machine code is used; if modes have corners, it is that of `branches`.
+        Of the library whose machine code is used; if modes have corners, it is that of the branches of the `course`.
     """
 
     def __init__(
@@ -257,36 +257,27 @@ class _Solve:
         structure: Structure,
         coarse: Mesh,
         settings: Settings,
-        branches: Branches | None = None,
+        course: Course | None = None,
     ) -> None:
-        self._problem, self._structure, self._coarse, self._branches = run.problem, run.structure, coarse, branches
+        self._problem, self._structure, self._coarse, self._course = run.problem, run.structure, coarse, course
         self._experiment, self._settings = run.experiment, settings
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
-        is_common = coarse is run.coarse
-        whole = run.coarse_arguments if is_common else run.build_arguments(coarse)
-        self._whole, self._arguments = whole, whole.without_mesh()
+        self._whole = whole = run.build_arguments(coarse)
+        self._arguments = whole.without_mesh()
         self._native: NativeExperiment | None = None
         # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
         chosen = take_implicit_steps(structure, settings.implicit)
-        if branches is None or branches.count:
-            known = run.solvers.__dict__ if is_common else {}
-            key = f"{'' if branches is None else branches.version} {chosen.implicit}"
+        if course is None or course.branches.count:
+            known = run.solvers.__dict__ if coarse is run.coarse else {}
+            key = f"{'' if course is None else course.branches.version} {chosen.implicit}"
             if key not in known:
                 made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
                 if made is None and chosen is not structure:
                     made = native_experiment(structure, whole, coarse.times, order=Order.COST)
                 known[key] = made
             self._native = known[key]
-        self._course: Course | None = None
         self._p = np.zeros(0)
-
-    @property
-    def path(self) -> Path:
-        """The branches of the trajectory, as far as it was solved."""
-        if self._course is None:
-            raise ValueError("modes without corners have one branch each")
-        return self._course.path
 
     def __call__(self, tau: FloatArray, p: FloatArray) -> FloatArray:
         """Return the accepted times from t0 to tf, strictly increasing."""
@@ -294,8 +285,6 @@ class _Solve:
         ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
         inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
         steps, x = [ends[:1]], self._find_initial_state()
-        if self._branches is not None:
-            self._course = Course(self._branches, structure, self._whole, p)
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 x = self._apply_reset(i - 1, ends[i], x)

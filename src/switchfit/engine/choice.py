@@ -34,7 +34,7 @@ from switchfit.engine.native.experiment import reason_for_jax
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.native.hypothesis_loops import hypotheses_program
 from switchfit.engine.native.templates import Sizes
-from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Run, Simulation, Tangents
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Run, Simulation, Tangents
 from switchfit.problem.corners import Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -192,7 +192,7 @@ class SplitEngine:
         return self._plain.slopes(times, cells, states, p)
 
     @cached_property
-    def _plain(self) -> ExperimentEngine:
+    def _plain(self) -> NativeEngine | JaxEngine:
         return self._build(self._structure)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
@@ -382,6 +382,10 @@ class _PathFallback(JaxEngine):
         return _refuse(len(tau) + len(p), len(multipliers))
 
 
+ExperimentEngine = NativeEngine | JaxEngine | SplitEngine
+"""One experiment on one mesh, as functions of its transition times tau (N,) and its parameters p (M,)."""
+
+
 def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
     """Return the engine of an experiment on a mesh, chosen by `Problem.engine`.
 
@@ -391,7 +395,6 @@ def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
     base = run.get_structure(mesh)
-
     build = partial(_engine_on, run, base, arguments, mesh)
     return build(base) if run.branches is None else SplitEngine(run, run.branches, base, arguments, mesh, build)
 

@@ -3,7 +3,7 @@
 The jaxpr contains the derivatives already. Operations that only move entries (reshape, slice, pad and so on) emit
 nothing. Operations without a scalar form (loops of unknown length, random numbers, solvers) raise `Unsupported`.
 
-An array whose entries are all known is a NumPy array of numbers, any other an object array of what `entries` describes.
+An array whose entries are all known is a NumPy array of numbers, any other an object array of what `arrays` describes.
 """
 
 from __future__ import annotations
@@ -18,26 +18,24 @@ import numpy as np
 from jax.interpreters import partial_eval
 
 from switchfit.engine.native.arrays import (
+    OF_INTEGERS,
+    Integer,
+    Meaning,
+    Unsupported,
     cholesky,
+    choose,
     compare_in_order,
     dynamic_slice,
     dynamic_update_slice,
+    from_double,
     gather,
+    known_number,
+    less,
     lu,
     scatter,
     search,
     sort,
     triangular_solve,
-)
-from switchfit.engine.native.entries import (
-    OF_INTEGERS,
-    Integer,
-    Meaning,
-    Unsupported,
-    choose,
-    from_double,
-    known_number,
-    less,
     within,
 )
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
