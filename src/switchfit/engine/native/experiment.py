@@ -104,10 +104,6 @@ def _find_own_directions(
     return found
 
 
-LONG = 200_000_000
-"""Work of an evaluation, in additions, from which Ctrl-C is handled in the meantime: 20 to 100 ms."""
-
-
 class FailedCheckError(Exception):
     """A product with a structural zero was left out whose other factor is not finite: the caller falls back to JAX."""
 
@@ -189,7 +185,6 @@ class NativeExperiment:
         ]
         self._size_of_states: FloatArray | None = None
         self._judged = -1
-        self._work = (cells + N) * max(1, *program.row_work)
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
         self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
@@ -209,7 +204,9 @@ class NativeExperiment:
         self._named["bounds"][1:] = self.times[-1]
         self._named["first_cell"][1:] = self._cells - 1
         self._set_sequence(structure)
-        self._write_places()
+        for name, which in places_in_library(structure).items():
+            self._named[name][:] = which
+        self._named["modes"][-1] = self._judged
 
     def _set_sequence(self, structure: Structure) -> None:
         N, rows = structure.N, self._rows
@@ -275,48 +272,6 @@ class NativeExperiment:
         with self._workspace.lock:
             self._evaluate(tau, p, 1.0)
             return self._J.item(0)
-
-    def costs(self, places: NDArray[np.int64], times: FloatArray, p: FloatArray) -> FloatArray | None:
-        """Return J of B schedules: (B,); NaN where a finiteness check failed, None if samples come late.
-
-        Parameters
-        ----------
-        places : (B, P) int64 array
-            For each the arrays of `places_in_library`, one after the other, without their last entries.
-        times : (B, N) array
-            Transition times, tf for those that a schedule does not need.
-        p : (M,) array
-        """
-        if self._late:
-            return None
-        B = len(times)
-        bounds = np.empty((B, self.sizes.N + 2))
-        bounds[:, 0], bounds[:, 1:-1], bounds[:, -1] = self.times[0], times, self.times[-1]
-        first_cell = np.zeros(bounds.shape, dtype=np.int64)
-        # Segments begin in the cell behind a node that tau is on: the right derivative, as in `_find_first_cells` for
-        # side +1.
-        first_cell[:, 1:-1] = self._inner_nodes.searchsorted(times, "right")
-        first_cell[:, -1] = self._cells - 1
-        places, found = np.ascontiguousarray(places), np.empty((B, 2))
-        function = self._find("all_costs", 6 + len(self._counts))
-        # The loop in machine code writes each schedule over the arrays of this one, which are restored at the end.
-        kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
-        with self._workspace.lock:
-            self._prepare(p)
-            at_once = max(1, LONG // self._work)
-            for before in range(0, B, at_once):  # Ctrl-C is handled after each call
-                given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
-                function(self._address, min(at_once, B - before), *given, *self._counts)
-            self._named["bounds"][:], self._named["first_cell"][:] = kept
-            self._write_places()
-        # An infinite J with a failed check stays infinite: both refuse the schedule.
-        return np.where(np.isfinite(found[:, 0]) & np.isnan(found[:, 1]), np.nan, found[:, 0])
-
-    def _write_places(self) -> None:
-        """Write the modes of the sequence, and the functions at its transitions, into the workspace."""
-        for name, which in places_in_library(self.structure).items():
-            self._named[name][:] = which
-        self._named["modes"][-1] = self._judged
 
     def simulate(
         self, tau: FloatArray, p: FloatArray, multipliers: FloatArray | None = None
@@ -470,10 +425,7 @@ class NativeExperiment:
         if multipliers is not None:
             self._multipliers[self._constraint_rows] = multipliers
         try:
-            if self._work > LONG:
-                self._workspace.call(lambda: self._function(self._address, *self._counts))
-            else:
-                self._function(self._address, *self._counts)
+            self._function(self._address, *self._counts)
         finally:
             if multipliers is not None:
                 self._multipliers[:] = 0.0
@@ -484,7 +436,6 @@ class NativeExperiment:
 
     def _prepare(self, p: FloatArray) -> None:
         """Store p, and the addresses of the workspace in the table."""
-        self._workspace.finish()
         self._own_p[:] = p
         # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
         # call.

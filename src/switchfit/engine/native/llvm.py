@@ -594,18 +594,6 @@ class Workspace:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.memory = np.zeros(0)
-        self._running: Future[None] | None = None
-
-    def call(self, function: Callable[[], None]) -> None:
-        """Call a function that works here for long, in a thread: Python handles Ctrl-C only while it is not in it."""
-        self._running = ThreadPoolExecutor(1).submit(function)
-        self.finish()
-
-    def finish(self) -> None:
-        """Wait for a call that Ctrl-C has left, and that still works here."""
-        if self._running is not None:
-            wait_for(self._running)
-            self._running = None
 
     def reserve(self, size: int) -> None:
         """Allocate at least `size` doubles; the contents may be lost."""

@@ -27,7 +27,6 @@ from switchfit.discretization.rows import STIFF
 from switchfit.engine.native.adaptive import TIMES, Adaptive, write_slope, write_step
 from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variable, compile_modules
-from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import (
     constraint_pointers,
     count_rows,
@@ -42,7 +41,7 @@ from switchfit.engine.native.segments import (
 )
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, layout_of, list_place_lengths
+from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, layout_of
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
@@ -132,31 +131,6 @@ def _call_end(writer: Writer, found: Pointers) -> None:
     )
     for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
         writer.call(name, given)
-
-
-def write_costs(writer: Writer) -> str:
-    """Write the loop over schedules that evaluates J of each.
-
-    `places` has for each the arrays of `list_place_lengths`, one after the other, and `bounds` and `first_cell` are as
-    in `writer.GIVEN`; J and the finiteness check of each come to `found`.
-    """
-    N, lengths = writer.sizes.N, list_place_lengths(writer.sizes.N)
-    given = "i64 %count, ptr %places, ptr %bounds, ptr %first_cell, ptr %found"
-    of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
-    signature = f"void @all_costs(ptr %table, {given}{of_samples})"
-    table, count, places, bounds, first_cell, results, *counts = writer.begin(signature)
-    pointers = writer.pointers()
-    with writer.loop(0, count) as which:
-        place = writer.at(places, which, sum(lengths.values()))
-        for name, length in lengths.items():
-            writer.copy(pointers[name], place, length)
-            place = writer.at(place, length)
-        for name, source in (("bounds", bounds), ("first_cell", first_cell)):
-            writer.copy(pointers[name], writer.at(source, which, N + 2), N + 2)
-        writer.invoke("evaluate", table, *counts)
-        for entry, name in enumerate(("J", CHECKED)):
-            writer.put(writer.load("double", pointers[name]), writer.at(results, which, 2), entry)
-    return writer.end()
 
 
 def write_loop(writer: Writer, name: str) -> str:
@@ -325,7 +299,8 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     module.add(write_loop(writer, "outputs"))
     module.add(write_forward(writer))
     module.add(write_evaluation(writer))
-    module.add(write_costs(writer) if order == Order.COST else write_backward(writer, curvatures))
+    if order > Order.COST:
+        module.add(write_backward(writer, curvatures))
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
     yield module.take()

@@ -39,11 +39,6 @@ values (K, q), weights (K, q); the segment that holds a late sample, (K,); resul
 the state, and this state, (K, 1 + n)."""
 
 
-def list_place_lengths(N: int) -> dict[str, int]:
-    """Return the lengths of the arrays that say what is active where: modes, then functions at N transitions."""
-    return {"modes": N + 1, "resets": N} | dict.fromkeys(AT_TRANSITIONS, N)
-
-
 class Length(NamedTuple):
     """A size, in doubles, that grows with the number of rows."""
 
