@@ -18,12 +18,7 @@ from jax import lax
 
 from switchfit.discretization import implicit_rows, rows
 from switchfit.discretization.mesh import Rows, Samples, build_rows, find_row_ending_cell
-from switchfit.discretization.model import (
-    Field,
-    Model,
-    Piece,
-    list_transition_functions,
-)
+from switchfit.discretization.model import Field, Model, Piece, list_transition_functions
 from switchfit.discretization.rows import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau, combine
 
 Array = jax.Array

@@ -252,12 +252,7 @@ class _Solve:
     """
 
     def __init__(
-        self,
-        run: Run,
-        structure: Structure,
-        coarse: Mesh,
-        settings: Settings,
-        course: Course | None = None,
+        self, run: Run, structure: Structure, coarse: Mesh, settings: Settings, course: Course | None = None
     ) -> None:
         self._problem, self._structure, self._coarse, self._course = run.problem, run.structure, coarse, course
         self._experiment, self._settings = run.experiment, settings

@@ -81,12 +81,7 @@ class NativeHypotheses:
     """
 
     def __init__(
-        self,
-        program: Program,
-        sizes: Sizes,
-        arguments: Arguments,
-        times: FloatArray,
-        jumps: Sequence[tuple[int, int]],
+        self, program: Program, sizes: Sizes, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
     ) -> None:
         self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
@@ -144,13 +139,7 @@ class NativeHypotheses:
         self._table[:] = [get_address(a) for a in self._arrays.values()]
         return Reserved(given["nodes"], given["signals"], of_sensors)
 
-    def begin(
-        self,
-        p: FloatArray,
-        start: Hypotheses,
-        tolerances: Tolerances,
-        limits: Limits | None,
-    ) -> Hypotheses:
+    def begin(self, p: FloatArray, start: Hypotheses, tolerances: Tolerances, limits: Limits | None) -> Hypotheses:
         """Return one hypothesis at t0, with the samples there.
 
         Parameters

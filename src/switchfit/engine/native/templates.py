@@ -13,12 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.mesh import Arguments, Samples
-from switchfit.discretization.model import (
-    Model,
-    Piece,
-    apply_weights,
-    get_transition_function,
-)
+from switchfit.discretization.model import Model, Piece, apply_weights, get_transition_function
 from switchfit.engine.native.scalars import Template
 from switchfit.engine.native.trace import trace_scalars
 from switchfit.problem.structure import Structure

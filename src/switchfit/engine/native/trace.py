@@ -248,11 +248,7 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     return _run(graph, jaxprs.solve, [*args[before : before + lengths.solve], *args[right:]])
 
 
-LOOPS: dict[str, Callable[..., list[Any]]] = {
-    "scan": _scan,
-    "cond": _cond,
-    "custom_linear_solve": _linear_solve,
-}
+LOOPS: dict[str, Callable[..., list[Any]]] = {"scan": _scan, "cond": _cond, "custom_linear_solve": _linear_solve}
 
 CALLS = "jit", "closed_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"
 """Operations that run another jaxpr. Custom derivatives have been applied before."""
