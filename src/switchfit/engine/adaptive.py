@@ -71,9 +71,6 @@ STEPS_AT_ONCE = 256
 STEPS_OF_BRANCH = 16
 """The same in a mode with corners: steps behind the end of a branch are lost."""
 
-ROWS_BY_JAX = {True: 20_000, False: 200_000}
-"""Work of an explicit and of an implicit row in JAX, in additions of machine code: 5 and 50 us, for 2 to 4 states."""
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -289,7 +286,7 @@ class _Solve:
             name = structure.mode_names[mode]
             is_explicit = not structure.implicit[mode] and name not in self._settings.implicit
             if watch is not None:
-                watch.enter(name, self._find_row_work(name, is_explicit))
+                watch.enter(name, is_explicit=is_explicit)
             if self._course is not None:
                 self._course.enter(mode, ends[i], x, 0.5 * (stops[0] + stops[1]))
             for start, end in pairwise(stops.tolist()):
@@ -328,15 +325,6 @@ class _Solve:
             what = "the map of a Jump" if i in structure.jumps else f"reset map {names}"
             raise _report_infinite(f"{what} at t = {t:.6g}{self._unit}, x = {x.tolist()}", after)
         return after
-
-    def _find_row_work(self, name: str, is_explicit: bool) -> float:
-        """Return the work of a row of a mode on the engine that will evaluate it."""
-        native = self._native
-        if native is not None and self._problem.engine != "jax" and name in native.structure.mode_names:
-            place = native.structure.mode_names.index(name)
-            if native.structure.implicit[place] is not is_explicit:
-                return native.row_work[place]
-        return ROWS_BY_JAX[is_explicit]
 
     def _follow(self, stretch: _Stretch) -> tuple[list[FloatArray], FloatArray]:
         """Return the accepted times after the start of a stretch, from branch to branch, and the state at its end."""

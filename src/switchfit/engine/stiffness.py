@@ -9,9 +9,7 @@ mesh is unstable.
 A `Watch` counts the steps of each mode in a solve. For a mode with many explicit steps, the eigenvalues are computed at
 every `STEPS_BETWEEN` of them. If stability limits more than a quarter of the steps, the mode is solved by the implicit
 method too, which it keeps if its rows take less time; a `Choice` holds what was found. The other modes take explicit
-steps all the same. The time of a row is its *work*, in additions: the operations of its machine code are counted, so
-that the choice is the same in each process. The implicit rows of small models have three to five times the work of
-explicit ones, and take 0.65 to 0.9 times as long as their work says.
+steps all the same.
 
 A fit may reach a theta where a mode is stiff and the explicit steps of its mesh are unstable: it then cannot go on.
 After such a failure, the eigenvalues at that theta are compared with the mesh.
@@ -55,6 +53,9 @@ damping ratio is above 0.3, to 2.1 for one of 0.02. Accuracy limits it to less: 
 oscillation."""
 
 
+IMPLICIT_ROW = 4.0
+"""Time of an implicit row, in explicit ones: 2 to 5 for small models in machine code."""
+
 UNSTABLE = 1.5
 """Factor by which explicit steps at the limit of stability count more: they are unstable on a mesh that is a bit
 coarser, or as soon as theta moves (Van der Pol's oscillator with mu = 100: J is NaN at the guess, and finite on a mesh
@@ -78,10 +79,10 @@ class _Look(NamedTuple):
 @dataclass
 class _ModeSteps:
     """Accepted steps in one mode, so far and at the last look, the projected total of a solve that was given up, the
-    rows of a mesh with these steps, and the work of a row.
+    rows of a mesh with these steps, and the time of a row, in explicit ones.
     """
 
-    row_work: float = 1.0
+    of_row: float = 1.0
     rows: int = 0
     count: int = 0
     looked: int = 0
@@ -110,9 +111,9 @@ class _ModeSteps:
         return round(max(self.projected, self.count))
 
     @property
-    def work(self) -> float:
-        """Work of the rows of a mesh with these steps: there is at least one between two samples."""
-        return self.row_work * max(self.rows, self.total)
+    def time(self) -> float:
+        """Time of the rows of a mesh with these steps: there is at least one between two samples."""
+        return self.of_row * max(self.rows, self.total)
 
 
 class Watch:
@@ -121,7 +122,7 @@ class Watch:
     Parameters
     ----------
     most : mapping of str to float, optional
-        Work in a mode after which `add` raises `TooManyStepsError`.
+        Time in a mode, in explicit rows, after which `add` raises `TooManyStepsError`.
     between : int
         Steps in a mode between two looks.
     refused : container of str, optional
@@ -164,10 +165,10 @@ class Watch:
                     found[name] = ratio
         return found
 
-    def enter(self, name: str, row_work: float = 1.0) -> None:
-        """Begin the solve of a mode whose rows have this work, in additions, in an evaluation of (J, g, H)."""
+    def enter(self, name: str, *, is_explicit: bool = True) -> None:
+        """Begin the solve of a mode."""
         self.current = name
-        self.modes.setdefault(name, _ModeSteps()).row_work = row_work
+        self.modes.setdefault(name, _ModeSteps()).of_row = 1.0 if is_explicit else IMPLICIT_ROW
 
     def add(self, accepted: int) -> bool:
         """Count steps in the current mode, and return whether it is time to `look`.
@@ -175,11 +176,11 @@ class Watch:
         Raises
         ------
         TooManyStepsError
-            If their work is more than the `most` of this mode.
+            If they take longer than the `most` of this mode.
         """
         mode = self.modes[self.current]
         mode.count += accepted
-        if mode.row_work * mode.count > self.most.get(self.current, np.inf):
+        if mode.of_row * mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
         return mode.count - mode.looked >= self.between
 
@@ -221,7 +222,7 @@ class Watch:
 
 
 class TooManyStepsError(Exception):
-    """More work in a mode than a `Watch` allows."""
+    """More steps in a mode than a `Watch` allows."""
 
 
 class Choice:
@@ -240,7 +241,7 @@ class Choice:
 
     def __init__(self, stiffness: Iterable[Stiffness] = ()) -> None:
         self.found = {each.mode: each for each in stiffness}
-        self._most: dict[str, tuple[int, float]] = {}  # where a mode was found, and the work it may have there
+        self._most: dict[str, tuple[int, float]] = {}  # where a mode was found, and how long it may take there
         self._refused: set[str] = set()
 
     @property
@@ -249,7 +250,7 @@ class Choice:
         return tuple(self.found.values())
 
     def watch(self, k: int) -> Watch:
-        """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its work is limited."""
+        """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its time is limited."""
         return Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
 
     def add(self, stiff: Mapping[str, float], explicit: Watch, k: int) -> bool:
@@ -268,7 +269,7 @@ class Choice:
         new = {name: ratio for name, ratio in stiff.items() if name not in self.found and name not in self._refused}
         for name, ratio in new.items():
             steps = explicit.modes[name]
-            self.found[name], self._most[name] = Stiffness(name, steps.total, 0, ratio), (k, UNSTABLE * steps.work)
+            self.found[name], self._most[name] = Stiffness(name, steps.total, 0, ratio), (k, UNSTABLE * steps.time)
         return bool(new)
 
     def refuse(self, name: str) -> bool:
@@ -281,12 +282,11 @@ class Choice:
         """Record the implicit steps that a solve at the k-th theta took in the modes that were found there; refuse
         those whose rows take longer than explicit ones, and return whether there is one.
         """
-        # Only where a mode was found stiff are both kinds of steps known, at one theta: there they are compared by
-        # work.
+        # Only where a mode was found stiff are both kinds of steps known, at one theta: there they are compared.
         found = {name: most for name, (at, most) in self._most.items() if at == k and name in watch.modes}
         for name in found:
             self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)
-        slower = [name for name, most in found.items() if watch.modes[name].work > most]
+        slower = [name for name, most in found.items() if watch.modes[name].time > most]
         for name in slower:
             self.refuse(name)
         return bool(slower)

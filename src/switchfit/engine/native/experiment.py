@@ -96,11 +96,9 @@ def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, An
 def _find_own_directions(
     sizes: Sizes, N: int, jumps: tuple[int, ...]
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return what `find_directions` does for N transitions with these jumps: read-only, shared by all meshes."""
-    are_jumps = np.isin(np.arange(N), jumps).astype(np.int64)
-    found: tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]] = find_directions(sizes, are_jumps, np)
-    for array in found:
-        array.setflags(write=False)
+    """Return what `find_directions` does for N transitions with these jumps, shared by all meshes."""
+    found: tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]
+    found = find_directions(sizes, np.isin(np.arange(N), jumps).astype(np.int64), np)
     return found
 
 
@@ -134,8 +132,8 @@ class NativeExperiment:
         times: FloatArray,
         order: Order,
     ) -> None:
-        self.sizes, self.order, self.times, self.row_work = sizes, order, times, program.row_work
-        self._program, self._workspace, self._prefix = program, program.workspace, PREFIX[order]
+        self.sizes, self.order, self.times = sizes, order, times
+        self._program, self._prefix = program, PREFIX[order]
         N, cells = sizes.N, len(times) - 1
         self._inner_nodes, self._cells = times[1:-1], cells
         self._channels = sum(channels for _, channels in structure.outputs)
@@ -174,7 +172,7 @@ class NativeExperiment:
         self._divide(np.zeros(sum(layout.sums.values())), layout.sums)
         of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
         self._pointers = [*layout.pointers, *of_samples]
-        self._memory = np.zeros(0)  # the workspace that the table points to, after the first call
+        self._memory = np.zeros(0)  # the scratch space that the table points to, after the first call
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
         of_late = "time", "cell", "segment"
@@ -224,7 +222,7 @@ class NativeExperiment:
 
         With multipliers (m,) the constraints too, and the Hessian of ``J + multipliers . c``.
         """
-        with self._workspace.lock:
+        with self._program.lock:
             self._evaluate(tau, p, side, multipliers)
             g, H = self._read_derivatives()
             if multipliers is None:
@@ -269,7 +267,7 @@ class NativeExperiment:
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
-        with self._workspace.lock:
+        with self._program.lock:
             self._evaluate(tau, p, 1.0)
             return self._J.item(0)
 
@@ -287,7 +285,7 @@ class NativeExperiment:
         late : for each late Measurements, by its index, the times at which its samples saw the state, and the states
             then, (K, 1 + n)
         """
-        with self._workspace.lock:
+        with self._program.lock:
             self._evaluate(tau, p, 1.0, multipliers)
             n, N, cells, width = self.sizes.n, self.structure.N, self._cells, self.sizes.width
             first_cell = self._named["first_cell"][: N + 1].astype(np.intp)
@@ -435,14 +433,14 @@ class NativeExperiment:
             raise FailedCheckError
 
     def _prepare(self, p: FloatArray) -> None:
-        """Store p, and the addresses of the workspace in the table."""
+        """Store p, and the addresses of the scratch space in the table."""
         self._own_p[:] = p
         # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
         # call.
-        self._workspace.reserve(self._size)
-        if self._memory is self._workspace.memory:
+        self._program.reserve(self._size)
+        if self._memory is self._program.memory:
             return
-        self._memory = self._workspace.memory
+        self._memory = self._program.memory
         self._divide(self._memory, self._lengths)
         self._table[:] = [self._addresses[name] for name in self._pointers]
 

@@ -27,9 +27,6 @@ from switchfit.problem.data import FloatArray
 
 SLOT = int(Column.SLOT)
 
-CELLS_AT_ONCE = 1000
-"""Cells, of all hypotheses together, that one call propagates."""
-
 
 class Reserved(NamedTuple):
     """Arrays of a log that grows: nodes (G + 1,), signals (G, 4, S), and for each Measurements the place of the first
@@ -109,7 +106,7 @@ class NativeHypotheses:
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
         self._propagate = program.function(
-            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 8
+            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 7
         )
         self._follow_order = program.function(
             f"{PREFIX[Order.GAUSS_NEWTON]}follow_order", *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 5
@@ -255,15 +252,12 @@ class NativeHypotheses:
         places: tuple[int, int, bool],
         recentres: bool = True,
     ) -> Hypotheses:
-        """Propagate copies of records, a few at a time; Python handles Ctrl-C in between."""
+        """Propagate copies of records."""
         records = np.empty((len(counts), self.record_size))
         arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
         addresses = map(get_address, (records, parents, *arrays))
-        given = [self._table_at, *addresses, times.shape[1], first, last, restarts]
-        at_once = max(1, CELLS_AT_ONCE // max(1, last - first))
-        for begin in range(0, len(records), at_once):
-            end = min(begin + at_once, len(records))
-            self._propagate(*given, begin, end, last == self._cells, recentres and self._recentres)
+        ends = last == self._cells, recentres and self._recentres
+        self._propagate(self._table_at, *addresses, times.shape[1], first, last, restarts, len(records), *ends)
         return self.view(records)
 
     def view(self, records: FloatArray) -> Hypotheses:

@@ -389,9 +389,6 @@ def _write_solve(name: str, width: int) -> str:
 NEEDED_NEXT = "scipy.linalg.lapack", "scipy.special"
 """What a fit and its report will import, which takes a few tenths of a second."""
 
-LOOKUP = 3
-"""Cost of a table lookup, in additions."""
-
 
 class Module:
     """Text of LLVM functions, collected one by one and taken in parts.
@@ -405,8 +402,8 @@ class Module:
 
     Attributes
     ----------
-    work, pointers : dict
-        Cost of each straight-line function, in additions, and the pointers that it takes.
+    pointers : dict
+        The pointers that each straight-line function takes.
     """
 
     def __init__(self, width: int, prefix: str = "") -> None:
@@ -415,7 +412,6 @@ class Module:
         self._functions: list[str] = []
         self._declared: dict[str, str] = {}
         self._written: dict[str, str] = {}
-        self.work: dict[str, int] = {}
         self.pointers: dict[str, tuple[str, ...]] = {}
 
     def write_straight_line(
@@ -427,10 +423,8 @@ class Module:
         are the `pointers`; by default those that it uses.
         """
         writer = _Writer(self)
-        nodes = list_needed([node for _, _, node in stores])
-        for node in nodes:
+        for node in list_needed([node for _, _, node in stores]):
             writer.value(node)
-        self.work[name] = sum(_estimate_cost(node) * (1 + self.width // 4 if node.vector else 1) for node in nodes)
         for pointer, offset, node in stores:
             if node.truth:
                 raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
@@ -459,17 +453,6 @@ class Module:
         # A later module needs the declarations of those that it calls in earlier ones.
         self._written |= {name: f"declare {header}" for header, name in _HEADER.findall(written)}
         return "\n".join([*declared.values(), *called.values(), written])
-
-
-def _estimate_cost(node: Node) -> int:
-    """Return the cost of a node, in additions, so that rows of 7 to 10 states have about the work of their time."""
-    if node.op == "factors":
-        m = int(node.args[0]) * len(node.args[1])
-        return m**3 // 3 + 10 * m**2 if len(node.args) > 3 else 1
-    if node.op == "solution":
-        return 2 * len(node.args) ** 2
-    operation = OPERATIONS.get(node.op)
-    return LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
 
 
 _CALLED = re.compile(r"call \w+ @([\w.]+)\(")
@@ -582,25 +565,6 @@ class _Writer(Lines):
         return self._splats[node.index]
 
 
-class Workspace:
-    """Scratch space of a program. Calls share it, one at a time, so that it stays in the CPU caches.
-
-    Attributes
-    ----------
-    lock : held during a call, since ctypes releases the GIL
-    memory : array of doubles
-    """
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.memory = np.zeros(0)
-
-    def reserve(self, size: int) -> None:
-        """Allocate at least `size` doubles; the contents may be lost."""
-        if len(self.memory) < size:
-            self.memory = np.zeros(size)
-
-
 class Program:
     """Machine code of a module; it is freed with this object.
 
@@ -608,19 +572,23 @@ class Program:
     ----------
     key : str
         Hash of the module, the same in every process.
-    workspace : Workspace
-    row_work : list of int
-        Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
+    lock : held during a call, since ctypes releases the GIL
+    memory : array of doubles
+        Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.
     pointers : dict
         Names of the pointers that each straight-line function takes.
     """
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
-        self.workspace = Workspace()
-        self.row_work: list[int] = []
+        self.lock, self.memory = threading.Lock(), np.zeros(0)
         self.pointers: dict[str, tuple[str, ...]] = {}
         self._functions: dict[str, Any] = {}
+
+    def reserve(self, size: int) -> None:
+        """Allocate at least `size` doubles; the contents may be lost."""
+        if len(self.memory) < size:
+            self.memory = np.zeros(size)
 
     def function(self, name: str, *types: Any) -> Any:
         """Return a Python callable for a void function with arguments of these ctypes."""

@@ -30,7 +30,6 @@ from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variab
 from switchfit.engine.native.segments import (
     constraint_pointers,
     count_rows,
-    estimate_row,
     solve_stages,
     state_pointers,
     write_backward,
@@ -224,8 +223,8 @@ def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     return compile_library(library, sizes, both if order in both else (order,), _write, "Evaluated by JAX")
 
 
-Write = Callable[[Structure, Sizes, Order, Module, list[int]], Iterator[str]]
-"""Writes functions of a library with derivatives of an order, in parts, and the work of a row of each mode."""
+Write = Callable[[Structure, Sizes, Order, Module], Iterator[str]]
+"""Writes functions of a library with derivatives of an order, in parts."""
 
 
 def compile_library(
@@ -243,13 +242,12 @@ def compile_library(
 def _program_of(
     library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
 ) -> Program | str:
-    row_work = [0] * len(library.modes)
     modules = [Module(sizes.width, PREFIX[order]) for order in orders]
     try:
         if sizes.D == 0:
             raise Unsupported("an experiment has no unknowns")
         with use_float64():
-            parts = (write(library, sizes, order, each, row_work) for order, each in zip(orders, modules, strict=True))
+            parts = (write(library, sizes, order, each) for order, each in zip(orders, modules, strict=True))
             program = compile_modules(chain.from_iterable(parts))
     except Unsupported as error:
         reason = str(error)
@@ -258,7 +256,6 @@ def _program_of(
         reason = f"internal: {type(error).__name__}: {error}"
         log.info("%s: %s.", otherwise, reason, exc_info=True)
     else:
-        program.row_work = row_work
         program.pointers = {f"{each.prefix}{name}": given for each in modules for name, given in each.pointers.items()}
         return program
     return reason
@@ -271,19 +268,14 @@ def drop_programs() -> None:
         layout_of.cache_clear()
 
 
-def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
-    """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest.
-
-    With derivatives, the work of a row of each mode is stored in `row_work`.
-    """
+def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> Iterator[str]:
+    """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest."""
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     curvatures = []
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
-        if order > Order.COST:
-            row_work[mode] = estimate_row(writer, mode, curvatures[mode]["inner"])
         yield module.take()
     kernels.nodes()
     for k in range(len(library.measurements)):
