@@ -16,7 +16,7 @@ import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -520,51 +520,28 @@ def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
 
 
 def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
-    """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table (K,)."""
-    entries = [known_number(e) for e in table.tolist()]
-    numbers = None if None in entries else np.array(entries, dtype=float)
-    of_constants = numbers is not None and not any(a > b for a, b in pairwise(numbers)) and not np.isnan(numbers).any()
+    """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table of known ones, (K,).
 
-    def place(x: Any) -> Any:
-        if of_constants:
-            return _search_constants(graph, numbers, x, right)
-        return _search(graph, table.tolist(), x, right)
-
-    return as_objects([place(x) for x in np.ravel(query).tolist()]).reshape(np.shape(query))
-
-
-def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
-    """Bisect with JAX's comparisons, written out for all branches."""
-
-    if len(table) > MOST_CHOICES:
-        raise Unsupported(f"searches {len(table)} numbers that depend on the state (limit: {MOST_CHOICES})")
-
-    def between(low: int, high: int, turns: int) -> Any:
-        if turns == 0:
-            return high
-        middle = low + (high - low) // 2
-        entry = table[min(middle, len(table) - 1)]
-        # Insert before equal entries, or after them (`right`).
-        left = compare_in_order(graph, "lt", x, entry) if right else compare_in_order(graph, "le", x, entry)
-        return choose(graph, left, between(low, middle, turns - 1), between(middle, high, turns - 1))
-
-    return between(0, len(table), int(np.ceil(np.log2(len(table) + 1))))
-
-
-def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
-    """Bisect a constant table in memory, in a fixed number of log2 K steps."""
-    K = len(table)
+    It is a bisection in memory, in a fixed number of log2 K steps. None for any other table.
+    """
+    numbers = np.array([known_number(e) for e in table.tolist()], dtype=float)  # NaN for what is not known
+    if np.isnan(numbers).any() or (np.diff(numbers) < 0.0).any():
+        return None
+    K = len(numbers)
     if K > MOST_ROWS_OF_TABLE:
         raise Unsupported(f"searches a table of {K} entries (limit: {MOST_ROWS_OF_TABLE})")
     turns = K.bit_length()
-    padded = np.concatenate([table, np.full(2**turns - 1 - K, np.inf)])
-    found: Any = graph.constant(0.0)
-    for step in (2**k for k in reversed(range(turns))):
-        last = found + float(step - 1)
-        entry = graph.lookup(padded, last)
-        beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN comes after all numbers
-        found = graph.apply("select", beyond, found + float(step), found)
-    return clamp(graph, Integer(found, 0, 2**turns - 1), 0, K)
+    padded = np.concatenate([numbers, np.full(2**turns - 1 - K, np.inf)])
+
+    def place(x: Any) -> Any:
+        found: Any = graph.constant(0.0)
+        for step in (2**k for k in reversed(range(turns))):
+            entry = graph.lookup(padded, found + float(step - 1))
+            beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN comes after all numbers
+            found = graph.apply("select", beyond, found + float(step), found)
+        return clamp(graph, Integer(found, 0, 2**turns - 1), 0, K)
+
+    return as_objects([place(x) for x in np.ravel(query).tolist()]).reshape(np.shape(query))
 
 
 MOST_ROWS_TO_PIVOT = 5

@@ -28,14 +28,8 @@ from switchfit.problem.data import FloatArray
 SLOT = int(Column.SLOT)
 
 
-class Reserved(NamedTuple):
-    """Arrays of a log that grows: nodes (G + 1,), signals (G, 4, S), and for each Measurements the place of the first
-    sample at each node (G + 2,), times (K,), values and weights (K, q).
-    """
-
-    nodes: FloatArray
-    signals: FloatArray
-    samples: list[tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]]
+SampleArrays = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+"""Of one Measurements: the place of the first sample at each node (G + 2,), times (K,), values and weights (K, q)."""
 
 
 class OrderTables(NamedTuple):
@@ -115,8 +109,9 @@ class NativeHypotheses:
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
         self._arrays |= {f"{name}_{k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
 
-    def reserve(self, cells: int, samples: int) -> Reserved:
-        """Replace nodes, signals and samples by empty arrays, which are to be filled while a log grows.
+    def reserve(self, cells: int, samples: int) -> tuple[FloatArray, FloatArray, list[SampleArrays]]:
+        """Replace nodes (G + 1,), signals (G, 4, S) and samples by empty arrays, which are to be filled while a log
+        grows; return them.
 
         Parameters
         ----------
@@ -134,7 +129,7 @@ class NativeHypotheses:
             of_sensors.append((first, time, np.zeros((samples, channels)), np.zeros((samples, channels))))
             self._set_samples(k, *of_sensors[-1])
         self._table[:] = [get_address(a) for a in self._arrays.values()]
-        return Reserved(given["nodes"], given["signals"], of_sensors)
+        return given["nodes"], given["signals"], of_sensors
 
     def begin(self, p: FloatArray, start: Hypotheses, tolerances: Tolerances, limits: Limits | None) -> Hypotheses:
         """Return one hypothesis at t0, with the samples there.

@@ -95,15 +95,14 @@ SHORT = 120
 adds one stage: compiling these functions would take longer than all others."""
 
 
-def most_kept(n: int) -> int:
-    """Return how many values of functions are kept at most at each stage: as many as sines and cosines of n states."""
-    return 2 * n
+MOST_KEPT = 2
+"""Values of functions that are kept at most at each stage, in n: as many as sines and cosines of all states."""
 
 
 def count_kept(library: Structure, n: int, order: Order) -> int:
     """Return how many doubles a row keeps at most for its backward step."""
     has_factors = order > Order.COST and any(library.implicit)
-    return STAGES * most_kept(n) + (count_factors(n, len(STIFF.b)) if has_factors else 0)
+    return STAGES * MOST_KEPT * n + (count_factors(n, len(STIFF.b)) if has_factors else 0)
 
 
 def has_jumps(library: Structure) -> bool:
@@ -590,7 +589,7 @@ class Kernels:
         where both steps compute them.
         """
         outputs = (F, *((F_T, F_X, F_P) if self.order > Order.COST else ()), *((ELL,) if costs else ()))
-        most = most_kept(self.sizes.n) if self.goes_back else 0
+        most = MOST_KEPT * self.sizes.n if self.goes_back else 0
         return outputs, stage.list_long(outputs)[:most]
 
     def _load_constants(self, graph: Graph) -> tuple[Objects, list[Objects]]:

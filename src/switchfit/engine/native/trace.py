@@ -142,7 +142,8 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
             places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
-            return [np.asarray(places, dtype=object)]
+            if places is not None:
+                return [np.asarray(places, dtype=object)]
         return _run(graph, inner, args)
     if name in MOVES:
         result = MOVES[name](params, *args)
