@@ -230,16 +230,6 @@ def test_a_routine_for_the_linear_systems(monkeypatch):
     drop_programs()
 
 
-@pytest.mark.parametrize("name", ["van der Pol", "everything"])
-def test_the_backward_step_of_a_row_has_the_factors_of_its_forward_step(name):
-    """Without tangents, the forward step has no factors: the backward step then factorizes by itself."""
-    native = both(name)[0]
-    for change in (1.0, 1.0 + 1e-3, 1.0):
-        theta = native.problem.check_theta(change * native.problem.initial_theta)
-        found, expected = native(theta), native(theta, matrix="none")
-        assert_close(found.gradient, expected.gradient, 1e-13)
-
-
 def last_of_chain(n, times, q):
     """The last of n states at times (K,), ``x_i' = k (x_{i-1} - 2 x_i + x_{i+1}) + c`` between walls at 0, from 1."""
     rates, V = np.linalg.eigh(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))

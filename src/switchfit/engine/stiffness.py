@@ -53,9 +53,6 @@ damping ratio is above 0.3, to 2.1 for one of 0.02. Accuracy limits it to less: 
 oscillation."""
 
 
-IMPLICIT_ROW = 4.0
-"""Time of an implicit row, in explicit ones: 2 to 5 for small models in machine code."""
-
 UNSTABLE = 1.5
 """Factor by which explicit steps at the limit of stability count more: they are unstable on a mesh that is a bit
 coarser, or as soon as theta moves (Van der Pol's oscillator with mu = 100: J is NaN at the guess, and finite on a mesh
@@ -165,10 +162,10 @@ class Watch:
                     found[name] = ratio
         return found
 
-    def enter(self, name: str, *, is_explicit: bool = True) -> None:
-        """Begin the solve of a mode."""
+    def enter(self, name: str, of_row: float = 1.0) -> None:
+        """Begin the solve of a mode whose rows take as long as so many explicit ones."""
         self.current = name
-        self.modes.setdefault(name, _ModeSteps()).of_row = 1.0 if is_explicit else IMPLICIT_ROW
+        self.modes.setdefault(name, _ModeSteps()).of_row = of_row
 
     def add(self, accepted: int) -> bool:
         """Count steps in the current mode, and return whether it is time to `look`.
