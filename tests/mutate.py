@@ -43,7 +43,7 @@ TESTS = {
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "beam": [["tests/test_known_order.py", "-k", "say"], ["tests/test_beam.py", "-k", "not jax"]],
-    "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
+    "final time": [["tests/test_final_time.py", "-k", "closed_form or every_check"]],
     "corners": [
         [
             "tests/test_corners.py",
