@@ -54,7 +54,7 @@ def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     np.testing.assert_allclose(found.hessian, expected[2], rtol=0, atol=1e-8)
 
 
-def hard_problem(tf=2.4):
+def hard_problem():
     """Two transitions, one with a reset map and one with a guard, a reference signal, late samples and costs of every
     kind, all of them nonlinear and dependent on time."""
     costs = [
@@ -64,7 +64,7 @@ def hard_problem(tf=2.4):
         sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] * x[1] - p["k"], x[1] ** 2])),
     ]
     system = sf.HybridSystem(protocol.MODES, [0.4, 0.1], protocol.BOUNCE, guards=protocol.GUARDS)
-    tf = sf.Parameter(tf, lower=1.6, upper=3.0)
+    tf = sf.Parameter(2.4, lower=1.6, upper=3.0)
     run = sf.Experiment(costs, ("swing", "fall", "swing"), (0.83, 1.57), 0.0, tf)
     return sf.Problem(system, run, protocol.PARAMETERS | protocol.MORE)
 

@@ -289,10 +289,7 @@ class NativeExperiment:
             self._evaluate(tau, p, 1.0, multipliers)
             n, N, cells, width = self.sizes.n, self.structure.N, self._cells, self.sizes.width
             first_cell = self._named["first_cell"][: N + 1].astype(np.intp)
-            # Ends of rows: the nodes inside a segment, then its end. A cell that a transition cuts has two rows.
-            firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
-            ends = zip(firsts, lasts, [*tau.tolist(), self.times[-1]], strict=True)
-            inside = [np.append(self.times[first + 1 : last + 1], end) for first, last, end in ends]
+            times = np.sort(np.append(self.times, tau))  # a cell that a transition cuts has two rows
 
             def of_rows(name: str, count: int, *shape: int) -> FloatArray:
                 values = self._named[name].reshape(-1, *shape)[:count]
@@ -307,7 +304,7 @@ class NativeExperiment:
                     starts[(first_cell[1:] + np.arange(1, N + 1))[resets]] = after[resets]
                 return starts, ends[1:]
 
-            none, times = np.zeros((cells + N, 0)), np.concatenate([self.times[:1], *inside])
+            none = np.zeros((cells + N, 0))
             derives = self.order > Order.COST
             simulation = Simulation(
                 self._J.item(0),
