@@ -10,9 +10,6 @@ A `Watch` counts the steps of each mode in a solve. For a mode with many explici
 every `STEPS_BETWEEN` of them. If stability limits more than a quarter of the steps, the mode is solved by the implicit
 method too, which it keeps if its rows take less time; a `Choice` holds what was found. The other modes take explicit
 steps all the same.
-
-A fit may reach a theta where a mode is stiff and the explicit steps of its mesh are unstable: it then cannot go on.
-After such a failure, the eigenvalues at that theta are compared with the mesh.
 """
 
 from __future__ import annotations
@@ -26,16 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.discretization.mesh import Mesh, Stiffness
+from switchfit.discretization.mesh import Stiffness
 from switchfit.problem.data import FloatArray
 
 log = logging.getLogger("switchfit")
 
 STEPS_BETWEEN = 250
 """Accepted steps in a mode between two states at which its eigenvalues are computed."""
-
-STEPS_BETWEEN_AFTER_FAILURE = 64
-"""The same after a fit has failed, to find out whether its mesh is unstable."""
 
 FEW_STEPS = 1000
 """A mode with fewer steps is not called stiff, and its eigenvalues are not computed: its rows take less than a
@@ -120,8 +114,6 @@ class Watch:
     ----------
     most : mapping of str to float, optional
         Time in a mode, in explicit rows, after which `add` raises `TooManyStepsError`.
-    between : int
-        Steps in a mode between two looks.
     refused : container of str, optional
         Modes that take explicit steps although they are stiff; by default all do.
 
@@ -135,32 +127,15 @@ class Watch:
     def __init__(
         self,
         most: Mapping[str, float] | None = None,
-        between: int = STEPS_BETWEEN,
         refused: Container[str] | None = None,
     ) -> None:
         self.modes: dict[str, _ModeSteps] = {}
-        self.most, self.between, self.refused = most or {}, between, refused
+        self.most, self.refused = most or {}, refused
         self.current = ""
 
     def find_stiff(self) -> dict[str, float]:
         """Return the stiff modes, and ``|lambda| h`` where stability limits the steps of each."""
         return {name: float(np.median(mode.limited)) for name, mode in self.modes.items() if mode.is_stiff}
-
-    def find_unstable(self, mesh: Mesh) -> dict[str, float]:
-        """Return the modes in which explicit steps of a mesh are beyond `LIMITED`, and the largest ``|lambda| h`` of
-        each.
-        """
-        last = len(mesh.times) - 2
-        found: dict[str, float] = {}
-        for name, mode in self.modes.items():
-            for rate, look in zip(mode.rates, mode.looks, strict=True):
-                # The steps of the fixed mesh, not those of the solve: |lambda| of the look times the length of the cell
-                # it is in.
-                cell = min(int(np.searchsorted(mesh.times, look.t)) - 1, last)
-                ratio = float(rate * (mesh.times[cell + 1] - mesh.times[cell]))
-                if ratio > max(LIMITED, found.get(name, 0.0)):
-                    found[name] = ratio
-        return found
 
     def enter(self, name: str, of_row: float = 1.0) -> None:
         """Begin the solve of a mode whose rows take as long as so many explicit ones."""
@@ -179,7 +154,7 @@ class Watch:
         mode.count += accepted
         if mode.of_row * mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
-        return mode.count - mode.looked >= self.between
+        return mode.count - mode.looked >= STEPS_BETWEEN
 
     def look(self, step: float, slopes: Slopes, t: float, y: FloatArray, smallest: float) -> None:
         """Keep a state of the current mode, for its eigenvalues; they are computed only if it takes many steps.
@@ -250,20 +225,14 @@ class Choice:
         """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its time is limited."""
         return Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
 
-    def add(self, stiff: Mapping[str, float], explicit: Watch, k: int) -> bool:
-        """Let modes take implicit steps, and return whether there is one among them that did not.
+    def add(self, explicit: Watch, k: int) -> bool:
+        """Let the stiff modes of a solve at the k-th theta take implicit steps, and return whether there is one among
+        them that did not.
 
         They keep them if these take less time there than the explicit ones.
-
-        Parameters
-        ----------
-        stiff : mapping of str to float
-            ``|lambda| h`` of their explicit steps.
-        explicit : Watch
-            Of the explicit solve at the k-th theta.
-        k : int
         """
-        new = {name: ratio for name, ratio in stiff.items() if name not in self.found and name not in self._refused}
+        stiff = explicit.find_stiff().items()
+        new = {name: ratio for name, ratio in stiff if name not in self.found and name not in self._refused}
         for name, ratio in new.items():
             steps = explicit.modes[name]
             self.found[name], self._most[name] = Stiffness(name, steps.total, 0, ratio), (k, UNSTABLE * steps.time)
