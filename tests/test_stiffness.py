@@ -145,7 +145,7 @@ def test_what_neither_can_integrate_is_refused():
 
 
 def test_the_look_at_eigenvalues_survives_a_model_that_is_undefined_beside_the_trajectory():
-    watch = Watch()
+    watch = Watch({}, ())
     watch.enter("m")
 
     def slopes(times, y):
@@ -159,7 +159,7 @@ def test_eigenvalues_are_those_of_the_vector_field():
     """Complex ones by their size, growing ones not at all, whatever the size of the states."""
     A = np.array([[-3.0, 400.0, 0.0], [-400.0, -3.0, 0.0], [0.0, 0.0, 5000.0]])
     for size in (1e-6, 1.0, 1e6):
-        watch = Watch()
+        watch = Watch({}, ())
         watch.enter("m")
         y = size * np.array([1.0, -2.0, 0.5, 0.0])
         watch.look(0.01, lambda t, y: np.pad(y[:, :3] @ A.T, [(0, 0), (0, 1)]), 0.0, y, 1e-2 * size)

@@ -112,10 +112,10 @@ class Watch:
 
     Parameters
     ----------
-    most : mapping of str to float, optional
+    most : mapping of str to float
         Time in a mode, in explicit rows, after which `add` raises `TooManyStepsError`.
-    refused : container of str, optional
-        Modes that take explicit steps although they are stiff; by default all do.
+    refused : container of str
+        Modes that take explicit steps although they are stiff.
 
     Attributes
     ----------
@@ -124,14 +124,9 @@ class Watch:
         The mode that is being solved; "" before the first.
     """
 
-    def __init__(
-        self,
-        most: Mapping[str, float] | None = None,
-        refused: Container[str] | None = None,
-    ) -> None:
+    def __init__(self, most: Mapping[str, float], refused: Container[str]) -> None:
         self.modes: dict[str, _ModeSteps] = {}
-        self.most, self.refused = most or {}, refused
-        self.current = ""
+        self.most, self.refused, self.current = most, refused, ""
 
     def find_stiff(self) -> dict[str, float]:
         """Return the stiff modes, and ``|lambda| h`` where stability limits the steps of each."""
@@ -178,7 +173,7 @@ class Watch:
         """Return whether the current mode is stiff, however its solve goes on, and may take implicit steps."""
         looks = self.modes[self.current].looks
         # 20 of at most 60 looks are more than a quarter of them.
-        if self.refused is None or self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
+        if self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
             return False
         last = looks[-LOOKS_TO_STOP:]
         rates = _measure_rates(last)
@@ -223,7 +218,7 @@ class Choice:
 
     def watch(self, k: int) -> Watch:
         """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its time is limited."""
-        return Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
+        return Watch({name: most for name, (at, most) in self._most.items() if at == k}, self._refused)
 
     def add(self, explicit: Watch, k: int) -> bool:
         """Let the stiff modes of a solve at the k-th theta take implicit steps, and return whether there is one among
