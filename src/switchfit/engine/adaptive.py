@@ -160,7 +160,7 @@ class _Stretch(NamedTuple):
 
 
 class _NativeSteps:
-    """Adaptive steps in machine code through a stretch, in a mode of its own structure."""
+    """Adaptive steps in machine code through a stretch, in a mode of its own structure: up to `t` and `y` so far."""
 
     message = None  # of a failure: SciPy has it
 
@@ -173,6 +173,7 @@ class _NativeSteps:
         self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
         self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)
+        self.t, self.is_running = start, True
 
     def slope(self, t: float, y: FloatArray) -> FloatArray:
         """Return the slope at a time."""
@@ -182,32 +183,25 @@ class _NativeSteps:
         """Return the slopes at times (L,) and y (L, n + 1); NaN where the model is not defined."""
         return self._native.slopes_in(self._mode, times, y, self._p)
 
-    @property
-    def t(self) -> float:
-        """The time so far."""
-        return float(self._state[Adaptive().t])
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it has neither come to the end nor failed."""
-        return self.t < self._end and not self._state[Adaptive().stuck]
-
     def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
         """Take up to `most` steps; return the accepted times (L,) and the states there (L, n)."""
-        return self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most)
+        found, at = self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most), Adaptive()
+        self.t = float(self._state[at.t])
+        self.is_running = self.t < self._end and not self._state[at.stuck]
+        return found
 
 
 class _PythonSteps:
-    """Adaptive steps of SciPy through a stretch, with slopes from Python."""
+    """Adaptive steps of SciPy through a stretch, with slopes from Python: up to `t` and `y` so far."""
 
     def __init__(self, slope: Slope, stretch: _Stretch, given: Tolerances) -> None:
         from scipy.integrate import RK45, Radau  # here, since importing it takes longer than most fits
 
         method, self._slope = RK45 if stretch.is_explicit else Radau, slope
         self.message: str | None = None
+        self.t, self.y, self.is_running = stretch.start, np.append(stretch.x, 0.0), True
         with np.errstate(all="ignore"):  # a slope of 1e300 is refused with a message
-            start = stretch.start, np.append(stretch.x, 0.0), stretch.end
-            self._solver = method(slope, *start, rtol=given.rtol, atol=given.atol)
+            self._solver = method(slope, self.t, self.y, stretch.end, rtol=given.rtol, atol=given.atol)
 
     def slopes(self, times: FloatArray, y: FloatArray) -> FloatArray:
         """Return the slopes at times (L,) and y (L, n + 1), outside of the solve too; NaN where the model is not
@@ -220,25 +214,11 @@ class _PythonSteps:
                     found[k] = self._slope(t, y[k])
         return found
 
-    @property
-    def t(self) -> float:
-        """The time so far."""
-        return float(self._solver.t)
-
-    @property
-    def y(self) -> FloatArray:
-        """The state and the running cost so far: (n + 1,)."""
-        return np.asarray(self._solver.y)
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it has neither come to the end nor failed."""
-        return bool(self._solver.status == "running")
-
     def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
         """Take a step; return the accepted time (1,) and the state there (1, n), none if it has failed."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused
             self.message = self._solver.step()
+        self.t, self.y, self.is_running = float(self._solver.t), self._solver.y, self._solver.status == "running"
         taken = slice(int(self.message is None))
         return np.array([self.t])[taken], self.y[None, :-1][taken]
 

@@ -82,10 +82,9 @@ class HypothesisKernels(Kernels):
         """Return the larger of the error so far and that of a step, relative to ``rtol (smallest + |x|)``."""
         rtol, smallest = graph.loads("tolerances", 2)
         largest = graph.load("error", 0)
-        for error, value in zip(errors, x, strict=True):
-            relative = graph.apply("abs", error) / (rtol * (smallest + graph.apply("abs", value)))
-            smaller = graph.apply("le", relative, largest)  # false for NaN, which then is the error
-            largest = graph.apply("select", smaller, largest, relative)
+        xp = Namespace(graph)
+        for relative in xp.abs(errors) / (rtol * (smallest + xp.abs(x))):
+            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
         return largest
 
     def move(self, name: str, sign: float, costs: bool) -> None:
