@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
@@ -11,22 +9,17 @@ from systems import (
     KINDS,
     NODES,
     P0,
-    Case,
     Derivatives,
     Parameter,
     case,
     closed_form,
     closed_form_case,
-    compiled,
     padded_mesh,
     problem_of,
     weighted,
 )
 
 from switchfit.discretization.mesh import build_arguments
-from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import propagate
-from switchfit.discretization.rows import EXPLICIT
 
 INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
 INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
@@ -91,52 +84,6 @@ def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
 
     coarse, fine = np.abs(remainders(0.5)), np.abs(remainders(0.25))
     np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)
-
-
-def test_gauss_newton_from_the_residual_jacobian() -> None:
-    this = case("plain")
-    N = this.N
-
-    def explicit(arguments, tau, p, side):
-        model = Model(this.structure, arguments)
-
-        def residuals(theta):
-            path = propagate(model, theta[:N], theta[N:], side)
-            samples = arguments.samples[0]
-            at_samples = jax.vmap(lambda s, x: model.sample_residual(0, s, x, theta[N:]))(
-                samples, path.at_samples(samples.cell)
-            )
-
-            def of_row(start, end, piece, X):
-                (residual,) = model.reference_residuals(piece)
-                return jax.vmap(lambda t, x: residual(t, x, theta[N:]))(start + EXPLICIT.c * (end - start), X)
-
-            continuous = jax.vmap(of_row)(path.layout.start, path.layout.end, path.pieces, path.stages)
-            return at_samples, continuous[..., 0], path.layout.end - path.layout.start
-
-        theta = jnp.concatenate([tau, p])
-        h = residuals(theta)[2]
-        at_samples, continuous, _ = jax.jacfwd(residuals)(theta)
-        weight = h[:, None] * EXPLICIT.b[None] * arguments.weights[0][0]
-        return jnp.einsum("kqd,kq,kqe->de", at_samples, arguments.samples[0].weight, at_samples) + jnp.einsum(
-            "rsd,rs,rse->de", continuous, weight, continuous
-        )
-
-    arguments = this.arguments("all")
-    with_data_only = weighted_data(this)
-    expected = np.asarray(compiled(explicit)(with_data_only, INSIDE["plain"], P0))
-    at = INSIDE["plain"], P0
-    found, exact = this.gauss_newton(with_data_only, *at), this.discrete(with_data_only, *at)
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
-    assert np.abs(found - exact.hessian).max() > 0.1
-    assert np.linalg.eigvalsh(found).min() > 0.0
-    assert np.abs(this.gauss_newton(arguments, *at) - found).max() > 0.1
-
-
-def weighted_data(this: Case):
-    """Arguments with samples and the reference signal, without the other costs."""
-    arguments, samples, reference = (this.arguments(kind) for kind in ("all", "samples", "reference"))
-    return arguments._replace(fixed=samples.fixed, samples=arguments.samples, weights=reference.weights)
 
 
 def test_equal_neighbouring_modes_give_zero_rows() -> None:

@@ -279,8 +279,9 @@ class Templates:
         if self.order == Order.COST:
             return []
         # First, since the machine code of both is then a little faster.
-        is_given = gauss_newton is not None and self.order == Order.GAUSS_NEWTON
-        second = gauss_newton() if is_given else _differentiate_twice(value, t, x, p)
+        if gauss_newton is None or self.order == Order.HESSIAN:
+            gauss_newton = partial(_differentiate_twice, value, t, x, p)
+        second = gauss_newton()
         return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), second]
 
     def _no_second(self) -> Any:
