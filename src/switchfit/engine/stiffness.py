@@ -128,10 +128,6 @@ class Watch:
         self.modes: dict[str, _ModeSteps] = {}
         self.most, self.refused, self.current = most, refused, ""
 
-    def find_stiff(self) -> dict[str, float]:
-        """Return the stiff modes, and ``|lambda| h`` where stability limits the steps of each."""
-        return {name: float(np.median(mode.limited)) for name, mode in self.modes.items() if mode.is_stiff}
-
     def enter(self, name: str, of_row: float = 1.0) -> None:
         """Begin the solve of a mode whose rows take as long as so many explicit ones."""
         self.current = name
@@ -226,12 +222,12 @@ class Choice:
 
         They keep them if these take less time there than the explicit ones.
         """
-        stiff = explicit.find_stiff().items()
-        new = {name: ratio for name, ratio in stiff if name not in self.found and name not in self._refused}
-        for name, ratio in new.items():
-            steps = explicit.modes[name]
-            self.found[name], self._most[name] = Stiffness(name, steps.total, 0, ratio), (k, UNSTABLE * steps.time)
-        return bool(new)
+        others = {name: mode for name, mode in explicit.modes.items() if name not in {*self.found, *self._refused}}
+        stiff = {name: mode for name, mode in others.items() if mode.is_stiff}
+        for name, mode in stiff.items():
+            self.found[name] = Stiffness(name, mode.total, 0, float(np.median(mode.limited)))
+            self._most[name] = k, UNSTABLE * mode.time
+        return bool(stiff)
 
     def refuse(self, name: str) -> bool:
         """Let a mode take explicit steps after its implicit ones have failed; return whether it took implicit ones."""

@@ -210,7 +210,7 @@ class Kernels:
         found = explicit_rows.stages(tableau, field, start, end, x, k)
         after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         stores, factors = store_all("x_after", 0, after), None
-        keep = store_all if self.goes_back else lambda *_: []
+        keep: Callable[..., list[Store]] = store_all if self.goes_back else lambda *_: []
         if self.order > Order.COST:
             at_points = found.states
             # The backward step needs slopes only if the row moves: V multiplies them by h'. Those of an explicit row it
