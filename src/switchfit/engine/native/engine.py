@@ -159,15 +159,12 @@ class NativeEngine:
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
         """Return J and its derivatives."""
-
-        def evaluate(native: NativeExperiment) -> Evaluation[FloatArray]:
-            found = native(tau, p, side)
-            if matrix != "none":
-                return found
-            return Evaluation(found.cost, found.gradient, np.full_like(found.hessian, np.nan))
-
         order = Order.GAUSS_NEWTON if matrix == "gauss-newton" else Order.HESSIAN
-        return self._try(order, evaluate, lambda: self._fallback.derivatives(tau, p, side, matrix))
+        given = tau, p, side
+        found = self._try(order, lambda native: native(*given), lambda: self._fallback.derivatives(*given, matrix))
+        return (
+            found if matrix != "none" else Evaluation(found.cost, found.gradient, np.full_like(found.hessian, np.nan))
+        )
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
