@@ -162,9 +162,9 @@ class NativeEngine:
         order = Order.GAUSS_NEWTON if matrix == "gauss-newton" else Order.HESSIAN
         given = tau, p, side
         found = self._try(order, lambda native: native(*given), lambda: self._fallback.derivatives(*given, matrix))
-        return (
-            found if matrix != "none" else Evaluation(found.cost, found.gradient, np.full_like(found.hessian, np.nan))
-        )
+        if matrix != "none":
+            return found
+        return Evaluation(found.cost, found.gradient, np.full_like(found.hessian, np.nan))
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
