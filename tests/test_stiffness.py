@@ -15,6 +15,7 @@ from test_implicit import SQUARE, robertson, van_der_pol
 
 import switchfit as sf
 from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.native.templates import Order
 from switchfit.engine.stiffness import Choice, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.command_line import describe_steps
@@ -179,6 +180,19 @@ def test_the_predicted_time_decides_on_the_engine_that_evaluates(mu):
     (stiffness,) = native.stiffness
     assert 2.5 * stiffness.implicit_steps < stiffness.explicit_steps < 6 * stiffness.implicit_steps
     assert by_jax.stiffness == ()
+
+
+def test_the_work_of_implicit_rows_grows_faster_with_states_that_depend_on_one_another():
+    def find_work(n, solver):
+        A = np.cos(np.arange(n * n).reshape(n, n)) - 3 * n * np.eye(n)
+        system = sf.HybridSystem({"m": lambda t, x, p: p["k"] * (jnp.asarray(A) @ x)}, [1.0] * n)
+        run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("m",), (), 0.0, 1.0)
+        evaluator = Evaluator(sf.Problem(system, run, {"k": 1.0}, solver=solver))
+        return evaluator.engines[0].at(Order.HESSIAN).row_work[0]
+
+    few, many = (find_work(n, "stiff") / find_work(n, "explicit") for n in (2, 10))
+    assert 3 < few < 6
+    assert many > 3 * few
 
 
 @pytest.mark.parametrize(("samples", "modes"), [(20, ["m"]), (20_000, [])])

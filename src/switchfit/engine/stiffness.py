@@ -9,7 +9,10 @@ mesh is unstable.
 A `Watch` counts the steps of each mode in a solve. For a mode with many explicit steps, the eigenvalues are computed at
 every `STEPS_BETWEEN` of them. If stability limits more than a quarter of the steps, the mode is solved by the implicit
 method too, which it keeps if its rows take less time; a `Choice` holds what was found. The other modes take explicit
-steps all the same.
+steps all the same. The time of a row is its *work*, in additions: the operations of its machine code are counted, so
+that the choice is the same in each process. The implicit rows of small models have three to five times the work of
+explicit ones, and take 0.65 to 0.9 times as long as their work says; those of 12 states that all depend on one another
+have eighteen times the work.
 """
 
 from __future__ import annotations
@@ -70,10 +73,10 @@ class _Look(NamedTuple):
 @dataclass
 class _ModeSteps:
     """Accepted steps in one mode, so far and at the last look, the projected total of a solve that was given up, the
-    rows of a mesh with these steps, and the time of a row, in explicit ones.
+    rows of a mesh with these steps, and the work of a row.
     """
 
-    of_row: float = 1.0
+    row_work: float = 1.0
     rows: int = 0
     count: int = 0
     looked: int = 0
@@ -102,9 +105,9 @@ class _ModeSteps:
         return round(max(self.projected, self.count))
 
     @property
-    def time(self) -> float:
-        """Time of the rows of a mesh with these steps: there is at least one between two samples."""
-        return self.of_row * max(self.rows, self.total)
+    def work(self) -> float:
+        """Work of the rows of a mesh with these steps: there is at least one between two samples."""
+        return self.row_work * max(self.rows, self.total)
 
 
 class Watch:
@@ -128,10 +131,10 @@ class Watch:
         self.modes: dict[str, _ModeSteps] = {}
         self.most, self.refused, self.current = most, refused, ""
 
-    def enter(self, name: str, of_row: float = 1.0) -> None:
-        """Begin the solve of a mode whose rows take as long as so many explicit ones."""
+    def enter(self, name: str, row_work: float = 1.0) -> None:
+        """Begin the solve of a mode whose rows have this work, in additions, in an evaluation of (J, g, H)."""
         self.current = name
-        self.modes.setdefault(name, _ModeSteps()).of_row = of_row
+        self.modes.setdefault(name, _ModeSteps()).row_work = row_work
 
     def add(self, accepted: int) -> bool:
         """Count steps in the current mode, and return whether it is time to `look`.
@@ -143,7 +146,7 @@ class Watch:
         """
         mode = self.modes[self.current]
         mode.count += accepted
-        if mode.of_row * mode.count > self.most.get(self.current, np.inf):
+        if mode.row_work * mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
         return mode.count - mode.looked >= STEPS_BETWEEN
 
@@ -226,7 +229,7 @@ class Choice:
         stiff = {name: mode for name, mode in others.items() if mode.is_stiff}
         for name, mode in stiff.items():
             self.found[name] = Stiffness(name, mode.total, 0, float(np.median(mode.limited)))
-            self._most[name] = k, UNSTABLE * mode.time
+            self._most[name] = k, UNSTABLE * mode.work
         return bool(stiff)
 
     def refuse(self, name: str) -> bool:
@@ -243,7 +246,7 @@ class Choice:
         found = {name: most for name, (at, most) in self._most.items() if at == k and name in watch.modes}
         for name in found:
             self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)
-        slower = [name for name, most in found.items() if watch.modes[name].time > most]
+        slower = [name for name, most in found.items() if watch.modes[name].work > most]
         for name in slower:
             self.refuse(name)
         return bool(slower)

@@ -26,6 +26,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+MANY = 20
+"""Cost of a function of the C library, in additions."""
+
 
 class Operation(NamedTuple):
     """One operation.
@@ -46,6 +49,8 @@ class Operation(NamedTuple):
         Function that its code calls: an intrinsic ("llvm.") or a function of the C library.
     primitives, of_truth : tuple of str
         JAX primitives that it implements, for doubles and for truth values.
+    effort : int
+        Its cost, in additions.
     may_fail : bool
         Whether it is infinite or NaN for some finite operands; overflow of sums and products does not count.
     commutes : bool
@@ -64,6 +69,7 @@ class Operation(NamedTuple):
     function: str | None = None
     primitives: tuple[str, ...] = ()
     of_truth: tuple[str, ...] = ()
+    effort: int = 1
     may_fail: bool = False
     commutes: bool = False
     gives_integer: bool = False
@@ -95,7 +101,7 @@ def _intrinsic(name: str, value: Callable[..., Any], intrinsic: str, **more: Any
 
 
 def _from_libm(name: str, value: Callable[..., Any], function: str | None = None, **more: Any) -> Operation:
-    return _call(name, value, function or name, **more)
+    return _call(name, value, function or name, effort=MANY, **more)
 
 
 def _round_half_away(a: Any) -> Any:
@@ -109,7 +115,7 @@ OPERATIONS = {
         _arithmetic("add", np.add, "fadd contract", primitives=("add", "add_any"), commutes=True, known_alike=True),
         _arithmetic("sub", np.subtract, "fsub contract", known_alike=True),
         _arithmetic("mul", np.multiply, "fmul contract", commutes=True, known_alike=True),
-        _arithmetic("div", np.divide, "fdiv", may_fail=True),
+        _arithmetic("div", np.divide, "fdiv", effort=4, may_fail=True),
         Operation("neg", np.negative, "fneg {type} {0}", 1, primitives=("neg",)),
         _comparison("lt", np.less, "olt"),
         _comparison("le", np.less_equal, "ole"),
@@ -125,7 +131,7 @@ OPERATIONS = {
         _intrinsic("max", np.maximum, "maximum", operands=2, commutes=True),
         _intrinsic("min", np.minimum, "minimum", operands=2, commutes=True),
         _intrinsic("abs", np.abs, "fabs"),
-        _intrinsic("sqrt", np.sqrt, "sqrt", may_fail=True),
+        _intrinsic("sqrt", np.sqrt, "sqrt", effort=4, may_fail=True),
         _intrinsic("floor", np.floor, "floor", gives_integer=True),
         _intrinsic("ceil", np.ceil, "ceil", gives_integer=True),
         _intrinsic("trunc", np.trunc, "trunc", primitives=(), gives_integer=True),
@@ -163,11 +169,11 @@ BY_VALUE = {operation.value: operation for operation in OPERATIONS.values()}
 COMMUTATIVE = frozenset(name for name, operation in OPERATIONS.items() if operation.commutes)
 INTEGERS = frozenset(name for name, operation in OPERATIONS.items() if operation.gives_integer)
 MAY_FAIL = frozenset(name for name, operation in OPERATIONS.items() if operation.may_fail)
+LONG = frozenset(name for name, operation in OPERATIONS.items() if operation.effort >= MANY)
 FROM_LIBM = tuple(
     operation.function for operation in OPERATIONS.values() if operation.function and "." not in operation.function
 )
 """Functions of the C library."""
-LONG = frozenset(name for name, operation in OPERATIONS.items() if operation.function in FROM_LIBM)
 
 
 Objects = NDArray[np.object_]
