@@ -33,7 +33,12 @@ from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.engine import NativeEngine
-from switchfit.engine.native.experiment import FailedCheckError, NativeExperiment, native_experiment
+from switchfit.engine.native.experiment import (
+    FailedCheckError,
+    NativeExperiment,
+    native_experiment,
+    places_in_library,
+)
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
@@ -142,7 +147,7 @@ class SharedEngine(NativeEngine):
         """Return the experiment with derivatives of an order, set to this sequence."""
         found = super().at(order)
         if found is not None and found.structure is not self._structure:
-            found.assign_sequence(self._structure)
+            found.assign_sequence(self._structure, places_in_library(self._structure))
         return found
 
 
@@ -179,6 +184,7 @@ class ScheduleCosts:
     def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
         self.problem, self._evaluator = problem, evaluator
         self._pairs: dict[tuple[int, tuple[str, str]], tuple[Function | None, ...]] = {}
+        self._sequences: dict[tuple[int, tuple[str, ...]], tuple[Structure, dict[str, NDArray[np.int64]]]] = {}
         self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
         times = sum(len(run.transition_times) for run in problem.experiments)
         counts = [len(run.times) + len(run.jump_times) for run in problem.experiments]
@@ -238,12 +244,19 @@ class ScheduleCosts:
         found = np.full(len(schedules), np.nan)
         if native is not None:
             for i, schedule in enumerate(schedules):
-                structure = self.structure_of(e, schedule.sequence)
+                structure, places = self._find_places(e, schedule.sequence)
                 if structure is not native.structure:
-                    native.assign_sequence(structure)
+                    native.assign_sequence(structure, places)
                 with suppress(FailedCheckError):
                     found[i] = native.cost(schedule.times, p)
         return found
+
+    def _find_places(self, e: int, sequence: tuple[str, ...]) -> tuple[Structure, dict[str, NDArray[np.int64]]]:
+        """Return the structure of an experiment with another sequence, and what is active where in it."""
+        if (e, sequence) not in self._sequences:
+            structure = self.structure_of(e, sequence)
+            self._sequences[e, sequence] = structure, places_in_library(structure)
+        return self._sequences[e, sequence]
 
     def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J by a problem of its own."""

@@ -191,18 +191,20 @@ class NativeExperiment:
         self._g, self._H, self._jacobian = self._named["g"][: sizes.D], H[:, : sizes.D], jacobian
         self._set_sequence(structure)
 
-    def assign_sequence(self, structure: Structure) -> None:
+    def assign_sequence(self, structure: Structure, places: dict[str, NDArray[np.int64]]) -> None:
         """Evaluate another sequence of the same library from now on; its transition times are the next call's.
 
         Parameters
         ----------
         structure : Structure
             Equal to that of the experiment but for the modes and the functions at transitions; without jumps.
+        places : dict
+            Its `places_in_library`.
         """
         self._named["bounds"][1:] = self.times[-1]
         self._named["first_cell"][1:] = self._cells - 1
         self._set_sequence(structure)
-        for name, which in places_in_library(structure).items():
+        for name, which in places.items():
             self._named[name][:] = which
         self._named["modes"][-1] = self._judged
 
