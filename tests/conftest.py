@@ -75,7 +75,7 @@ def pytest_configure(config):
     llvm.compile_modules = program.compile_modules = compile_quickly
 
 
-TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_interrupt", "test_prediction")
+TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_prediction")
 """Files that share the programs of `systems.case`, which are most of what they take: one process runs them all."""
 
 LONGEST = (

@@ -43,7 +43,7 @@ TESTS = {
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "beam": [["tests/test_known_order.py", "-k", "say"], ["tests/test_beam.py", "-k", "not jax"]],
-    "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
+    "final time": [["tests/test_final_time.py", "-k", "closed_form or every_check"]],
     "corners": [
         [
             "tests/test_corners.py",
@@ -243,7 +243,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
     "beam": {
         "sign of the jump in Z": swap(HYPOTHESES, "+ sign * graph.loads(", "- sign * graph.loads("),
         "dropped F_p": swap(
-            HYPOTHESES, "self._along_p(graph, each) for each", "self._along_p(graph, 0.0 * each) for each"
+            KERNELS, "forcing = [self._along_p(graph, f_p) for", "forcing = [self._along_p(graph, 0.0 * f_p) for"
         ),
         "no column for tau": swap(HYPOTHESES, "+ sign * graph.loads(", "+ 0.0 * sign * graph.loads("),
         "column one slot off": swap(HYPOTHESIS_LOOPS, "Column.SLOT) + 1", "Column.SLOT) + 2"),
@@ -276,7 +276,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "times of crossings at another theta": swap(SPLIT, "times[split.guarded] -= step", "pass"),
         "a path that does not hold any more": swap(
-            SPLIT, "if found is not None and self._holds(last, found[1], tau, p):", "if found is not None:"
+            SPLIT, "if found is not None and self._holds(last, times, p):", "if found is not None:"
         ),
         "the side behind a crossing": swap(COURSE, "behind if after == self.sides else after", "self.sides"),
         "sliding": swap(COURSE, "\n            )\n        return 0", "\n            )\n        return 1"),

@@ -190,7 +190,6 @@ class Case:
         self._paper = compiled(lambda given, *at: compute_paper_derivatives(Model(self.structure, given), *at))
         self._discrete = compiled(self._differentiate("discrete-adjoint"))
         self._forward = compiled(self._differentiate("forward"))
-        self._gauss_newton = compiled(self._differentiate("forward", "gauss-newton"))
         self._cost = compiled(self._simulate)
 
     def arguments(self, kind: str = "all", *, halvings: int = 0, equal: float = 0.0) -> Arguments:
@@ -200,8 +199,8 @@ class Case:
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
         return weighted(build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
 
-    def _differentiate(self, method: Any, matrix: Any = "exact") -> Callable[..., Any]:
-        return lambda *at: derivatives(*at, structure=self.structure, method=method, matrix=matrix)
+    def _differentiate(self, method: Any) -> Callable[..., Any]:
+        return lambda *at: derivatives(*at, structure=self.structure, method=method)
 
     def _simulate(self, arguments: Arguments, tau: Any, p: Any, side: int) -> Any:
         model = Model(self.structure, arguments)
@@ -222,10 +221,6 @@ class Case:
     def forward(self, *given: Any) -> Derivatives:
         """Of the discretised cost, forward over forward."""
         return Derivatives.of(self._forward(*given))
-
-    def gauss_newton(self, *given: Any) -> np.ndarray:
-        """The Gauss-Newton matrix."""
-        return np.asarray(self._gauss_newton(*given)[2])
 
 
 @cache

@@ -2,43 +2,28 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from systems import (
     KINDS,
     NODES,
     P0,
-    Case,
     Derivatives,
     Parameter,
     case,
     closed_form,
     closed_form_case,
-    compiled,
     padded_mesh,
     problem_of,
     weighted,
 )
 
 from switchfit.discretization.mesh import build_arguments
-from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import propagate
-from switchfit.discretization.rows import EXPLICIT
 
 INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
 INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
 """Transition times that are not nodes."""
-
-
-def beside(away: float) -> np.ndarray:
-    """A mode that begins just before a node, and ends just behind another one: its rows have hardly any length."""
-    begin, end = NODES[[5, 14]]
-    return np.array([min(begin - away, np.nextafter(begin, 0.0)), max(end + away, np.nextafter(end, 9.0))])
 
 
 def assert_same(found: Derivatives, expected: Derivatives, relative: float) -> None:
@@ -48,20 +33,16 @@ def assert_same(found: Derivatives, expected: Derivatives, relative: float) -> N
         np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
 
 
-def assert_all_same(this: Case, *at: object) -> None:
-    relative = 1e-9 if any(this.structure.implicit) else 2e-12
-    expected = this.forward(*at)
-    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
-    assert_same(this.discrete(*at), expected, relative)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "name", ["mixed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("resets", "stiff"))]
 )
 def test_adjoint_and_forward_agree(name: str, kind: str) -> None:
     this = case(name)
-    assert_all_same(this, this.arguments(kind), INSIDE[name], P0)
+    at = this.arguments(kind), INSIDE[name], P0
+    expected = this.forward(*at)
+    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
+    assert_same(this.discrete(*at), expected, 1e-9 if any(this.structure.implicit) else 2e-12)
 
 
 def test_derivatives_in_closed_form() -> None:
@@ -70,22 +51,6 @@ def test_derivatives_in_closed_form() -> None:
     _, gradient, hessian = differentiate(lambda z: closed_form(z[0], z[1]), [0.9, 0.7])
     np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
     np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)
-
-
-SPECIAL = {
-    "resets": [NODES[[5, 9, 14]], NODES[[4, 4, 13]], NODES[[4, 4, 4]], np.array([0.413, 0.413, 1.287])],
-    "mixed": [NODES[[9, 14]], *(beside(away) for away in (0.0, 1e-12, 1e-9, 1e-6))],
-    "stiff": [NODES[[9, 14]]],
-}
-"""Transition times on nodes that are samples too, on one another, and as close to nodes as numbers can be."""
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize("name", ["resets", "mixed", pytest.param("stiff", marks=pytest.mark.slow)])
-def test_agree_at_special_places(name: str, side: int) -> None:
-    this = case(name)
-    for tau in SPECIAL[name]:
-        assert_all_same(this, this.arguments(), tau, P0, side)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -98,20 +63,6 @@ def test_side_is_the_limit_from_that_side(side: int) -> None:
     np.testing.assert_allclose(at.gradient, beside.gradient, atol=1e-6)
     np.testing.assert_allclose(at.hessian, beside.hessian, atol=1e-4)
     assert np.abs(at.gradient - other.gradient).max() > 0.1
-
-
-@settings(max_examples=10, deadline=None)
-@given(
-    times=st.lists(st.floats(0.0, 2.0), min_size=3, max_size=3),
-    p=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
-    side=st.sampled_from([-1, 1]),
-)
-def test_adjoint_and_forward_agree_anywhere(times: list[float], p: tuple[float, float], side: int) -> None:
-    this = case("resets")
-    at = this.arguments(), np.sort(times), np.array(p), side
-    found, expected = this.discrete(*at), this.forward(*at)
-    scale = max(1.0, np.abs(expected.hessian).max())
-    np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0.0, atol=1e-11 * scale)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -133,62 +84,6 @@ def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
 
     coarse, fine = np.abs(remainders(0.5)), np.abs(remainders(0.25))
     np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)
-
-
-def test_gauss_newton_from_the_residual_jacobian() -> None:
-    this = case("plain")
-    N = this.N
-
-    def explicit(arguments, tau, p, side):
-        model = Model(this.structure, arguments)
-
-        def residuals(theta):
-            path = propagate(model, theta[:N], theta[N:], side)
-            samples = arguments.samples[0]
-            at_samples = jax.vmap(lambda s, x: model.sample_residual(0, s, x, theta[N:]))(
-                samples, path.at_samples(samples.cell)
-            )
-
-            def of_row(start, end, piece, X):
-                (residual,) = model.reference_residuals(piece)
-                return jax.vmap(lambda t, x: residual(t, x, theta[N:]))(start + EXPLICIT.c * (end - start), X)
-
-            continuous = jax.vmap(of_row)(path.layout.start, path.layout.end, path.pieces, path.stages)
-            return at_samples, continuous[..., 0], path.layout.end - path.layout.start
-
-        theta = jnp.concatenate([tau, p])
-        h = residuals(theta)[2]
-        at_samples, continuous, _ = jax.jacfwd(residuals)(theta)
-        weight = h[:, None] * EXPLICIT.b[None] * arguments.weights[0][0]
-        return jnp.einsum("kqd,kq,kqe->de", at_samples, arguments.samples[0].weight, at_samples) + jnp.einsum(
-            "rsd,rs,rse->de", continuous, weight, continuous
-        )
-
-    arguments = this.arguments("all")
-    with_data_only = weighted_data(this)
-    expected = np.asarray(compiled(explicit)(with_data_only, INSIDE["plain"], P0))
-    at = INSIDE["plain"], P0
-    found, exact = this.gauss_newton(with_data_only, *at), this.discrete(with_data_only, *at)
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
-    assert np.abs(found - exact.hessian).max() > 0.1
-    assert np.linalg.eigvalsh(found).min() > 0.0
-    assert np.abs(this.gauss_newton(arguments, *at) - found).max() > 0.1
-
-
-def weighted_data(this: Case):
-    """Arguments with samples and the reference signal, without the other costs."""
-    arguments, samples, reference = (this.arguments(kind) for kind in ("all", "samples", "reference"))
-    return arguments._replace(fixed=samples.fixed, samples=arguments.samples, weights=reference.weights)
-
-
-def test_samples_alone() -> None:
-    """Without a running cost nothing is integrated; it is not the same program as a running cost of weight 0."""
-    this, alone = case("plain"), Case(problem_of("plain", parts=("samples",)))
-    arguments = weighted(build_arguments(alone.problem, 0, padded_mesh(NODES)), "all")
-    assert not alone.structure.running
-    at, other = (arguments, INSIDE["plain"], P0), (this.arguments("samples"), INSIDE["plain"], P0)
-    assert_same(alone.discrete(*at), this.discrete(*other), 1e-13)
-    np.testing.assert_allclose(alone.gauss_newton(*at), this.gauss_newton(*other), atol=1e-12)
 
 
 def test_equal_neighbouring_modes_give_zero_rows() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from functions import FALLS_BACK
 
-from switchfit.engine.native import arrays, entries, trace
+from switchfit.engine.native import arrays, trace
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "engines.md"
 
@@ -42,9 +42,9 @@ def test_the_page_claims_machine_code_only_for_what_has_it():
     ("row", "limits"),
     [
         ("branches, loops", (trace.MOST_NODES,)),
-        ("tables of numbers", (entries.MOST_ROWS_OF_TABLE,)),
-        ("tables of parameters", (entries.MOST_CHOICES,)),
-        ("indices that depend", (entries.MOST_CHOICES,)),
+        ("tables of numbers", (arrays.MOST_ROWS_OF_TABLE,)),
+        ("tables of parameters", (arrays.MOST_CHOICES,)),
+        ("indices that depend", (arrays.MOST_CHOICES,)),
         ("linear systems", (arrays.MOST_ROWS_TO_PIVOT,)),
         ("Cholesky", (arrays.MOST_ROWS, arrays.MOST_KNOWN_ROWS)),
         ("sorting", (arrays.MOST_SORTED,)),

@@ -1,6 +1,5 @@
 """Guards and terminal constraints: derivatives against closed forms and JAX, fits with known answers."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,9 +7,6 @@ from derivatives import differentiate
 from models import BALL_G, BALL_HEIGHT, ball, ball_system, constrained, decay, rest
 
 import switchfit as sf
-from switchfit.discretization.model import Model, list_transition_functions
-from switchfit.discretization.propagation import compute_path_cost, propagate
-from switchfit.fit.evaluator import Evaluator
 
 END, TARGET = 15.0, 20.0
 
@@ -156,66 +152,14 @@ def test_unknowns_on_a_logarithmic_scale_are_fitted_beside_guards():
     assert other.constraints[0][2] == pytest.approx(one.constraints[0][2], rel=1e-5, abs=1e-6)
 
 
-def test_priors_count_beside_guards():
-    """They are part of J and of the Lagrangian."""
-    problem = tank(sf.Parameter(0.8, prior=sf.Normal(0.45, 1e-3)))
-    theta = problem.initial_theta
-    evaluator = Evaluator(problem)
-    found, expected = evaluator.constrained(theta), evaluator(theta)
-    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
-    np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-10)
-    np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-10, atol=1e-10)
-
-
-# --- derivatives ------------------------------------------------------------------------------------------------------
-
-
-def by_jax(evaluator, theta, multipliers):
-    """The Lagrangian by running the constraints through JAX as they are written."""
-    problem = evaluator.problem
-
-    def value(theta):
-        total, last = 0.0, 0
-        for e, (structure, arguments) in enumerate(zip(problem.structures, evaluator.arguments, strict=True)):
-            places, N = problem.places[e], structure.N
-            tau, p = theta[places[:N]], theta[places[N:]]
-            model = Model(structure, jax.tree.map(jnp.asarray, arguments))
-            path = propagate(model, tau, p, 1.0)
-            guards = list_transition_functions(model, "guards")
-            c = [guard(tau[i], path.at_transition(i)[1], p) for i, guard in guards]
-            if structure.terminal_constraints:
-                c += list(model.terminal_constraint(path.after[-1], p))
-            here = slice(last, last := last + len(c))
-            c = jnp.stack(c)
-            total = total + compute_path_cost(model, path, p) + multipliers[here] @ c
-        return total
-
-    return differentiate(value, theta)
-
-
-def test_the_lagrangian_has_exact_derivatives():
-    evaluator = Evaluator(constrained(second_run=True))
-    problem = evaluator.problem
-    assert problem.constraint_names == (
+def test_constraints_of_several_runs_are_named_by_run():
+    assert constrained(second_run=True).constraint_names == (
         "run1.guard of tau_1 (first -> second)",
         "run1.guard of tau_2 (second -> first)",
         "run1.terminal constraint 1",
         "run1.terminal constraint 2",
         "run2.guard of tau_1 (second -> first)",
     )
-    rng = np.random.default_rng(3)
-    multipliers = rng.standard_normal(5)
-    theta = problem.initial_theta
-    here = evaluator.constrained(theta, multipliers=multipliers)
-    value, slope, hessian = by_jax(evaluator, theta, multipliers)
-    assert here.cost + multipliers @ here.constraints == pytest.approx(float(value), rel=1e-13)
-    np.testing.assert_allclose(here.gradient + multipliers @ here.jacobian, slope, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(here.hessian, hessian, rtol=0, atol=1e-11)
-    plain = sf.evaluate(problem)
-    assert here.cost == pytest.approx(plain.cost, rel=1e-14)
-    np.testing.assert_allclose(here.gradient, plain.gradient, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(plain.constraints, here.constraints, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(plain.jacobian, here.jacobian, rtol=0, atol=1e-13)
 
 
 # --- what can go wrong ------------------------------------------------------------------------------------------------

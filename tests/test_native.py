@@ -68,23 +68,6 @@ def test_threads_do_not_disturb_one_another():
         np.testing.assert_array_equal(one.hessian, other.hessian)
 
 
-# Simulations, sensitivities, batches
-
-
-def test_simulations_are_those_of_jax():
-    problem = problem_of("resets")
-    by_jax = Evaluator(replace(problem, engine="jax"))
-    found, expected = (
-        each.simulate(problem.initial_theta, tangents=True)[0] for each in (evaluator_of(problem), by_jax)
-    )
-    assert found.cost == pytest.approx(expected.cost, rel=1e-11)
-    for column in ("nodes", "first_cell", "start", "end", "before", "after", "y_before", "y_after"):
-        one, other = getattr(found, column), getattr(expected, column)
-        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12, err_msg=column)
-    for one, other in zip((*found.seen, *found.tangents), (*expected.seen, *expected.tangents), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
-
-
 # The cache
 
 
@@ -140,15 +123,6 @@ SAMPLES = sf.Measurements(TIMES, np.stack([np.sin(TIMES), np.cos(TIMES)], 1), si
 def problem_with(mode, data=SAMPLES, **settings):
     run = sf.Experiment(data, ("m",), (), 0.0, 3.0)
     return sf.Problem(sf.HybridSystem({"m": mode}, [0.4, 0.1]), run, {"k": sf.Parameter(1.0)}, **settings)
-
-
-@pytest.mark.usefixtures("quick_certificates")
-def test_an_estimate_says_that_machine_code_evaluated_it(tmp_path):
-    estimate = sf.estimate(problem_with(decay), max_iterations=1)
-    assert (estimate.engine.name, estimate.engine.reason) == ("native", None)
-    assert "Evaluated in machine code." in str(estimate)
-    estimate.save(tmp_path / "fit.json")
-    assert sf.Estimate.load(tmp_path / "fit.json").engine == estimate.engine
 
 
 @pytest.mark.parametrize("mode", [copied, pytest.param(inner_copied, marks=pytest.mark.slow)])

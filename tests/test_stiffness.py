@@ -14,8 +14,8 @@ from derivatives import differentiate
 from test_implicit import SQUARE, robertson, van_der_pol
 
 import switchfit as sf
-from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.engine.protocol import runs_of
+from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.native.templates import Order
 from switchfit.engine.stiffness import Choice, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.command_line import describe_steps
@@ -146,7 +146,7 @@ def test_what_neither_can_integrate_is_refused():
 
 
 def test_the_look_at_eigenvalues_survives_a_model_that_is_undefined_beside_the_trajectory():
-    watch = Watch()
+    watch = Watch({}, ())
     watch.enter("m")
 
     def slopes(times, y):
@@ -160,7 +160,7 @@ def test_eigenvalues_are_those_of_the_vector_field():
     """Complex ones by their size, growing ones not at all, whatever the size of the states."""
     A = np.array([[-3.0, 400.0, 0.0], [-400.0, -3.0, 0.0], [0.0, 0.0, 5000.0]])
     for size in (1e-6, 1.0, 1e6):
-        watch = Watch()
+        watch = Watch({}, ())
         watch.enter("m")
         y = size * np.array([1.0, -2.0, 0.5, 0.0])
         watch.look(0.01, lambda t, y: np.pad(y[:, :3] @ A.T, [(0, 0), (0, 1)]), 0.0, y, 1e-2 * size)
@@ -180,6 +180,19 @@ def test_the_predicted_time_decides_on_the_engine_that_evaluates(mu):
     (stiffness,) = native.stiffness
     assert 2.5 * stiffness.implicit_steps < stiffness.explicit_steps < 6 * stiffness.implicit_steps
     assert by_jax.stiffness == ()
+
+
+def test_the_work_of_implicit_rows_grows_faster_with_states_that_depend_on_one_another():
+    def find_work(n, solver):
+        A = np.cos(np.arange(n * n).reshape(n, n)) - 3 * n * np.eye(n)
+        system = sf.HybridSystem({"m": lambda t, x, p: p["k"] * (jnp.asarray(A) @ x)}, [1.0] * n)
+        run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("m",), (), 0.0, 1.0)
+        evaluator = Evaluator(sf.Problem(system, run, {"k": 1.0}, solver=solver))
+        return evaluator.engines[0].at(Order.HESSIAN).row_work[0]
+
+    few, many = (find_work(n, "stiff") / find_work(n, "explicit") for n in (2, 10))
+    assert 3 < few < 6
+    assert many > 3 * few
 
 
 @pytest.mark.parametrize(("samples", "modes"), [(20, ["m"]), (20_000, [])])
@@ -321,9 +334,6 @@ def test_modes_that_are_stiff_at_one_of_several_thetas():
     assert [each.mode for each in mesh.stiffness] == ["m0"]
     for thetas in ((before, after), (after, before)):
         assert {each.mode for each in refine_mesh(problem, 0, *thetas).stiffness} == {"m0", "m1"}
-    found = refine_if_unstable(runs_of(problem)[0], mesh, before, after)
-    assert {each.mode for each in found.stiffness} == {"m0", "m1"}
-    assert refine_if_unstable(runs_of(problem)[0], found, before, after) is None
 
 
 # Where the choice goes
@@ -366,15 +376,6 @@ def test_a_mode_that_becomes_stiff_during_the_fit(sigma):
     assert len(fit.evaluator_at_solution().stiffness) == 1
     assert str(fit.engine) == "Evaluated in machine code, with implicit steps in 'm'."
     assert fit.integration_error < 1e-8
-
-
-@pytest.mark.parametrize(
-    ("guess", "there", "solver"), [(2.0, 3.0, "auto"), (100.0, 1e5, "explicit"), (100.0, 1e5, "stiff")]
-)
-def test_steps_stay_where_they_are_stable_or_insisted_on(guess, there, solver):
-    problem = fitted_to(there, guess, EARLY, solver=solver)
-    mesh = refine_mesh(problem, 0, problem.initial_theta)
-    assert refine_if_unstable(runs_of(problem)[0], mesh, problem.initial_theta, np.array([there])) is None
 
 
 def test_each_experiment_has_steps_of_its_own():

@@ -181,14 +181,7 @@ def tangent(
     return Tangent(_pad(tableau, X_d, X_d[-1]), _pad(tableau, K_d, K_d[-1]), after)
 
 
-def adjoint(
-    tableau: Tableau,
-    h: Array,
-    psi: Array,
-    pull: Pull,
-    ell_x: Sequence[Array],
-    factors: Factors,
-) -> Adjoint:
+def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull, ell_x: Sequence[Array], factors: Factors) -> Adjoint:
     """Pull the costate psi (n,) after a row back to its start.
 
     Parameters

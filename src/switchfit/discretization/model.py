@@ -218,9 +218,7 @@ class Model:
 
     def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
         """Return the reset map R_i(t, x, p) of transition i, which must have one."""
-        function = self.structure.reset_maps[i]
-        if function is None:
-            raise ValueError(f"transition {i + 1} has no reset map.")
+        function: Any = self.structure.reset_maps[i]
         return lambda t, x, p: function(t, x, self.parameters(p))
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:
@@ -258,14 +256,12 @@ AT_TRANSITIONS = "guards", "transition_costs"
 which have to be zero; the others are costs."""
 
 
-def get_transition_function(model: Model, kind: str, i: int, piece: Piece | None = None) -> NodeFunction | None:
-    """Return the scalar function of a kind at transition i (from 0); None if the transition has no such function.
+def get_transition_function(model: Model, kind: str, i: int, piece: Piece | None = None) -> NodeFunction:
+    """Return the scalar function of a kind at transition i (from 0), which must have one.
 
     One that takes an input gets the one of a `piece`; by default, of the cell that ends at the transition or holds it.
     """
     function = getattr(model.structure, kind)[i]
-    if function is None:
-        return None
     if not function.takes_input:
         return lambda t, x, p: function(t, x, model.parameters(p))
     return lambda t, x, p: function(t, x, model.parameters(p), *model.inputs(t, piece or model.find_piece(t)))
@@ -273,17 +269,5 @@ def get_transition_function(model: Model, kind: str, i: int, piece: Piece | None
 
 def list_transition_functions(model: Model, kind: str) -> list[tuple[int, NodeFunction]]:
     """Return the functions of a kind, each with its transition (from 0)."""
-    found = [(i, get_transition_function(model, kind, i)) for i in range(model.structure.N)]
-    return [(i, function) for i, function in found if function is not None]
-
-
-def get_end_cost(model: Model) -> NodeFunction | None:
-    """Return the sum of the terminal costs; None without any."""
-    return (lambda t, x, p: model.terminal(x, p)) if model.structure.terminal else None
-
-
-def get_end_constraints(model: Model) -> NodeFunction | None:
-    """Return all terminal constraints as one function, which returns (m,); None without any."""
-    if not model.structure.terminal_constraints:
-        return None
-    return lambda t, x, p: model.terminal_constraint(x, p)
+    there = [i for i in range(model.structure.N) if getattr(model.structure, kind)[i] is not None]
+    return [(i, get_transition_function(model, kind, i)) for i in there]

@@ -18,14 +18,7 @@ from jax import lax
 
 from switchfit.discretization import implicit_rows, rows
 from switchfit.discretization.mesh import Rows, Samples, build_rows, find_row_ending_cell
-from switchfit.discretization.model import (
-    Field,
-    Model,
-    Piece,
-    get_end_constraints,
-    get_end_cost,
-    list_transition_functions,
-)
+from switchfit.discretization.model import Field, Model, Piece, list_transition_functions
 from switchfit.discretization.rows import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau, combine
 
 Array = jax.Array
@@ -85,10 +78,6 @@ class Path(NamedTuple):
         """Return tau_i and x(tau_i-), before the reset map, of transition i (from 0): (), (n,)."""
         last = self.layout.first_row[i + 1] - 1
         return self.layout.end[last], self.after[last]
-
-    def at_end(self) -> tuple[Array, Array]:
-        """Return tf and x(tf): (), (n,)."""
-        return self.layout.end[-1], self.after[-1]
 
     def at_samples(self, cell: Array) -> Array:
         """Return the state at the ends of the given cells (K,), the one before a jump: (K, n)."""
@@ -171,8 +160,8 @@ def compute_path_constraints(model: Model, path: Path, p: Array) -> Array:
     parts = [
         constraint(*path.at_transition(i), p)[None] for i, constraint in list_transition_functions(model, "guards")
     ]
-    at_end = get_end_constraints(model)
-    parts += [] if at_end is None else [at_end(*path.at_end(), p)]
+    if model.structure.terminal_constraints:
+        parts.append(model.terminal_constraint(path.after[-1], p))
     return jnp.concatenate([jnp.zeros(0), *parts])
 
 
@@ -213,8 +202,7 @@ def add_point_costs(model: Model, path: Path, p: Array) -> Array:
     total = jnp.zeros(())
     for i, cost in list_transition_functions(model, "transition_costs"):
         total = total + cost(*path.at_transition(i), p)
-    final = get_end_cost(model)
-    return total if final is None else total + final(*path.at_end(), p)
+    return total + model.terminal(path.after[-1], p)
 
 
 def add_sample_costs(model: Model, path: Path, p: Array) -> Array:

@@ -43,7 +43,7 @@ from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
-from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
+from switchfit.engine.stiffness import STEPS_BETWEEN, Choice, TooManyStepsError, Watch
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.inspection import find_undefined
@@ -70,6 +70,7 @@ STEPS_AT_ONCE = 256
 
 STEPS_OF_BRANCH = 16
 """The same in a mode with corners: steps behind the end of a branch are lost."""
+
 
 ROWS_BY_JAX = {True: 20_000, False: 200_000}
 """Work of an explicit and of an implicit row in JAX, in additions of machine code: 5 and 50 us, for 2 to 4 states."""
@@ -124,17 +125,17 @@ def find_path(
     # was followed with the final library, and its steps are those that machine code will take.
     while True:
         known = branches.get_structure(run.structure) if branches.count else run.structure
-        solve, count = _Solve(run, known, coarse, settings, branches), branches.count
+        course, count = Course(branches, known, run.build_arguments(coarse), p), branches.count
         steps = None
         try:
-            steps = solve(tau, p)
+            steps = _Solve(run, known, coarse, settings, course)(tau, p)
         except SteepError:
             continue  # nothing is compiled yet with its margin
         except BranchError:
             pass
-        branches.add(run.structure, solve.path)
+        branches.add(run.structure, course.path)
         if steps is not None and branches.count == count:
-            return steps, solve.path
+            return steps, course.path
 
 
 class _NativeError(Exception):
@@ -159,7 +160,7 @@ class _Stretch(NamedTuple):
 
 
 class _NativeSteps:
-    """Adaptive steps in machine code through a stretch, in a mode of its own structure."""
+    """Adaptive steps in machine code through a stretch, in a mode of its own structure: up to `t` and `y` so far."""
 
     message = None  # of a failure: SciPy has it
 
@@ -172,41 +173,35 @@ class _NativeSteps:
         self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
         self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)
+        self.t, self.is_running = start, True
 
     def slope(self, t: float, y: FloatArray) -> FloatArray:
         """Return the slope at a time."""
-        return self._native.slope(self._mode, t, y, self._p)
+        return self.slopes(np.array([t]), y[None])[0]
 
     def slopes(self, times: FloatArray, y: FloatArray) -> FloatArray:
         """Return the slopes at times (L,) and y (L, n + 1); NaN where the model is not defined."""
         return self._native.slopes_in(self._mode, times, y, self._p)
 
-    @property
-    def t(self) -> float:
-        """The time so far."""
-        return float(self._state[Adaptive().t])
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it has neither come to the end nor failed."""
-        return self.t < self._end and not self._state[Adaptive().stuck]
-
     def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
         """Take up to `most` steps; return the accepted times (L,) and the states there (L, n)."""
-        return self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most)
+        found, at = self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most), Adaptive()
+        self.t = float(self._state[at.t])
+        self.is_running = self.t < self._end and not self._state[at.stuck]
+        return found
 
 
 class _PythonSteps:
-    """Adaptive steps of SciPy through a stretch, with slopes from Python."""
+    """Adaptive steps of SciPy through a stretch, with slopes from Python: up to `t` and `y` so far."""
 
     def __init__(self, slope: Slope, stretch: _Stretch, given: Tolerances) -> None:
         from scipy.integrate import RK45, Radau  # here, since importing it takes longer than most fits
 
         method, self._slope = RK45 if stretch.is_explicit else Radau, slope
         self.message: str | None = None
+        self.t, self.y, self.is_running = stretch.start, np.append(stretch.x, 0.0), True
         with np.errstate(all="ignore"):  # a slope of 1e300 is refused with a message
-            start = stretch.start, np.append(stretch.x, 0.0), stretch.end
-            self._solver = method(slope, *start, rtol=given.rtol, atol=given.atol)
+            self._solver = method(slope, self.t, self.y, stretch.end, rtol=given.rtol, atol=given.atol)
 
     def slopes(self, times: FloatArray, y: FloatArray) -> FloatArray:
         """Return the slopes at times (L,) and y (L, n + 1), outside of the solve too; NaN where the model is not
@@ -219,25 +214,11 @@ class _PythonSteps:
                     found[k] = self._slope(t, y[k])
         return found
 
-    @property
-    def t(self) -> float:
-        """The time so far."""
-        return float(self._solver.t)
-
-    @property
-    def y(self) -> FloatArray:
-        """The state and the running cost so far: (n + 1,)."""
-        return np.asarray(self._solver.y)
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it has neither come to the end nor failed."""
-        return bool(self._solver.status == "running")
-
     def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
         """Take a step; return the accepted time (1,) and the state there (1, n), none if it has failed."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused
             self.message = self._solver.step()
+        self.t, self.y, self.is_running = float(self._solver.t), self._solver.y, self._solver.status == "running"
         taken = slice(int(self.message is None))
         return np.array([self.t])[taken], self.y[None, :-1][taken]
 
@@ -248,45 +229,31 @@ class _Solve:
     Parameters
     ----------
     structure : Structure
-        Of the library whose machine code is used; if modes have corners, it is that of `branches`.
+        Of the library whose machine code is used; if modes have corners, it is that of the branches of the `course`.
     """
 
     def __init__(
-        self,
-        run: Run,
-        structure: Structure,
-        coarse: Mesh,
-        settings: Settings,
-        branches: Branches | None = None,
+        self, run: Run, structure: Structure, coarse: Mesh, settings: Settings, course: Course | None = None
     ) -> None:
-        self._problem, self._structure, self._coarse, self._branches = run.problem, run.structure, coarse, branches
+        self._problem, self._structure, self._coarse, self._course = run.problem, run.structure, coarse, course
         self._experiment, self._settings = run.experiment, settings
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
-        is_common = coarse is run.coarse
-        whole = run.coarse_arguments if is_common else run.build_arguments(coarse)
-        self._whole, self._arguments = whole, whole.without_mesh()
+        self._whole = whole = run.build_arguments(coarse)
+        self._arguments = whole.without_mesh()
         self._native: NativeExperiment | None = None
         # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
         chosen = take_implicit_steps(structure, settings.implicit)
-        if branches is None or branches.count:
-            known = run.solvers.__dict__ if is_common else {}
-            key = f"{'' if branches is None else branches.version} {chosen.implicit}"
+        if course is None or course.branches.count:
+            known = run.solvers.__dict__ if coarse is run.coarse else {}
+            key = f"{'' if course is None else course.branches.version} {chosen.implicit}"
             if key not in known:
                 made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
                 if made is None and chosen is not structure:
                     made = native_experiment(structure, whole, coarse.times, order=Order.COST)
                 known[key] = made
             self._native = known[key]
-        self._course: Course | None = None
         self._p = np.zeros(0)
-
-    @property
-    def path(self) -> Path:
-        """The branches of the trajectory, as far as it was solved."""
-        if self._course is None:
-            raise ValueError("modes without corners have one branch each")
-        return self._course.path
 
     def __call__(self, tau: FloatArray, p: FloatArray) -> FloatArray:
         """Return the accepted times from t0 to tf, strictly increasing."""
@@ -294,8 +261,6 @@ class _Solve:
         ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
         inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
         steps, x = [ends[:1]], self._find_initial_state()
-        if self._branches is not None:
-            self._course = Course(self._branches, structure, self._whole, p)
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 x = self._apply_reset(i - 1, ends[i], x)
@@ -407,7 +372,7 @@ class _Solve:
         course, natively = self._course, isinstance(steps, _NativeSteps)
         accepted, x = [stretch.start], stretch.x
         # Between two calls Python looks: for corners that the steps have passed, and for stiffness.
-        at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
+        at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, STEPS_BETWEEN if watch else STEPS_AT_ONCE)
         while steps.is_running:
             if len(accepted) > most_of_branch:
                 raise BranchError
@@ -594,27 +559,6 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     return runs[0].coarse.refine(kept, stiffness)
 
 
-def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
-    """Return a mesh that meets the tolerances at each theta, with implicit steps in the modes whose explicit ones are
-    unstable.
-
-    It is called after a fit on `mesh` has failed, at the last of the thetas. None if the problem sets the solver; if
-    all explicit steps are stable; or if implicit ones take longer.
-    """
-    if run.problem.solver != "auto":
-        return None
-    watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), Choice(mesh.stiffness)
-    with suppress(NotIntegrableError):
-        solve_adaptively(run, thetas[-1], Settings(choice.found, watch))
-    if not choice.add(watch.find_unstable(mesh), watch, 0):
-        return None
-    try:
-        found = _solve_at(run, thetas[::-1], choice)
-    except NotIntegrableError:
-        return None
-    return run.coarse.refine(*found) if choice.found.keys() - {each.mode for each in mesh.stiffness} else None
-
-
 def _solve_at(
     run: Run, thetas: Sequence[FloatArray], choice: Choice, most: int = MAX_STEPS
 ) -> tuple[list[FloatArray], tuple[Stiffness, ...]]:
@@ -634,7 +578,7 @@ def _solve_at(
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
         refused = failure is None and choice.count_steps(watch, k)
-        again = choice.add(watch.find_stiff(), watch, k) or refused
+        again = choice.add(watch, k) or refused
         if again or (failure is not None and choice.refuse(watch.current)):
             solutions = []  # again, with other steps in some mode
         elif failure is not None:

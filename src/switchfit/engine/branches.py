@@ -14,7 +14,7 @@ slides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -42,38 +42,32 @@ MOST_FOUND = 500
 """Largest number of steps in a branch without machine code; then it is compiled."""
 
 
-class NumpyFunction:
-    """A function of a mode's arguments as NumPy evaluates it, from the graph of its scalars; by JAX if it has none."""
-
-    def __init__(self, function: Function) -> None:
-        call = lambda *given: jax.core.eval_jaxpr(function.jaxpr, function.consts, *given)  # noqa: E731
-        self._template = self._call = None
-        with use_float64():
-            try:
-                self._template = trace_scalars(call, *(a.shape for a in function.structs))
-            except Unsupported:
-                axes = (0,) * (2 + function.takes_input) + (None,) * len(function.parameters)
-                self._call = jax.jit(jax.vmap(call, in_axes=axes))
-
-    def __call__(self, t: Any, x: FloatArray, given: Sequence[FloatArray], count: int) -> FloatArray:
-        """Return the values at times () or (L,) and states (n,) or (L, n), with the input and the parameters.
-
-        The input is the first of those `given` if the function `count`s one, (size,) or (L, size).
-        """
-        if self._template is not None:
-            moving = [np.asarray(a).T for a in given[:count]]
-            return self._template.evaluate([t], x.T, *moving, *(np.ravel(a) for a in given[count:]))[0]
-        times = np.atleast_1d(t)
-        moving = [np.reshape(a, (len(times), -1)) for a in given[:count]]
-        with use_float64():
-            found = np.asarray(self._call(times, np.atleast_2d(x), *moving, *given[count:])[0])  # type: ignore[misc]
-        return found if np.ndim(t) else found[0]
-
-
 @lru_cache(maxsize=1024)
-def trace_for_numpy(function: Function) -> NumpyFunction:
-    """Return a function as NumPy evaluates it, traced once."""
-    return NumpyFunction(function)
+def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
+    """Return a function of a mode's arguments as NumPy evaluates it, from the graph of its scalars; by JAX if it has
+    none.
+
+    It takes times () or (L,), what moves with them, states (n,) or (L, n) and maybe the input (size,) or (L, size), and
+    the parameters.
+    """
+    call = lambda *given: jax.core.eval_jaxpr(function.jaxpr, function.consts, *given)  # noqa: E731
+    shapes = [struct.shape for struct in function.structs]
+    with use_float64():
+        try:
+            template = trace_scalars(call, *shapes)
+        except Unsupported:
+            compiled = jax.jit(call)
+        else:
+            return lambda t, moving, p: template.evaluate([t], *(a.T for a in moving), *map(np.ravel, p))[0]
+
+    def evaluate(t: Any, moving: Sequence[FloatArray], p: Sequence[FloatArray]) -> FloatArray:
+        """Evaluate by JAX, point by point: it would compile a program for each number of points."""
+        if np.ndim(t):
+            return np.array([evaluate(at, inputs, p) for at, *inputs in zip(t, *moving, strict=True)])
+        with use_float64():
+            return np.asarray(compiled(*map(np.reshape, (t, *moving, *p), shapes))[0])
+
+    return evaluate
 
 
 @dataclass(frozen=True)
@@ -163,21 +157,18 @@ class Branches:
             path = Path((known[0][1:],) * (structure.N + 1), ((),) * (structure.N + 1), np.zeros(0))
             structure = replace(structure, mode_of_segment=(known[0][0],) * (structure.N + 1))
         modes: list[int] = []
-        at: dict[str, list[Any]] = {name: [] for name in ("reset_maps", "guards", "transition_costs")}
+        found: list[tuple[Any, Any, Any]] = []  # guard, reset map and cost of each transition
         jumps = []
         for i, (mode, sides, ends) in enumerate(zip(structure.mode_of_segment, path.sides, path.ends, strict=True)):
             modes += [known.index((mode, each)) for each in sides]
             # A crossing is a transition between two branches of one mode: a guard if the state decides when, no reset
             # map, no cost.
-            for each, end in zip(sides, ends, strict=False):
-                at["guards"].append(None if end < 0 else self.corners[mode].end(each, end))
-                at["reset_maps"].append(None)
-                at["transition_costs"].append(None)
+            pairs = zip(sides, ends, strict=False)
+            found += [(None if end < 0 else self.corners[mode].end(each, end), None, None) for each, end in pairs]
             if i < structure.N:
                 # Transitions behind crossings have other numbers than in the experiment.
-                jumps += [len(at["guards"])] if i in structure.jumps else []
-                for name, functions in at.items():
-                    functions.append(getattr(structure, name)[i])
+                jumps += [len(found)] if i in structure.jumps else []
+                found.append((structure.guards[i], structure.reset_maps[i], structure.transition_costs[i]))
         guards = dict.fromkeys((*structure.guard_library, *self._guards))
         return replace(
             structure,
@@ -188,9 +179,9 @@ class Branches:
             jumps=tuple(jumps),
             transitions=structure.transitions + self._room,
             guard_library=tuple(guards),
-            reset_maps=tuple(at["reset_maps"]),
-            guards=tuple(at["guards"]),
-            transition_costs=tuple(at["transition_costs"]),
+            guards=tuple(guard for guard, _, _ in found),
+            reset_maps=tuple(reset_map for _, reset_map, _ in found),
+            transition_costs=tuple(cost for _, _, cost in found),
             has_rough_hessian=structure.has_only_residuals and any(corners.margins for corners in self.corners),
         )
 
@@ -295,15 +286,15 @@ class Course:
         """Evaluate a function of the mode at times () or (L,); an input is that of the cells that `inside`, () or (L,),
         is in.
         """
-        given = [self._named[name] for name in function.parameters]
+        moving, shape = [x], np.shape(t) + function.shape
         if function.takes_input:
             cells = np.clip(self._nodes.searchsorted(inside, "right") - 1, 0, len(self._signals) - 1)
             size = int(np.prod(self._structure.input_shape or ()))
             s, u = np.expand_dims(np.subtract(t, self._nodes[cells]), -1), np.zeros(size)
             for power in reversed(range(self._signals.shape[1])):
                 u = u * s + self._signals[cells, power, self._signals.shape[-1] - size :]
-            given = [u, *given]
-        found, shape = trace_for_numpy(function)(t, x, given, function.takes_input), np.shape(t) + function.shape
+            moving.append(u)
+        found = trace_for_numpy(function)(t, moving, [self._named[name] for name in function.parameters])
         return found if found.shape == shape else np.broadcast_to(found, shape)  # it may be constant
 
     def enter(self, mode: int, t: float, x: FloatArray, inside: float) -> None:
@@ -387,18 +378,18 @@ class Course:
         with np.errstate(all="ignore"):
             return bool(np.isfinite(self.evaluate(self.corners.beyond(sides, k), t, x, inside)).all())
 
-    def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
+    def evaluate_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
         return self.evaluate(self.branches.corners[mode].ends(sides), t, x, np.nextafter(t, -np.inf))
 
-    def slides(self, mode: int, sides: Sides) -> NDArray[np.bool_]:
-        """Return which ends of a branch are those of sliding."""
-        return np.array([sides[k] == 0 for k, _ in self.branches.corners[mode].list_ends(sides)])
+    def list_ends(self, mode: int, sides: Sides) -> tuple[list[int], NDArray[np.bool_]]:
+        """Return the corners of the ends of a branch, and which of them it slides along."""
+        of_end = [k for k, _ in self.branches.corners[mode].list_ends(sides)]
+        return of_end, np.array([sides[k] == 0 for k in of_end])
 
     def look(self, times: FloatArray, states: FloatArray) -> Crossing | None:
         """Return where steps between states (L + 1, n) at times (L + 1,) leave the branch; None if they do not."""
-        ends = self.corners.list_ends(self.sides)
-        if not ends or len(times) < 2:
+        if not self.sides or len(times) < 2:
             return None
         function, inside = self.corners.ends(self.sides), 0.5 * float(times[0] + times[-1])
         self._largest = np.maximum(self._largest, np.abs(states).max(axis=0))
@@ -407,7 +398,7 @@ class Course:
         known = len(self._last)
         values = np.concatenate([self._last, self.evaluate(function, times[1:], states[1:], inside)])
         dips, values = np.asarray(find_dips(values))[known - 1 :], values[known - 1 :]
-        of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
+        of_end, slides = self.list_ends(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
         steep = np.array([self._is_steep(k) for k in of_end])
@@ -505,13 +496,9 @@ class Course:
         # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
         # way. Both point to the corner: it slides (Filippov).
         still = STILL * max(abs(up), abs(down))
-        rises, falls = up > still, down < -still
-        if rises and falls:
-            return sides[k] or 1
-        if rises or falls:
-            return 1 if rises else -1
-        if abs(up) <= still or abs(down) <= still:
-            return (sides[k] or 1) if abs(up) <= still and abs(down) <= still else (1 if abs(up) <= still else -1)
+        for is_up, is_down in ((up > still, down < -still), (abs(up) <= still, abs(down) <= still)):
+            if is_up or is_down:
+                return (sides[k] or 1) if is_up and is_down else 1 if is_up else -1
         if sum(side == 0 for side in (*sides[:k], *sides[k + 1 :])) == MOST_SLIDING:
             raise NotIntegrableError(
                 f"mode {self._structure.mode_names[self._mode]!r} slides along more than {MOST_SLIDING} corners of the "

@@ -17,6 +17,7 @@ The path is that of the last evaluation, and is looked for anew where it does no
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -33,7 +34,7 @@ from switchfit.engine.native.experiment import reason_for_jax
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.native.hypothesis_loops import hypotheses_program
 from switchfit.engine.native.templates import Sizes
-from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Run, Simulation, Tangents
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Run, Simulation, Tangents
 from switchfit.problem.corners import Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -55,6 +56,10 @@ REQUIRED = "engine='native' requires machine code, but {}. Leave engine out to e
 Build = Callable[[Structure], NativeEngine | JaxEngine]
 
 
+OWN = -2
+"""A transition of the experiment, in the place of the end of a branch that a crossing is."""
+
+
 class _Split(NamedTuple):
     """The engine of one path, and where its unknowns and constraints are among those of the engine.
 
@@ -66,7 +71,7 @@ class _Split(NamedTuple):
     engine : NativeEngine or JaxEngine
     own : (N,), the transitions of the experiment
     crossings : (K,), those of the path
-    guarded : (K',), those of the crossings that have a guard, by their place in `crossings`
+    guarded : (K',), those of the crossings that have a guard
     own_constraints, guards : the rows of constraints of the experiment, and of the guarded crossings
     """
 
@@ -84,12 +89,6 @@ class _Split(NamedTuple):
     def has_gauss_newton(self) -> bool:
         """Whether the engine has the Gauss-Newton matrix in place of second derivatives."""
         return self.structure.has_rough_hessian and isinstance(self.engine, NativeEngine)
-
-    def join(self, tau: FloatArray, times: FloatArray) -> FloatArray:
-        """Return the times of all transitions: (N + K,)."""
-        every = np.zeros(len(self.own) + len(self.crossings))
-        every[self.own], every[self.crossings] = tau, times
-        return every
 
 
 class SplitEngine:
@@ -114,15 +113,14 @@ class SplitEngine:
         self._run, self._branches, self._structure = run, branches, structure
         self._arguments, self._mesh, self._build = arguments, mesh, build
         self._split: _Split | None = None
-        self._times: FloatArray = np.zeros(0)
+        self._times: FloatArray = np.zeros(0)  # of all transitions of the path: (N + K,)
         self._judges_rows = False
 
     @property
     def engine(self) -> Engine:
         """The engine of the path; at the guess, where none is known."""
         at_guess = self._run.vectors(self._run.problem.initial_theta)
-        split = self._split or self._recall_path() or self._find_path(*at_guess)
-        return split.engine.engine
+        return (self._split or self._recall_path() or self._find_path(*at_guess)).engine.engine
 
     def judge_rows(self) -> None:
         """Estimate the errors of rows in all evaluations from now on."""
@@ -148,44 +146,44 @@ class SplitEngine:
         method: Callable[[Structure, FloatArray], Evaluation[FloatArray]] | None = None,
     ) -> Evaluation[FloatArray]:
         """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
-        split, found, times = self._solve(tau, p, side)
+        split, found = self._solve(tau, p, side)
         if split is None:
             return found
-        every = split.join(tau, times)
+        at = self._times, p, side
         if split.has_gauss_newton and matrix == "exact":  # asked for all the same
-            split = self._derive_twice(split)
-            found = split.engine.constrained(every, p, side, np.zeros(len(found.constraints)))
+            structure = replace(split.structure, has_rough_hessian=False)
+            split = split._replace(structure=structure, engine=self._build_engine(structure))
+            found = split.engine.constrained(*at, np.zeros(len(found.constraints)))
         own, (T, multipliers) = found, self._eliminate(split, found)
         if method is not None:
-            own = method(split.structure, every)
+            own = method(split.structure, self._times)
         elif matrix == "none" or (matrix == "gauss-newton" and not split.has_gauss_newton):
-            own = split.engine.derivatives(every, p, side, matrix)
+            own = split.engine.derivatives(*at, matrix)
         # T' D^2 (J + lam . g) T: the second derivatives of sigma(theta) enter by lam alone. `own` may be another matrix
         # of J; then lam . g is what the Hessian of the Lagrangian has beside that of J. Gauss-Newton is T' G T.
         second = own.hessian
         if matrix == "exact" and len(split.guards):
-            second = second + split.engine.constrained(every, p, side, multipliers).hessian - found.hessian
+            second = second + split.engine.constrained(*at, multipliers).hessian - found.hessian
         return Evaluation(own.cost, own.gradient @ T, T.T @ second @ T, row_errors=found.row_errors)
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
-        split, found, times = self._solve(tau, p, side)
+        split, found = self._solve(tau, p, side, len(multipliers))
         if split is None:
-            return _refuse(tau, p, len(multipliers), found.row_errors)
+            return found
         T, every_multiplier = self._eliminate(split, found, multipliers)
-        second = split.engine.constrained(split.join(tau, times), p, side, every_multiplier).hessian
+        second = split.engine.constrained(self._times, p, side, every_multiplier).hessian
         c, A = found.constraints[split.own_constraints], found.jacobian[split.own_constraints] @ T
         return Evaluation(found.cost, found.gradient @ T, T.T @ second @ T, c, A, found.row_errors)
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
-        split, found, times = self._solve(tau, p, 1.0)
+        split, found = self._solve(tau, p, 1.0)
         if split is None:
             raise NotIntegrableError(LOST)
-        _, every_multiplier = self._eliminate(split, found, multipliers)
-        inner = split.engine.costates(split.join(tau, times), p, every_multiplier)
+        inner = split.engine.costates(self._times, p, self._eliminate(split, found, multipliers)[1])
         modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
         return inner._replace(modes=modes)
 
@@ -194,20 +192,20 @@ class SplitEngine:
         return self._plain.slopes(times, cells, states, p)
 
     @cached_property
-    def _plain(self) -> ExperimentEngine:
+    def _plain(self) -> NativeEngine | JaxEngine:
         return self._build(self._structure)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`; crossings are nodes of the simulation."""
-        split, found, times = self._solve(tau, p, 1.0)
-        if split is None:
-            split, times = self._split, self._times
+        split, found = self._solve(tau, p, 1.0)
+        split = split or (None if tangents else self._split)
         if split is None:
             raise NotIntegrableError(LOST)
-        inner = split.engine.simulate(split.join(tau, times), p, tangents=tangents)
-        begins = [0, *(1 + k for k in split.own.tolist())][: len(self._structure.mode_of_segment)]
-        own = inner.first_row[[k for k in begins if k < len(inner.first_cell)]]  # without the rest after a free tf
-        nodes = np.sort(np.concatenate([inner.nodes, times]))
+        times = self._move_own(split, tau)
+        inner = split.engine.simulate(times, p, tangents=tangents)
+        begins = np.append(0, 1 + split.own)[: len(self._structure.mode_of_segment)]
+        own = inner.first_row[begins[begins < len(inner.first_cell)]]  # without the rest after a free tf
+        nodes = np.sort(np.concatenate([inner.nodes, times[split.crossings]]))
         simulation = replace(inner, nodes=nodes, first_cell=own - np.arange(len(own)))
         if inner.tangents is None:
             return simulation
@@ -216,56 +214,45 @@ class SplitEngine:
         return replace(simulation, tangents=Tangents(*(values @ T for values in inner.tangents)))
 
     def _eliminate(
-        self, split: _Split, found: Evaluation[FloatArray], multipliers: FloatArray | None = None
+        self, split: _Split, found: Evaluation[FloatArray], multipliers: FloatArray | float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
         """Return T (N + K + M, N + M), and the multipliers of all constraints, those of the experiment given."""
-        own, A, rows, times = len(split.own), found.jacobian, split.guards, split.crossings[split.guarded]
-        D = len(found.gradient)
+        A, rows, times, D = found.jacobian, split.guards, split.guarded, len(found.gradient)
         # theta = (tau, p), in the order of all unknowns (tau and sigma merged, then p).
-        others = np.concatenate([split.own, np.arange(own + len(split.crossings), D)])
-        T, every, slope = np.zeros((D, len(others))), np.zeros(len(found.constraints)), found.gradient
-        T[others, np.arange(len(others))] = 1.0
-        if multipliers is not None:
-            every[split.own_constraints] = multipliers
-            slope = slope + every @ A
-        if len(rows):
-            # g_sigma is lower triangular in exact arithmetic, a guard depending on the crossings before it; S =
-            # -g_sigma^-1 g_theta.
-            square = A[rows[:, None], times]
-            T[times] = -np.linalg.solve(square, A[rows[:, None], others])
-            every[rows] = -np.linalg.solve(square.T, slope[times])
+        others = np.delete(np.arange(D), split.crossings)
+        T, every = np.eye(D)[:, others], np.zeros(len(found.constraints))
+        every[split.own_constraints] = multipliers
+        slope = found.gradient + every @ A
+        # g_sigma is lower triangular in exact arithmetic, a guard depending on the crossings before it; S =
+        # -g_sigma^-1 g_theta.
+        square = A[rows[:, None], times]
+        T[times] = -np.linalg.solve(square, A[rows[:, None], others])
+        every[rows] = -np.linalg.solve(square.T, slope[times])
         return T, every
 
     def _solve(
-        self, tau: FloatArray, p: FloatArray, side: float
-    ) -> tuple[_Split | None, Evaluation[FloatArray], FloatArray]:
-        """Return the path at a theta, J and the constraints with their derivatives there, and the crossings' times.
+        self, tau: FloatArray, p: FloatArray, side: float, m: int = 0
+    ) -> tuple[_Split | None, Evaluation[FloatArray]]:
+        """Return the path at a theta, and J and the constraints with their derivatives there, and keep its times.
 
-        If the trajectory cannot be followed, J is NaN and there is no path.
+        If the trajectory cannot be followed, J and m constraints are NaN and there is no path.
         """
         # First the path of the last theta, by Newton from its times: near the solution it holds, and no adaptive solve
         # is needed.
         last = self._split or self._recall_path()
         if last is not None:
-            found = self._locate(last, self._times, tau, p, side)
-            if found is not None and self._holds(last, found[1], tau, p):
-                self._times = found[1]
-                return last, *found
-        try:
+            found, times = self._locate(last, tau, p, side)
+            if found is not None and self._holds(last, times, p):
+                self._times = times
+                return last, found
+        with suppress(NotIntegrableError):
             split = self._find_path(tau, p)
-        except NotIntegrableError:
-            split = None
-        found = None if split is None else self._locate(split, split.path.times, tau, p, side)
-        if split is None or found is None:
-            # Another mesh may do.
-            return None, _refuse(tau, p, 0, (np.inf,) if self._judges_rows else ()), np.zeros(0)
-        self._times = found[1]
-        return split, *found
-
-    def _derive_twice(self, split: _Split) -> _Split:
-        """Return a path with an engine of second derivatives, where the Gauss-Newton matrix stands for them."""
-        structure = replace(split.structure, has_rough_hessian=False)
-        return split._replace(structure=structure, engine=self._build_engine(structure))
+            found, times = self._locate(split, tau, p, side)
+            if found is not None:
+                self._times = times
+                return split, found
+        D, row_errors = len(tau) + len(p), (np.inf,) if self._judges_rows else ()  # another mesh may do
+        return None, _refuse(D, m, row_errors)
 
     def _build_engine(self, structure: Structure) -> NativeEngine | JaxEngine:
         engine = self._build(structure)
@@ -278,115 +265,106 @@ class SplitEngine:
         path = self._run.path
         if path is not None:
             self._branches.add(self._structure, path)
-            self._split, self._times = self._build_split(path), path.times
+            self._take(path)
         return self._split
 
     def _find_path(self, tau: FloatArray, p: FloatArray) -> _Split:
         """Look for the path at a theta, and keep it."""
         settings = Settings(implicit=[each.mode for each in self._mesh.stiffness])
-        path = find_path(self._run, self._branches, tau, p, self._mesh, settings)[1]
-        split = self._split
-        is_same = split is not None and (path.sides, path.ends) == (split.path.sides, split.path.ends)
-        if split is None or not is_same or split.corners != self._branches.corners:
-            split = self._build_split(path)
-        self._split = split._replace(path=path)
-        self._run.path, self._times = path, path.times
-        return self._split
+        self._run.path = find_path(self._run, self._branches, tau, p, self._mesh, settings)[1]
+        return self._take(self._run.path)
 
-    def _build_split(self, path: Path) -> _Split:
-        structure = self._branches.get_structure(self._structure, path)
-        own: list[int] = []
-        crossings: list[int] = []
-        guarded: list[int] = []
-        # Transitions in the order of time: the crossings of segment i, then its own transition i.
-        for i, ends in enumerate(path.ends):
-            for end in ends:
-                guarded += [len(crossings)] if end >= 0 else []
-                crossings.append(len(own) + len(crossings))
-            if i < self._structure.N:
-                own.append(len(own) + len(crossings))
-        times = [crossings[k] for k in guarded]
-        guards = [structure.guarded.index(i) for i in times]
-        count = len(structure.guarded) + structure.terminal_constraint_count
-        rest = [k for k in range(count) if k not in guards]
-        places = (np.array(each, dtype=np.intp) for each in (own, crossings, guarded, rest, guards))
-        return _Split(path, self._branches.corners.copy(), structure, self._build_engine(structure), *places)
+    def _take(self, path: Path) -> _Split:
+        """Keep a path with the times of its crossings."""
+        split, corners = self._split, self._branches.corners
+        known = None if split is None else (split.path.sides, split.path.ends, split.corners)
+        if split is None or known != (path.sides, path.ends, corners):
+            structure = self._branches.get_structure(self._structure, path)
+            # Transitions in the order of time: the crossings of segment i, then its own transition i.
+            kinds = np.concatenate([[*ends, OWN] for ends in path.ends])[:-1]
+            own, crossings, guarded = (np.flatnonzero(is_one) for is_one in (kinds == OWN, kinds != OWN, kinds >= 0))
+            guards = np.array([structure.guarded.index(i) for i in guarded], dtype=np.intp)
+            every = np.arange(len(structure.guarded) + structure.terminal_constraint_count)
+            places = own, crossings, guarded, np.delete(every, guards), guards
+            split = _Split(path, corners.copy(), structure, self._build_engine(structure), *places)
+        self._split, self._times = split, np.zeros(len(split.own) + len(split.crossings))
+        self._times[split.crossings] = path.times
+        return split
+
+    def _move_own(self, split: _Split, tau: FloatArray) -> FloatArray:
+        """Return the times of all transitions of a path, the experiment's being tau: (N + K,)."""
+        times = self._times.copy()
+        times[split.own] = tau
+        return times
 
     def _locate(
-        self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray, side: float
-    ) -> tuple[Evaluation[FloatArray], FloatArray] | None:
-        """Find the times of the crossings by Newton's method from a guess; None if they cannot be found."""
-        horizon = self._mesh.times[-1] - self._mesh.times[0]
-        times, m = times.copy(), len(split.guards) + len(split.own_constraints)
-        columns = split.crossings[split.guarded]
-
-        def evaluate(times: FloatArray) -> Evaluation[FloatArray]:
-            return split.engine.constrained(split.join(tau, times), p, side, np.zeros(m))
-
+        self, split: _Split, tau: FloatArray, p: FloatArray, side: float
+    ) -> tuple[Evaluation[FloatArray] | None, FloatArray]:
+        """Find the times of the crossings by Newton's method from the last ones; the evaluation is None if there are
+        none.
+        """
+        ends, times = self._mesh.times[[0, -1]], self._move_own(split, tau)
+        no_multipliers = np.zeros(len(split.guards) + len(split.own_constraints))
         for _ in range(NEWTON_ITERATIONS):
             # A Newton step that changes the order of transitions leaves what the structure can say: the path is found
             # anew.
-            ordered = np.concatenate([self._mesh.times[:1], split.join(tau, times), self._mesh.times[-1:]])
-            if not (np.diff(ordered) >= 0.0).all():
-                return None
-            found = evaluate(times)
-            if not len(columns):
-                return (found, times) if np.isfinite(found.cost) else None
+            if not (np.diff([ends[0], *times, ends[1]]) >= 0.0).all():
+                break
+            found = split.engine.constrained(times, p, side, no_multipliers)
             # J may be no number yet: sqrt(x) of the branch behind a crossing that is a little too early. What ends the
             # branch before it, and its derivatives, are numbers all the same.
             try:
                 # sigma -= g_sigma^-1 g, all other unknowns being fixed.
-                step = np.linalg.solve(found.jacobian[np.ix_(split.guards, columns)], found.constraints[split.guards])
+                square = found.jacobian[np.ix_(split.guards, split.guarded)]
+                step = np.linalg.solve(square, found.constraints[split.guards])
             except np.linalg.LinAlgError:
-                return None
-            if not np.isfinite(step).all():
-                return None
-            size = np.abs(step).max()
-            if size > CONVERGED * horizon:
+                break
+            size = np.abs(step).max(initial=0.0) / (ends[1] - ends[0])
+            if not np.isfinite(size):
+                break
+            if size > CONVERGED:
                 times[split.guarded] -= step
-            if size <= CLOSE * horizon:  # the next step is of the size of rounding
-                found = found if size <= CONVERGED * horizon else evaluate(times)
-                return (found, times) if np.isfinite(found.cost) else None
-        return None
+            if size <= CLOSE:  # the next step is of the size of rounding
+                if size > CONVERGED:
+                    found = split.engine.constrained(times, p, side, no_multipliers)
+                return (found if np.isfinite(found.cost) else None), times
+        return None, times
 
-    def _holds(self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray) -> bool:
+    def _holds(self, split: _Split, times: FloatArray, p: FloatArray) -> bool:
         """Return whether the trajectory is inside its branches at the ends of all rows, and in dips between them."""
-        found = split.engine.trace(split.join(tau, times), p)
-        ends, states = found.end, found.after
+        found = split.engine.trace(times, p)
         course = Course(self._branches, self._structure, self._arguments, p)
         # All rows of one branch together: one call evaluates the functions of its ends for all of them.
         pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)
-        branches = [(mode, sides) for mode, every in pairs for sides in every]
-        in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
-        for branch, part in zip(branches, found.segments, strict=False):
-            in_branch.setdefault(branch, []).append(np.arange(part.start, part.stop))
-        corners = self._branches.corners
-        rows = {branch: np.concatenate(parts) for branch, parts in in_branch.items() if corners[branch[0]].count}
-        rows = {branch: here for branch, here in rows.items() if len(here)}
-        every = {branch: course.list_ends(*branch, ends[here], states[here]) for branch, here in rows.items()}
+        rows: dict[tuple[int, Sides], list[int]] = {}
+        for branch, part in zip([(k, sides) for k, every in pairs for sides in every], found.segments, strict=False):
+            rows.setdefault(branch, []).extend(range(part.start, part.stop))
         # g relative to its largest value in this mode, where it may rest at zero; s of a sliding corner to its range.
-        scales = {mode: np.zeros(corners[mode].count) for mode, _ in rows}
-        for (mode, sides), values in every.items():
-            of_end, slides = [k for k, _ in corners[mode].list_ends(sides)], course.slides(mode, sides)
-            np.maximum.at(scales[mode], of_end, np.where(slides, 0.0, np.abs(values).max(axis=0)))
-        for (mode, sides), values in every.items():
-            of_end, slides = [k for k, _ in corners[mode].list_ends(sides)], course.slides(mode, sides)
-            here, largest = rows[mode, sides], np.where(slides, 1.0, scales[mode][of_end])
-            if (values < -MAY_END * largest).any():
+        scales = {mode: np.zeros(self._branches.corners[mode].count) for mode, _ in rows}
+        seen = []
+        for (mode, sides), here in rows.items():
+            if here and sides:
+                of_end, slides = course.list_ends(mode, sides)
+                values = course.evaluate_ends(mode, sides, found.end[here], found.after[here])
+                np.maximum.at(scales[mode], of_end, np.where(slides, 0.0, np.abs(values).max(axis=0)))
+                seen.append((mode, sides, np.array(here), values))
+        for mode, sides, here, values in seen:
+            of_end, slides = course.list_ends(mode, sides)
+            least = MAY_END * np.where(slides, 1.0, scales[mode][of_end])
+            if (values < -least).any():
                 return False
             # Between two rows, in a branch that goes on at both sides of them.
-            moves = np.abs(np.diff(values, axis=0)) > MAY_END * largest
+            moves = np.abs(np.diff(values, axis=0)) > least
             dips = (find_dips(values)[1:-1] & (moves[:-2] | moves[2:])).any(axis=1) & (here[3:] - here[:-3] == 3)
             for row in np.flatnonzero(dips).tolist():
                 step = here[row + 1 : row + 3]
-                if course.leaves(mode, sides, ends[step], states[step], -MAY_END * largest):
+                if course.leaves(mode, sides, found.end[step], found.after[step], -least):
                     return False
         return True
 
 
-def _refuse(tau: FloatArray, p: FloatArray, m: int, row_errors: tuple[float, ...] = ()) -> Evaluation[FloatArray]:
-    """Return an evaluation without numbers, with m constraints."""
-    D = len(tau) + len(p)
+def _refuse(D: int, m: int, row_errors: tuple[float, ...] = ()) -> Evaluation[FloatArray]:
+    """Return an evaluation without numbers, of D unknowns and with m constraints."""
     gradient, hessian, c, A = (np.full(shape, np.nan) for shape in (D, (D, D), m, (m, D)))
     return Evaluation(np.nan, gradient, hessian, c, A, row_errors)
 
@@ -401,7 +379,11 @@ class _PathFallback(JaxEngine):
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return an evaluation without numbers."""
-        return _refuse(tau, p, len(multipliers))
+        return _refuse(len(tau) + len(p), len(multipliers))
+
+
+ExperimentEngine = NativeEngine | JaxEngine | SplitEngine
+"""One experiment on one mesh, as functions of its transition times tau (N,) and its parameters p (M,)."""
 
 
 def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
@@ -413,7 +395,6 @@ def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
     base = run.get_structure(mesh)
-
     build = partial(_engine_on, run, base, arguments, mesh)
     return build(base) if run.branches is None else SplitEngine(run, run.branches, base, arguments, mesh, build)
 

@@ -279,11 +279,7 @@ def simulate_rows(
 
 @partial(jax.jit, static_argnames=("structure", "function", "which"))
 def call_model(
-    arguments: Arguments,
-    *given: Any,
-    structure: Structure,
-    function: Callable[..., Array],
-    which: tuple[int, ...] = (),
+    arguments: Arguments, *given: Any, structure: Structure, function: Callable[..., Array], which: tuple[int, ...] = ()
 ) -> Array:
     """Return ``function(model, *which, *given)``, compiled."""
     return function(Model(structure, arguments), *which, *given)

@@ -1,4 +1,4 @@
-"""Interface of an engine for one experiment on one mesh. Code outside `engine` does not depend on which one it is.
+"""What the engines take and return for one experiment on one mesh. Code outside `engine` does not depend on which.
 
 An experiment of a problem, prepared once: what all its meshes, adaptive solves and engines share.
 """
@@ -10,7 +10,7 @@ from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,45 +249,6 @@ def cut_at_tf(simulation: Simulation, structure: Structure) -> Simulation:
     return replace(simulation, first_cell=simulation.first_cell[:-1], **cut)
 
 
-class ExperimentEngine(Protocol):
-    """One experiment on one mesh, as functions of its transition times tau (N,) and its parameters p (M,)."""
-
-    @property
-    def engine(self) -> Engine:
-        """Name of the engine, and why it was chosen."""
-        ...
-
-    def judge_rows(self) -> None:
-        """Estimate the errors of rows in all evaluations with second derivatives from now on, if the engine can."""
-        ...
-
-    def cost(self, tau: FloatArray, p: FloatArray) -> float:
-        """Return J alone."""
-        ...
-
-    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
-        """Return J and its derivatives; if a transition is at a node, those on its `side`, +1 or -1."""
-        ...
-
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
-    ) -> Evaluation[FloatArray]:
-        """Return J and the constraints, with the Hessian of ``J + multipliers . c``; the multipliers are (m,)."""
-        ...
-
-    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
-        """Return the costates of ``J + multipliers . c`` at the starts of all rows; the multipliers are (m,)."""
-        ...
-
-    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
-        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
-        ...
-
-    def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
-        """Return all rows, with their derivatives if `tangents`."""
-        ...
-
-
 class Hypotheses(NamedTuple):
     """Hypotheses on the mode sequence of one experiment, at one time; D = births at most + M unknowns.
 
@@ -395,18 +356,19 @@ class Run:
         """The nodes that every mesh of the experiment has."""
         return Mesh.of(self.experiment)
 
-    @cached_property
-    def coarse_arguments(self) -> Arguments:
-        """The arrays that its programs take on these nodes."""
-        return self.build_arguments(self.coarse)
-
     def vectors(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what its programs take at theta (d,): its times (N,) and its p (M,)."""
         return self.problem.vectors(theta, self.e)
 
     def build_arguments(self, mesh: Mesh) -> Arguments:
-        """Return the arrays that its programs take on a mesh."""
+        """Return the arrays that its programs take on a mesh; those on the coarse one are kept."""
+        if mesh is self.coarse:
+            return self._coarse_arguments
         return put_on_mesh(self._common, self.experiment, mesh)
+
+    @cached_property
+    def _coarse_arguments(self) -> Arguments:
+        return put_on_mesh(self._common, self.experiment, self.coarse)
 
     @cached_property
     def _common(self) -> Arguments:

@@ -20,6 +20,7 @@ changes the sequence inside one experiment of machine code instead.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -146,7 +147,7 @@ class SharedEngine(NativeEngine):
         """Return the experiment with derivatives of an order, set to this sequence."""
         found = super().at(order)
         if found is not None and found.structure is not self._structure:
-            found.assign_sequence(self._structure)
+            found.assign_sequence(self._structure, places_in_library(self._structure))
         return found
 
 
@@ -182,8 +183,8 @@ class ScheduleCosts:
 
     def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
         self.problem, self._evaluator = problem, evaluator
-        self._rows: dict[tuple[int, tuple[str, ...]], NDArray[np.int64]] = {}
         self._pairs: dict[tuple[int, tuple[str, str]], tuple[Function | None, ...]] = {}
+        self._sequences: dict[tuple[int, tuple[str, ...]], tuple[Structure, dict[str, NDArray[np.int64]]]] = {}
         self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
         times = sum(len(run.transition_times) for run in problem.experiments)
         counts = [len(run.times) + len(run.jump_times) for run in problem.experiments]
@@ -240,29 +241,22 @@ class ScheduleCosts:
     def _simulate(self, e: int, schedules: Sequence[Schedule], parameters: FloatArray) -> FloatArray:
         """Return what an experiment adds to J with each of some schedules; NaN where machine code cannot say: (B,)."""
         native, p = self._native[e], parameters[self._places[e]]
-        if native is None or not schedules:
-            return np.full(len(schedules), np.nan)
-        times = np.full((len(schedules), native.sizes.N), native.times[-1])
-        for row, schedule in zip(times, schedules, strict=True):
-            row[: schedule.switches] = schedule.times
-        found = native.costs(np.array([self._list_places(e, each.sequence) for each in schedules]), times, p)
-        if found is None:  # samples come late
-            found = np.empty(len(schedules))
+        found = np.full(len(schedules), np.nan)
+        if native is not None:
             for i, schedule in enumerate(schedules):
-                native.assign_sequence(self.structure_of(e, schedule.sequence))
-                try:
+                structure, places = self._find_places(e, schedule.sequence)
+                if structure is not native.structure:
+                    native.assign_sequence(structure, places)
+                with suppress(FailedCheckError):
                     found[i] = native.cost(schedule.times, p)
-                except FailedCheckError:
-                    found[i] = np.nan
         return found
 
-    def _list_places(self, e: int, sequence: tuple[str, ...]) -> NDArray[np.int64]:
-        """Return what is active where in a sequence, for machine code."""
-        key = e, sequence
-        if key not in self._rows:
-            places = places_in_library(self.structure_of(e, sequence))
-            self._rows[key] = np.concatenate([which[:-1] for which in places.values()])
-        return self._rows[key]
+    def _find_places(self, e: int, sequence: tuple[str, ...]) -> tuple[Structure, dict[str, NDArray[np.int64]]]:
+        """Return the structure of an experiment with another sequence, and what is active where in it."""
+        if (e, sequence) not in self._sequences:
+            structure = self.structure_of(e, sequence)
+            self._sequences[e, sequence] = structure, places_in_library(structure)
+        return self._sequences[e, sequence]
 
     def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J by a problem of its own."""

@@ -27,9 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.library import build_library
-from switchfit.online.saved import Arrival, Journal, Kept, build_kept_problem, pack, read, read_journal, unpack
+from switchfit.online.saved import Journal, Kept, build_kept_problem, pack, read, read_journal, unpack
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus, calibrate, hold, read_sigma
-from switchfit.online.tracker import Feed, Settings, StoppedError, Tracker, invert
+from switchfit.online.tracker import Feed, Settings, Start, StoppedError, Tracker, invert
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
@@ -686,14 +686,14 @@ class OnlineEstimator:
         sequence, times = now.mode_sequence[past:], now.transition_times[past:]
         return Kept(data, inputs, horizon, sequence, times, now.best.theta, self._describe_arrival())
 
-    def _describe_arrival(self) -> Arrival | None:
+    def _describe_arrival(self) -> Start | None:
         start, A, S = self._tracker.start, self._settings.entries, self._beam.births
         if start is None:
             return None
         acting = np.flatnonzero((start.tangent[:, :A] != 0).any(0))
         into = self._into[:, np.concatenate([acting, np.arange(S, self._into.shape[1])])]
-        theta = self._read_theta(start.moved)
-        return Arrival(theta, start.gradient @ into, into.T @ start.matrix @ into, start.state, start.tangent @ into)
+        matrix, theta = into.T @ start.matrix @ into, self._read_theta(start.moved)
+        return Start(theta, start.cost, start.gradient @ into, matrix, start.state, start.tangent @ into)
 
     @cached_property
     def _into(self) -> FloatArray:

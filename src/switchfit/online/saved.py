@@ -28,23 +28,6 @@ NO_EFFECT = 1e-12
 """Part of the largest second derivative below which one counts as none."""
 
 
-class Arrival(NamedTuple):
-    """What the samples before a window say of its unknowns d, A entries for the state at its start and U parameters.
-
-    Attributes
-    ----------
-    center : (U,), the parameters where d is 0
-    gradient, matrix : (A + U,), (A + U, A + U), of the cost
-    state, tangent : (n,), (n, A + U)
-    """
-
-    center: FloatArray
-    gradient: FloatArray
-    matrix: FloatArray
-    state: FloatArray
-    tangent: FloatArray
-
-
 class Kept(NamedTuple):
     """What has been measured since the start of the window, and what was found.
 
@@ -56,7 +39,8 @@ class Kept(NamedTuple):
     sequence : tuple of str
     times : (N,)
     theta : (U,), parameters and initial states in the order of the problem's theta
-    arrival : Arrival or None, if nothing has left the window
+    arrival : Start or None, if nothing has left the window
+        In U parameters and A entries for the state, the parameters being where it has moved.
     """
 
     data: list[Measurements]
@@ -65,7 +49,7 @@ class Kept(NamedTuple):
     sequence: tuple[str, ...]
     times: FloatArray
     theta: FloatArray
-    arrival: Arrival | None
+    arrival: Start | None
 
 
 def build_kept_problem(problem: Problem, kept: Kept) -> Problem:
@@ -89,7 +73,7 @@ def build_kept_problem(problem: Problem, kept: Kept) -> Problem:
     if arrival is not None:
         initial, sensor = _describe_arrival(problem, arrival, kept.horizon[0])
         data = [sensor, *data]
-        known = {ENTRIES: len(arrival.gradient) - len(arrival.center), STATES: int((states >= 0).sum())}
+        known = {ENTRIES: len(arrival.gradient) - len(arrival.moved), STATES: int((states >= 0).sum())}
         parameters = {name: replace(parameter, prior=None) for name, parameter in parameters.items()}
         parameters |= {name: Parameter(np.zeros(size)) for name, size in known.items() if size}
     t0, tf = kept.horizon
@@ -112,7 +96,7 @@ def _drop_empty_modes(
     return tuple(names), tuple(begins[1:])
 
 
-def _describe_arrival(problem: Problem, arrival: Arrival, t0: float) -> tuple[Any, Measurements]:
+def _describe_arrival(problem: Problem, arrival: Start, t0: float) -> tuple[Any, Measurements]:
     """Return the initial state as a function of the parameters, and the cost of the samples before as a measurement.
 
     With ``H = R'R`` and ``g = R's`` the cost is ``|R d + s|^2 / 2`` but for a constant: R d is measured to be -s.
@@ -124,14 +108,14 @@ def _describe_arrival(problem: Problem, arrival: Arrival, t0: float) -> tuple[An
     s = (vectors[:, there] / np.sqrt(values[there])).T @ arrival.gradient
     own = {problem_name: name for name, problem_name in run.parameter_map.items()}
     names = [own.get(name, name) for name in unknowns.parameters]
-    has_entries = len(arrival.gradient) > len(arrival.center)
+    has_entries = len(arrival.gradient) > len(arrival.moved)
     if (unknowns.initial_states[0] >= 0).any():
         names.append(STATES)
 
     def move(p: Any) -> Any:
         parameters = [jnp.ravel(jnp.asarray(p[name])) for name in names]
         entries = [p[ENTRIES]] if has_entries else []
-        return jnp.concatenate([*entries, jnp.concatenate([*parameters, jnp.zeros(0)]) - arrival.center])
+        return jnp.concatenate([*entries, jnp.concatenate([*parameters, jnp.zeros(0)]) - arrival.moved])
 
     def begin(p: Any) -> Any:
         return arrival.state + arrival.tangent @ move(p)

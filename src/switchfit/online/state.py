@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,27 +231,6 @@ EXCESS = 1.179
 of ``2 (1 - exp(-u)) / u`` from 0 to log 2."""
 
 
-class Estimator(Protocol):
-    """What is calibrated: an `OnlineEstimator`."""
-
-    problem: Problem
-    now: Now | None
-    held: FloatArray | None
-    spacing: float | None
-
-    def build_like(self, problem: Problem, threshold: float) -> Self:
-        """Return another one with the same settings."""
-        ...
-
-    def reset(self) -> None:
-        """Forget all samples."""
-        ...
-
-    def update(self, t: float, y: Any = None) -> Now:
-        """Take a sample."""
-        ...
-
-
 class Calibration(NamedTuple):
     """The threshold for a rate of false alarms.
 
@@ -292,7 +271,7 @@ class Calibration(NamedTuple):
 
 
 def calibrate(
-    online: Estimator,
+    online: Any,
     false_alarms: float,
     *,
     seconds: float = 20.0,
@@ -402,7 +381,7 @@ def read_sigma(item: Measurements) -> FloatArray:
     return np.asarray(np.diagonal(item.sigma[(~np.isnan(item.values)).argmax(0)]))
 
 
-def build_quiet_problem(online: Estimator, length: float) -> Problem:
+def build_quiet_problem(online: Any, length: float) -> Problem:
     """Return the problem of one run in the present mode, with empty samples at the usual times."""
     problem, now = online.problem, online.now
     run = problem.experiments[0]

@@ -394,7 +394,6 @@ class Tracker:
         self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self.behind = np.zeros((KEPT, settings.entries))
-        self._leaves, self._seen = 0, [0] * KEPT  # nodes that have left so far, and when each place has caught up
         self._views = [beam.engine.view(records[: settings.width]) for records in self.records]
         self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
         self._coded: tuple[Any, list[int]] = (None, [])
@@ -416,14 +415,13 @@ class Tracker:
         there = self.kept[place]
         if there is None:
             raise LookupError("no hypotheses are kept at this node")
-        if self._seen[place] != self._leaves:
-            self.catch_up(place, there[1])
+        self.catch_up(place, there[1])
         return there
 
     def catch_up(self, place: int, found: Hypotheses) -> None:
         """Let the entries e of the hypotheses at a place begin where the window does now."""
         found.moved[:, : self.settings.entries] += self.behind[place]
-        self.behind[place], self._seen[place] = 0.0, self._leaves
+        self.behind[place] = 0.0
 
     def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses whose records are at a place."""
@@ -439,7 +437,7 @@ class Tracker:
         """Keep hypotheses at a node, with the chosen ones of some records."""
         place = (node + self.dropped) % KEPT
         np.take(records, chosen, axis=0, out=self.records[place, : len(chosen)], mode="clip")  # "raise" makes a copy
-        self.kept[place], self.behind[place], self._seen[place] = self.view(place, kept), 0.0, self._leaves
+        self.kept[place], self.behind[place] = self.view(place, kept), 0.0
 
     def value(self, switches: Integers, found: Hypotheses) -> FloatArray:
         """Return the cost of hypotheses with the price of their switches; not finite where they have failed."""
@@ -576,7 +574,6 @@ class Tracker:
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
         self.behind -= moved[:, :A]
-        self._leaves += 1
         # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
         for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
             self._follow(node, pasts, modes, times[0, :gone], end)

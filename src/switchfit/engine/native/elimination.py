@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.implicit_rows import couple
 from switchfit.discretization.rows import FloatArray
-from switchfit.engine.native.entries import known_number
+from switchfit.engine.native.arrays import known_number
 from switchfit.engine.native.llvm import count_doubles
 from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
 

@@ -19,26 +19,12 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh, count_passed
 from switchfit.engine.jax import JaxEngine
-from switchfit.engine.native.experiment import (
-    FailedCheckError,
-    NativeExperiment,
-    find_directions,
-    native_experiment,
-)
+from switchfit.engine.native.experiment import FailedCheckError, NativeExperiment, find_directions, native_experiment
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import program_of, second_order
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.writer import GIVEN, layout_of
-from switchfit.engine.protocol import (
-    Costates,
-    Engine,
-    Evaluation,
-    Matrix,
-    Simulation,
-    Tangents,
-    add_samples,
-    cut_at_tf,
-)
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, add_samples, cut_at_tf
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 

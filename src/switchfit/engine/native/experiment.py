@@ -96,16 +96,10 @@ def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, An
 def _find_own_directions(
     sizes: Sizes, N: int, jumps: tuple[int, ...]
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return what `find_directions` does for N transitions with these jumps: read-only, shared by all meshes."""
-    are_jumps = np.isin(np.arange(N), jumps).astype(np.int64)
-    found: tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]] = find_directions(sizes, are_jumps, np)
-    for array in found:
-        array.setflags(write=False)
+    """Return what `find_directions` does for N transitions with these jumps, shared by all meshes."""
+    found: tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]
+    found = find_directions(sizes, np.isin(np.arange(N), jumps).astype(np.int64), np)
     return found
-
-
-LONG = 200_000_000
-"""Work of an evaluation, in additions, from which Ctrl-C is handled in the meantime: 20 to 100 ms."""
 
 
 class FailedCheckError(Exception):
@@ -139,7 +133,7 @@ class NativeExperiment:
         order: Order,
     ) -> None:
         self.sizes, self.order, self.times, self.row_work = sizes, order, times, program.row_work
-        self._program, self._workspace, self._prefix = program, program.workspace, PREFIX[order]
+        self._program, self._prefix = program, PREFIX[order]
         N, cells = sizes.N, len(times) - 1
         self._inner_nodes, self._cells = times[1:-1], cells
         self._channels = sum(channels for _, channels in structure.outputs)
@@ -178,7 +172,7 @@ class NativeExperiment:
         self._divide(np.zeros(sum(layout.sums.values())), layout.sums)
         of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
         self._pointers = [*layout.pointers, *of_samples]
-        self._memory = np.zeros(0)  # the workspace that the table points to, after the first call
+        self._memory = np.zeros(0)  # the scratch space that the table points to, after the first call
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
         of_late = "time", "cell", "segment"
@@ -189,7 +183,6 @@ class NativeExperiment:
         ]
         self._size_of_states: FloatArray | None = None
         self._judged = -1
-        self._work = (cells + N) * max(1, *program.row_work)
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
         self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
@@ -198,18 +191,22 @@ class NativeExperiment:
         self._g, self._H, self._jacobian = self._named["g"][: sizes.D], H[:, : sizes.D], jacobian
         self._set_sequence(structure)
 
-    def assign_sequence(self, structure: Structure) -> None:
+    def assign_sequence(self, structure: Structure, places: dict[str, NDArray[np.int64]]) -> None:
         """Evaluate another sequence of the same library from now on; its transition times are the next call's.
 
         Parameters
         ----------
         structure : Structure
             Equal to that of the experiment but for the modes and the functions at transitions; without jumps.
+        places : dict
+            Its `places_in_library`.
         """
         self._named["bounds"][1:] = self.times[-1]
         self._named["first_cell"][1:] = self._cells - 1
         self._set_sequence(structure)
-        self._write_places()
+        for name, which in places.items():
+            self._named[name][:] = which
+        self._named["modes"][-1] = self._judged
 
     def _set_sequence(self, structure: Structure) -> None:
         N, rows = structure.N, self._rows
@@ -227,7 +224,7 @@ class NativeExperiment:
 
         With multipliers (m,) the constraints too, and the Hessian of ``J + multipliers . c``.
         """
-        with self._workspace.lock:
+        with self._program.lock:
             self._evaluate(tau, p, side, multipliers)
             g, H = self._read_derivatives()
             if multipliers is None:
@@ -273,51 +270,9 @@ class NativeExperiment:
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
-        with self._workspace.lock:
+        with self._program.lock:
             self._evaluate(tau, p, 1.0)
             return self._J.item(0)
-
-    def costs(self, places: NDArray[np.int64], times: FloatArray, p: FloatArray) -> FloatArray | None:
-        """Return J of B schedules: (B,); NaN where a finiteness check failed, None if samples come late.
-
-        Parameters
-        ----------
-        places : (B, P) int64 array
-            For each the arrays of `places_in_library`, one after the other, without their last entries.
-        times : (B, N) array
-            Transition times, tf for those that a schedule does not need.
-        p : (M,) array
-        """
-        if self._late:
-            return None
-        B = len(times)
-        bounds = np.empty((B, self.sizes.N + 2))
-        bounds[:, 0], bounds[:, 1:-1], bounds[:, -1] = self.times[0], times, self.times[-1]
-        first_cell = np.zeros(bounds.shape, dtype=np.int64)
-        # Segments begin in the cell behind a node that tau is on: the right derivative, as in `_find_first_cells` for
-        # side +1.
-        first_cell[:, 1:-1] = self._inner_nodes.searchsorted(times, "right")
-        first_cell[:, -1] = self._cells - 1
-        places, found = np.ascontiguousarray(places), np.empty((B, 2))
-        function = self._find("all_costs", 6 + len(self._counts))
-        # The loop in machine code writes each schedule over the arrays of this one, which are restored at the end.
-        kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
-        with self._workspace.lock:
-            self._prepare(p)
-            at_once = max(1, LONG // self._work)
-            for before in range(0, B, at_once):  # Ctrl-C is handled after each call
-                given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
-                function(self._address, min(at_once, B - before), *given, *self._counts)
-            self._named["bounds"][:], self._named["first_cell"][:] = kept
-            self._write_places()
-        # An infinite J with a failed check stays infinite: both refuse the schedule.
-        return np.where(np.isfinite(found[:, 0]) & np.isnan(found[:, 1]), np.nan, found[:, 0])
-
-    def _write_places(self) -> None:
-        """Write the modes of the sequence, and the functions at its transitions, into the workspace."""
-        for name, which in places_in_library(self.structure).items():
-            self._named[name][:] = which
-        self._named["modes"][-1] = self._judged
 
     def simulate(
         self, tau: FloatArray, p: FloatArray, multipliers: FloatArray | None = None
@@ -333,14 +288,11 @@ class NativeExperiment:
         late : for each late Measurements, by its index, the times at which its samples saw the state, and the states
             then, (K, 1 + n)
         """
-        with self._workspace.lock:
+        with self._program.lock:
             self._evaluate(tau, p, 1.0, multipliers)
             n, N, cells, width = self.sizes.n, self.structure.N, self._cells, self.sizes.width
             first_cell = self._named["first_cell"][: N + 1].astype(np.intp)
-            # Ends of rows: the nodes inside a segment, then its end. A cell that a transition cuts has two rows.
-            firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
-            ends = zip(firsts, lasts, [*tau.tolist(), self.times[-1]], strict=True)
-            inside = [np.append(self.times[first + 1 : last + 1], end) for first, last, end in ends]
+            times = np.sort(np.append(self.times, tau))  # a cell that a transition cuts has two rows
 
             def of_rows(name: str, count: int, *shape: int) -> FloatArray:
                 values = self._named[name].reshape(-1, *shape)[:count]
@@ -355,7 +307,7 @@ class NativeExperiment:
                     starts[(first_cell[1:] + np.arange(1, N + 1))[resets]] = after[resets]
                 return starts, ends[1:]
 
-            none, times = np.zeros((cells + N, 0)), np.concatenate([self.times[:1], *inside])
+            none = np.zeros((cells + N, 0))
             derives = self.order > Order.COST
             simulation = Simulation(
                 self._J.item(0),
@@ -382,8 +334,13 @@ class NativeExperiment:
     def slopes_in(
         self, mode: int, times: FloatArray, y: FloatArray, p: FloatArray, cells: NDArray[np.intp] | None = None
     ) -> FloatArray:
-        """Return what `slope` does at times (L,) and y (L, n + 1): (L, n + 1), NaN where a finiteness check failed."""
-        cells = self._find_cells(times) if cells is None else cells
+        """Return f and ell at times (L,) and y = (x, running cost so far), (L, n + 1): (L, n + 1).
+
+        They are NaN where a finiteness check failed. The signals are those of `cells`; by default, of those that hold
+        the times (at a node, of the later one).
+        """
+        if cells is None:
+            cells = np.clip(self.times.searchsorted(times, "right") - 1, 0, self._cells - 1)
         slopes = np.zeros(y.shape)
         given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
         checks = self._call(f"slope_{mode}", given | {"y": y, "K": slopes}, p, len(times))
@@ -414,17 +371,6 @@ class NativeExperiment:
         given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": after, "moves": moves}
         return after + self._call(f"reset_{int(self._named['resets'][i])}", given, p)
 
-    def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
-        """Return f and ell at t, y = (x, running cost so far): (n + 1,).
-
-        The signals are those of `cell`; by default, of the cell that holds t (at a node, of the later one).
-        """
-        if cell is None:
-            cell = min(max(int(self.times.searchsorted(t, "right")) - 1, 0), self._cells - 1)
-        slope, moment = np.zeros(len(y)), np.array([t, self.times[cell]])
-        given = {"moment": moment, "signal": self._signals[cell], "y": y, "K": slope}
-        return slope + self._call(f"slope_{mode}", given, p)
-
     def adaptive_steps(
         self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int
     ) -> tuple[FloatArray, FloatArray]:
@@ -453,10 +399,6 @@ class NativeExperiment:
         """Return a function of the driver with a number of arguments: integers and addresses."""
         return self._program.function(f"{self._prefix}{name}", *[ctypes.c_int64] * count)
 
-    def _find_cells(self, times: FloatArray) -> NDArray[np.intp]:
-        """Return the cells that hold times (L,)."""
-        return np.clip(self.times.searchsorted(times, "right") - 1, 0, self._cells - 1)
-
     def _call(self, name: str, given: Mapping[str, FloatArray], p: FloatArray, count: int = 1) -> FloatArray:
         """Call a straight-line function at `count` points, with an array for each pointer that is not an argument.
 
@@ -481,10 +423,7 @@ class NativeExperiment:
         if multipliers is not None:
             self._multipliers[self._constraint_rows] = multipliers
         try:
-            if self._work > LONG:
-                self._workspace.call(lambda: self._function(self._address, *self._counts))
-            else:
-                self._function(self._address, *self._counts)
+            self._function(self._address, *self._counts)
         finally:
             if multipliers is not None:
                 self._multipliers[:] = 0.0
@@ -494,15 +433,14 @@ class NativeExperiment:
             raise FailedCheckError
 
     def _prepare(self, p: FloatArray) -> None:
-        """Store p, and the addresses of the workspace in the table."""
-        self._workspace.finish()
+        """Store p, and the addresses of the scratch space in the table."""
         self._own_p[:] = p
         # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
         # call.
-        self._workspace.reserve(self._size)
-        if self._memory is self._workspace.memory:
+        self._program.reserve(self._size)
+        if self._memory is self._program.memory:
             return
-        self._memory = self._workspace.memory
+        self._memory = self._program.memory
         self._divide(self._memory, self._lengths)
         self._table[:] = [self._addresses[name] for name in self._pointers]
 

@@ -27,18 +27,9 @@ from switchfit.problem.data import FloatArray
 
 SLOT = int(Column.SLOT)
 
-CELLS_AT_ONCE = 1000
-"""Cells, of all hypotheses together, that one call propagates."""
 
-
-class Reserved(NamedTuple):
-    """Arrays of a log that grows: nodes (G + 1,), signals (G, 4, S), and for each Measurements the place of the first
-    sample at each node (G + 2,), times (K,), values and weights (K, q).
-    """
-
-    nodes: FloatArray
-    signals: FloatArray
-    samples: list[tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]]
+SampleArrays = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+"""Of one Measurements: the place of the first sample at each node (G + 2,), times (K,), values and weights (K, q)."""
 
 
 class OrderTables(NamedTuple):
@@ -81,12 +72,7 @@ class NativeHypotheses:
     """
 
     def __init__(
-        self,
-        program: Program,
-        sizes: Sizes,
-        arguments: Arguments,
-        times: FloatArray,
-        jumps: Sequence[tuple[int, int]],
+        self, program: Program, sizes: Sizes, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
     ) -> None:
         self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
@@ -114,7 +100,7 @@ class NativeHypotheses:
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
         self._propagate = program.function(
-            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 8
+            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 7
         )
         self._follow_order = program.function(
             f"{PREFIX[Order.GAUSS_NEWTON]}follow_order", *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 5
@@ -123,8 +109,9 @@ class NativeHypotheses:
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
         self._arrays |= {f"{name}_{k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
 
-    def reserve(self, cells: int, samples: int) -> Reserved:
-        """Replace nodes, signals and samples by empty arrays, which are to be filled while a log grows.
+    def reserve(self, cells: int, samples: int) -> tuple[FloatArray, FloatArray, list[SampleArrays]]:
+        """Replace nodes (G + 1,), signals (G, 4, S) and samples by empty arrays, which are to be filled while a log
+        grows; return them.
 
         Parameters
         ----------
@@ -142,15 +129,9 @@ class NativeHypotheses:
             of_sensors.append((first, time, np.zeros((samples, channels)), np.zeros((samples, channels))))
             self._set_samples(k, *of_sensors[-1])
         self._table[:] = [get_address(a) for a in self._arrays.values()]
-        return Reserved(given["nodes"], given["signals"], of_sensors)
+        return given["nodes"], given["signals"], of_sensors
 
-    def begin(
-        self,
-        p: FloatArray,
-        start: Hypotheses,
-        tolerances: Tolerances,
-        limits: Limits | None,
-    ) -> Hypotheses:
+    def begin(self, p: FloatArray, start: Hypotheses, tolerances: Tolerances, limits: Limits | None) -> Hypotheses:
         """Return one hypothesis at t0, with the samples there.
 
         Parameters
@@ -266,15 +247,12 @@ class NativeHypotheses:
         places: tuple[int, int, bool],
         recentres: bool = True,
     ) -> Hypotheses:
-        """Propagate copies of records, a few at a time; Python handles Ctrl-C in between."""
+        """Propagate copies of records."""
         records = np.empty((len(counts), self.record_size))
         arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
         addresses = map(get_address, (records, parents, *arrays))
-        given = [self._table_at, *addresses, times.shape[1], first, last, restarts]
-        at_once = max(1, CELLS_AT_ONCE // max(1, last - first))
-        for begin in range(0, len(records), at_once):
-            end = min(begin + at_once, len(records))
-            self._propagate(*given, begin, end, last == self._cells, recentres and self._recentres)
+        ends = last == self._cells, recentres and self._recentres
+        self._propagate(self._table_at, *addresses, times.shape[1], first, last, restarts, len(records), *ends)
         return self.view(records)
 
     def view(self, records: FloatArray) -> Hypotheses:

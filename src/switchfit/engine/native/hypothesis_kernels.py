@@ -14,19 +14,17 @@ matrix to H at once, without a costate. Further pointers:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from switchfit.discretization import implicit_rows
 from switchfit.discretization import rows as explicit_rows
-from switchfit.discretization.rows import EXPLICIT_ERROR, Tableau, combine, cost_of_row, times_vector
+from switchfit.discretization.rows import EXPLICIT_ERROR, Tableau, combine, times_vector
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels, Store, as_vector, list_entries, store_all
 from switchfit.engine.native.scalars import Graph, Namespace, Node, Objects, Template
-from switchfit.engine.native.templates import ELL, F_P, F_X, GRADIENT, SECOND, F
+from switchfit.engine.native.templates import F_X, GRADIENT, SECOND, F
 
 SMALLEST_RATE = 1e-30
 """Square of the rate of a guard below which it says nothing on the time."""
@@ -38,80 +36,56 @@ class HypothesisKernels(Kernels):
     def step(self, mode: int, stage: Template, costs: bool) -> list[tuple[int, int]]:
         """Write a step in a mode: state, tangents, running costs and the estimate of the error.
 
-        Return which second derivatives of the running costs are stored for each stage, as `Kernels.backward_row`.
+        Its ends do not move: births change Z by `move` and `hold`, between steps. Return which second derivatives of
+        the running costs are stored for each stage, as `Kernels.backward_row`.
         """
-        graph, n, tableau = Graph(), self.sizes.n, self.tableau(mode)
-        at = self._row(graph)
-
-        def field(t: Any, X: Any) -> Objects:
-            return stage(graph, *at(t, X), only=(F,), checked=True)[0]
-
-        start, end = graph.load("row", 0), graph.load("row", 1)
-        # The step has no moving ends: births change Z by `move` and `hold`, between steps.
-        x, Z, h = graph.loads("x", n), graph.loads("Z", n, vector=True), end - start
-        k = self.load_increments(graph) if tableau.coupled else []
-        found = explicit_rows.stages(tableau, field, start, end, x, k)
-        after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
-        # X_j' of all stages at once; machine code has one vector per state, with an entry for each time and parameter.
-        points = list(zip(found.times, found.states, strict=True))
-        f_x, f_p = zip(*(stage(graph, *at(t, X), only=(F_X, F_P)) for t, X in points), strict=True)
-        tangent: Callable[..., explicit_rows.Tangent]
-        if k:
-            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
-            error = implicit_rows.estimate_error(h, k, slope, jacobian, eliminate)
-            tangent = partial(implicit_rows.tangent, factors=eliminate(tableau.a, h, f_x))
+        self._chosen: list[tuple[int, int]] = []
+        if self.library.implicit[mode]:
             self.newton(f"newton_{mode}", stage)
+        self.forward_row(f"step_{mode}", stage, False, costs, self.tableau(mode))
+        return self._chosen
+
+    def _add_to_row(
+        self,
+        graph: Graph,
+        stage: Template,
+        tableau: Tableau,
+        found: explicit_rows.Stages,
+        along: explicit_rows.Tangent,
+        costs: bool,
+    ) -> list[Store]:
+        """Return stores of the largest error so far, and of what the running costs add to g and H."""
+        at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
+        if tableau.coupled:
+            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
+            error = implicit_rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
         else:
-            error, tangent = h * combine(EXPLICIT_ERROR, found.slopes), explicit_rows.tangent
-        forcing = [self._along_p(graph, each) for each in f_p]
-        along = tangent(tableau, h, found.slopes, f_x, forcing, Z, None)
-        stores = store_all("x", 0, after) + store_all("Z", 0, [as_vector(graph, value) for value in along.after])
-        stores.append(("error", 0, self._largest_error(graph, error, x)))
-        chosen: list[tuple[int, int]] = []
-        if costs:
-            more, chosen = self._add_running_costs(graph, stage, tableau, h, points, along.states)
-            stores += more
-        self.module.write_straight_line(f"step_{mode}", stores + graph.check())
-        return chosen
+            error = h * combine(EXPLICIT_ERROR, found.slopes)
+        stores = [("error", 0, self._largest_error(graph, error, x))]
+        if not costs:
+            return stores
+        g, second = graph.load("g", 0, vector=True), []
+        for j, (weight, t, X, X_d) in enumerate(zip(tableau.b.tolist(), *found[:2], along.states, strict=True)):
+            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
+            # J.
+            given = at(t, X, hb=h * weight)
+            g_x, g_p, S = stage(graph, *given, only=(*GRADIENT[1:], *SECOND), checked=True)
+            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
+            # future.
+            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
+            second.append(list_entries(S, with_time=False))
+            stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
+        self._chosen, entries = self._store_entries(graph, tableau, second)
+        return [*stores, ("g", 0, as_vector(graph, g)), *entries]
 
     def _largest_error(self, graph: Graph, errors: Objects, x: Objects) -> Node:
         """Return the larger of the error so far and that of a step, relative to ``rtol (smallest + |x|)``."""
         rtol, smallest = graph.loads("tolerances", 2)
         largest = graph.load("error", 0)
-        for error, value in zip(errors, x, strict=True):
-            relative = graph.apply("abs", error) / (rtol * (smallest + graph.apply("abs", value)))
-            smaller = graph.apply("le", relative, largest)  # false for NaN, which then is the error
-            largest = graph.apply("select", smaller, largest, relative)
+        xp = Namespace(graph)
+        for relative in xp.abs(errors) / (rtol * (smallest + xp.abs(x))):
+            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
         return largest
-
-    def _add_running_costs(
-        self,
-        graph: Graph,
-        stage: Template,
-        tableau: Tableau,
-        h: Node,
-        points: Sequence[tuple[Any, Any]],
-        tangents: Sequence[Objects],
-    ) -> tuple[list[Store], list[tuple[int, int]]]:
-        """Return stores of the running costs of a step and of what `curvature` adds to H, and its entries."""
-        at, n = self._row(graph), self.sizes.n
-        zeros = np.full(n, graph.constant(0.0), dtype=object)
-        g, densities, second = graph.load("g", 0, vector=True), [], []
-        for weight, point, X_d in zip(tableau.b.tolist(), points, tangents, strict=True):
-            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
-            # J.
-            given = at(*point, zeros, h * weight)
-            ell, _, g_x, g_p, S = stage(graph, *given, only=(ELL, *GRADIENT, *SECOND), checked=True)
-            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
-            # future.
-            densities.append(ell.item())
-            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
-            second.append(list_entries(S, with_time=False))
-        stores = [("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)), ("g", 0, as_vector(graph, g))]
-        for j, X_d in enumerate(tangents):
-            stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
-        chosen, entries = self._store_entries(graph, tableau, second)
-        return stores + entries, chosen
 
     def move(self, name: str, sign: float, costs: bool) -> None:
         """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.

@@ -95,7 +95,7 @@ def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
     return compile_library(library, sizes, (Order.GAUSS_NEWTON,), _write, "No beam")
 
 
-def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
+def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> Iterator[str]:
     kernels = HypothesisKernels(library, sizes, order, module, goes_back=False)
     costs = bool(library.running or library.references)
     curvatures = []
@@ -230,7 +230,7 @@ class HypothesisWriter(Writer):
         self.put(self.get("double", found["nodes"], cell), row, 2)
         found |= {"row": row, "signal": self.at(found["signals"], cell, 4 * self.sizes.signals)}
         # Ends of steps do not move with theta.
-        found |= {"opens": found["units"], "closes": found["units"]}
+        found |= {"opens": found["units"], "closes": found["units"], "x_after": found["x"], "Z_after": found["Z"]}
         with self.loop(0, parts) as part:
             # Ends of steps are begin + length k / parts, and the last one is `end` itself: sums of steps would miss the
             # node.
@@ -257,10 +257,10 @@ class HypothesisWriter(Writer):
         which of the `parents` it is a copy of.
         """
         given = "ptr %records, ptr %parents, ptr %children, ptr %times, ptr %counts, i64 %births, i64 %first, i64 %last"
-        settings = "i64 %restarts, i64 %first_record, i64 %end_record, i64 %at_end, i64 %recentres"
+        settings = "i64 %restarts, i64 %count, i64 %at_end, i64 %recentres"
         arguments = self.begin(f"void @propagate(ptr %table, {given}, {settings})")
         table, records, parents, children, times, counts = arguments[:6]
-        births, first, last, restarts, first_record, end_record, at_end, recentres = arguments[6:]
+        births, first, last, restarts, count, at_end, recentres = arguments[6:]
         size, place, library = measure_record(self.sizes), divide_record(self.sizes), self.library
         before, has_costs = self.allocate("double", size), library.running or library.references or library.guards
 
@@ -270,7 +270,7 @@ class HypothesisWriter(Writer):
             for part in (slice(0, place["p"].start), slice(place["x"].start, end)):
                 self.copy(self.at(target, part.start), self.at(source, part.start), part.stop - part.start)
 
-        with self.loop(first_record, end_record) as index:
+        with self.loop(0, count) as index:
             record, own = self.at(records, index, size), self.at(counts, index, 3)
             self.copy(record, self.at(parents, self.get("i64", own, 2), size), size)
             of_times, of_births = self.at(times, index, births), self.at(children, index, births * COLUMNS)
@@ -359,7 +359,7 @@ class HypothesisWriter(Writer):
                         record, own_births = self.at(records, child, size), self.at(births, child, length)
                         own_counts = self.at(counts, born * places + place, 3)
                         birth, before = self.at(children, place, COLUMNS), self.at(records, parent, size)
-                        whole = (table, record, before, birth, time_at, own_counts, 1, here, there, 0, 0, 1, at_end, 1)
+                        whole = (table, record, before, birth, time_at, own_counts, 1, here, there, 0, 1, at_end, 1)
                         self.invoke("propagate", *whole)
                         with self.loop(0, length) as k:
                             self.put(self.get("double", past, k), own_births, k)

@@ -95,15 +95,14 @@ SHORT = 120
 adds one stage: compiling these functions would take longer than all others."""
 
 
-def most_kept(n: int) -> int:
-    """Return how many values of functions are kept at most at each stage: as many as sines and cosines of n states."""
-    return 2 * n
+MOST_KEPT = 2
+"""Values of functions that are kept at most at each stage, in n: as many as sines and cosines of all states."""
 
 
 def count_kept(library: Structure, n: int, order: Order) -> int:
     """Return how many doubles a row keeps at most for its backward step."""
     has_factors = order > Order.COST and any(library.implicit)
-    return STAGES * most_kept(n) + (count_factors(n, len(STIFF.b)) if has_factors else 0)
+    return STAGES * MOST_KEPT * n + (count_factors(n, len(STIFF.b)) if has_factors else 0)
 
 
 def has_jumps(library: Structure) -> bool:
@@ -212,6 +211,7 @@ class Kernels:
         found = explicit_rows.stages(tableau, field, start, end, x, k)
         after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         stores, factors = store_all("x_after", 0, after), None
+        keep: Callable[..., list[Store]] = store_all if self.goes_back else lambda *_: []
         if self.order > Order.COST:
             at_points = found.states
             # The backward step needs slopes only if the row moves: V multiplies them by h'. Those of an explicit row it
@@ -220,15 +220,15 @@ class Kernels:
                 f_x = stage(graph, *at(start, x), only=(F_X,))[0]
                 found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
                 at_points = at_points + (found.slopes if moving else [])
-            stores += store_all("X", 0, np.concatenate(at_points))
+            stores += keep("X", 0, np.concatenate(at_points))
             if kept:
-                stores += store_all("kept", 0, np.concatenate([values[-1] for values in at_stages]))
+                stores += keep("kept", 0, np.concatenate([values[-1] for values in at_stages]))
             of_x = [values[2] for values in at_stages]
             if k:
                 # That the backward step reads them takes 12 to 15 % off (J, g, H) where 8 states depend on each other,
                 # 5 % where 4 do. With fewer, or a sparse Jacobian, to compute them again would take as long.
-                factors = eliminate(tableau.a, h, of_x, place=len(tableau.b) * len(kept))
-                stores += factors.stores
+                factors = eliminate(tableau.a, h, of_x, len(tableau.b) * len(kept) if self.goes_back else None)
+                stores += factors.stores if self.goes_back else ()
         if self.with_tangents:
             # X_j', K_j' and x+' of `discretization.rows`, with one entry of each vector per unknown: for p this is (10)
             # of the paper discretized, and for tau the products with h' of the rows on both sides of it leave X^i, (8).
@@ -249,8 +249,9 @@ class Kernels:
             # pay for.
             along = tangent(tableau, h, found.slopes, of_x, forcing, Z, h_d)
             vectors = along.states + (along.slopes if k and moving else [])
-            stores += store_all("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
+            stores += keep("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
+            stores += self._add_to_row(graph, stage, tableau, found, along, costs)
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
             stores.append(("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)))
@@ -258,6 +259,18 @@ class Kernels:
             stores += graph.check()
         self.module.write_straight_line(name, stores)
         return factors
+
+    def _add_to_row(
+        self,
+        graph: Graph,
+        stage: Template,
+        tableau: Tableau,
+        found: explicit_rows.Stages,
+        along: explicit_rows.Tangent,
+        costs: bool,
+    ) -> list[Store]:
+        """Return what else a step with derivatives stores: nothing, if a backward one follows it."""
+        return []
 
     def judge_row(self, mode: int, stage: Template, tableau: Tableau) -> None:
         """Write what a row that was computed adds to the largest errors: its own one; and a jump inside, which counts
@@ -579,7 +592,7 @@ class Kernels:
         where both steps compute them.
         """
         outputs = (F, *((F_T, F_X, F_P) if self.order > Order.COST else ()), *((ELL,) if costs else ()))
-        most = 0 if self.order == Order.COST else most_kept(self.sizes.n)
+        most = MOST_KEPT * self.sizes.n if self.goes_back else 0
         return outputs, stage.list_long(outputs)[:most]
 
     def _load_constants(self, graph: Graph) -> tuple[Objects, list[Objects]]:

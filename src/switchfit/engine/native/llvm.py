@@ -407,6 +407,8 @@ class Module:
     ----------
     work, pointers : dict
         Cost of each straight-line function, in additions, and the pointers that it takes.
+    row_work : list of int
+        Work of a row of each mode, if there are derivatives.
     """
 
     def __init__(self, width: int, prefix: str = "") -> None:
@@ -416,6 +418,7 @@ class Module:
         self._declared: dict[str, str] = {}
         self._written: dict[str, str] = {}
         self.work: dict[str, int] = {}
+        self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
 
     def write_straight_line(
@@ -582,37 +585,6 @@ class _Writer(Lines):
         return self._splats[node.index]
 
 
-class Workspace:
-    """Scratch space of a program. Calls share it, one at a time, so that it stays in the CPU caches.
-
-    Attributes
-    ----------
-    lock : held during a call, since ctypes releases the GIL
-    memory : array of doubles
-    """
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.memory = np.zeros(0)
-        self._running: Future[None] | None = None
-
-    def call(self, function: Callable[[], None]) -> None:
-        """Call a function that works here for long, in a thread: Python handles Ctrl-C only while it is not in it."""
-        self._running = ThreadPoolExecutor(1).submit(function)
-        self.finish()
-
-    def finish(self) -> None:
-        """Wait for a call that Ctrl-C has left, and that still works here."""
-        if self._running is not None:
-            wait_for(self._running)
-            self._running = None
-
-    def reserve(self, size: int) -> None:
-        """Allocate at least `size` doubles; the contents may be lost."""
-        if len(self.memory) < size:
-            self.memory = np.zeros(size)
-
-
 class Program:
     """Machine code of a module; it is freed with this object.
 
@@ -620,19 +592,26 @@ class Program:
     ----------
     key : str
         Hash of the module, the same in every process.
-    workspace : Workspace
     row_work : list of int
         Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
+    lock : held during a call, since ctypes releases the GIL
+    memory : array of doubles
+        Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.
     pointers : dict
         Names of the pointers that each straight-line function takes.
     """
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
-        self.workspace = Workspace()
+        self.lock, self.memory = threading.Lock(), np.zeros(0)
         self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
         self._functions: dict[str, Any] = {}
+
+    def reserve(self, size: int) -> None:
+        """Allocate at least `size` doubles; the contents may be lost."""
+        if len(self.memory) < size:
+            self.memory = np.zeros(size)
 
     def function(self, name: str, *types: Any) -> Any:
         """Return a Python callable for a void function with arguments of these ctypes."""

@@ -27,9 +27,9 @@ from switchfit.discretization.rows import STIFF
 from switchfit.engine.native.adaptive import TIMES, Adaptive, write_slope, write_step
 from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variable, compile_modules
-from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import (
     constraint_pointers,
+    count_rows,
     estimate_row,
     solve_stages,
     state_pointers,
@@ -41,7 +41,7 @@ from switchfit.engine.native.segments import (
 )
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, layout_of, list_place_lengths
+from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, layout_of
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
@@ -61,7 +61,7 @@ def write_handler(writer: Writer) -> str:
     Arguments are those of `writer.GIVEN`, then those of the samples; results are all accumulators in one array, and
     the scratch space.
     """
-    N, measurements = writer.sizes.N, len(writer.library.measurements)
+    measurements = len(writer.library.measurements)
     names = [*GIVEN, *(f"{name} {k}" for k in range(measurements) for name in OF_SAMPLES)]
     (frame,) = writer.begin("ptr @xla_handler(ptr %frame)")
     table = writer.allocate("ptr", len(writer.names) + len(OF_SAMPLES) * measurements)
@@ -83,7 +83,7 @@ def write_handler(writer: Writer) -> str:
     for name, length in writer.layout.sums.items():
         found[name] = writer.at(totals, position)
         position += length
-    rows = writer.get("i64", found["first_cell"], N + 1) + (N + 1)
+    rows = count_rows(writer, found)
     place: Operand = 0
     for name, extent in writer.layout.memory.items():
         found[name] = writer.at(between, place)
@@ -103,7 +103,7 @@ def write_evaluation(writer: Writer) -> str:
     of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
     table, *counts = writer.begin(f"void @evaluate(ptr %table{of_samples})")
     found, layout = writer.pointers(), writer.layout
-    rows = writer.get("i64", found["first_cell"], N + 1) + (N + 1)
+    rows = count_rows(writer, found)
     # The sums are one block of memory, so that one call clears all of them.
     writer.zero(found[next(iter(layout.sums))], sum(layout.sums.values()))
     for name in ZEROED:
@@ -124,39 +124,13 @@ def write_evaluation(writer: Writer) -> str:
 
 def _call_end(writer: Writer, found: Pointers) -> None:
     """Call the terminal cost and constraints."""
-    N, library = writer.sizes.N, writer.library
-    last = state_pointers(writer, found, writer.get("i64", found["first_cell"], N + 1) + (N + 1))
+    library, last = writer.library, state_pointers(writer, found, count_rows(writer, found))
     # No row follows the end: what the terminal terms add to the costate goes to psi itself.
     given = (
         found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
     )
     for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
         writer.call(name, given)
-
-
-def write_costs(writer: Writer) -> str:
-    """Write the loop over schedules that evaluates J of each.
-
-    `places` has for each the arrays of `list_place_lengths`, one after the other, and `bounds` and `first_cell` are as
-    in `writer.GIVEN`; J and the finiteness check of each come to `found`.
-    """
-    N, lengths = writer.sizes.N, list_place_lengths(writer.sizes.N)
-    given = "i64 %count, ptr %places, ptr %bounds, ptr %first_cell, ptr %found"
-    of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
-    signature = f"void @all_costs(ptr %table, {given}{of_samples})"
-    table, count, places, bounds, first_cell, results, *counts = writer.begin(signature)
-    pointers = writer.pointers()
-    with writer.loop(0, count) as which:
-        place = writer.at(places, which, sum(lengths.values()))
-        for name, length in lengths.items():
-            writer.copy(pointers[name], place, length)
-            place = writer.at(place, length)
-        for name, source in (("bounds", bounds), ("first_cell", first_cell)):
-            writer.copy(pointers[name], writer.at(source, which, N + 2), N + 2)
-        writer.invoke("evaluate", table, *counts)
-        for entry, name in enumerate(("J", CHECKED)):
-            writer.put(writer.load("double", pointers[name]), writer.at(results, which, 2), entry)
-    return writer.end()
 
 
 def write_loop(writer: Writer, name: str) -> str:
@@ -250,8 +224,8 @@ def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     return compile_library(library, sizes, both if order in both else (order,), _write, "Evaluated by JAX")
 
 
-Write = Callable[[Structure, Sizes, Order, Module, list[int]], Iterator[str]]
-"""Writes functions of a library with derivatives of an order, in parts, and the work of a row of each mode."""
+Write = Callable[[Structure, Sizes, Order, Module], Iterator[str]]
+"""Writes functions of a library with derivatives of an order, in parts."""
 
 
 def compile_library(
@@ -269,13 +243,12 @@ def compile_library(
 def _program_of(
     library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
 ) -> Program | str:
-    row_work = [0] * len(library.modes)
     modules = [Module(sizes.width, PREFIX[order]) for order in orders]
     try:
         if sizes.D == 0:
             raise Unsupported("an experiment has no unknowns")
         with use_float64():
-            parts = (write(library, sizes, order, each, row_work) for order, each in zip(orders, modules, strict=True))
+            parts = (write(library, sizes, order, each) for order, each in zip(orders, modules, strict=True))
             program = compile_modules(chain.from_iterable(parts))
     except Unsupported as error:
         reason = str(error)
@@ -284,7 +257,7 @@ def _program_of(
         reason = f"internal: {type(error).__name__}: {error}"
         log.info("%s: %s.", otherwise, reason, exc_info=True)
     else:
-        program.row_work = row_work
+        program.row_work = modules[-1].row_work
         program.pointers = {f"{each.prefix}{name}": given for each in modules for name, given in each.pointers.items()}
         return program
     return reason
@@ -297,11 +270,8 @@ def drop_programs() -> None:
         layout_of.cache_clear()
 
 
-def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
-    """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest.
-
-    With derivatives, the work of a row of each mode is stored in `row_work`.
-    """
+def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> Iterator[str]:
+    """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest."""
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
@@ -309,7 +279,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
         if order > Order.COST:
-            row_work[mode] = estimate_row(writer, mode, curvatures[mode]["inner"])
+            module.row_work.append(estimate_row(writer, mode, curvatures[mode]["inner"]))
         yield module.take()
     kernels.nodes()
     for k in range(len(library.measurements)):
@@ -326,7 +296,8 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
         module.add(write_loop(writer, "outputs"))
     module.add(write_forward(writer))
     module.add(write_evaluation(writer))
-    module.add(write_costs(writer) if order == Order.COST else write_backward(writer, curvatures))
+    if order > Order.COST:
+        module.add(write_backward(writer, curvatures))
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
     yield module.take()

@@ -43,7 +43,7 @@ def _units(writer: Writer, found: Pointers, moves: Value, index: Value) -> Value
 
 def row_pointers(writer: Writer, found: Pointers, segment: Value, cell: Value, last: Value) -> tuple[Pointers, Value]:
     """Emit the pointers of the row of a segment in a cell; return them with the case of `row_cases`."""
-    n, width = writer.sizes.n, writer.sizes.width
+    n = writer.sizes.n
     # Rows are numbered by cell + segment, as in `mesh.build_rows`; states by the row that they are before, so that the
     # state after row r is state r + 1.
     place, row, ends = start_row(writer, found, segment, cell), cell + segment, cell.equals(last)
@@ -58,18 +58,31 @@ def row_pointers(writer: Writer, found: Pointers, segment: Value, cell: Value, l
     pointers = place | {
         "row": times,
         "closes": _units(writer, found, closes, segment + 1),
-        "kept": writer.at(found["kept"], row, count_kept(writer.library, n, writer.order)),
-        "X": writer.at(found["stages"], row, STAGES * n),
-        "XZ": writer.at(found["stage_tangents"], row, STAGES * n * width),
         "jump": writer.at(found["jumps"], after, n),
         "late": writer.at(found["late"], row, n),
         "costate": writer.at(found["costates"], row, n),
     }
     here, there = state_pointers(writer, found, row), state_pointers(writer, found, after)
     pointers |= here | {f"{name}_after": pointer for name, pointer in there.items()}
+    pointers |= stage_pointers(writer, found, row)
     # Case 2 mode + kind: only rows beside a transition have the code for times that move.
     kind = (place["begins"] | closes).to("i64")
     return found | pointers, writer.get("i64", found["modes"], segment) * len(KINDS) + kind
+
+
+def stage_pointers(writer: Writer, found: Pointers, row: Operand) -> Pointers:
+    """Return pointers to what belongs to the stages of a row."""
+    n, width = writer.sizes.n, writer.sizes.width
+    return {
+        "kept": writer.at(found["kept"], row, count_kept(writer.library, n, writer.order)),
+        "X": writer.at(found["stages"], row, STAGES * n),
+        "XZ": writer.at(found["stage_tangents"], row, STAGES * n * width),
+    }
+
+
+def count_rows(writer: Writer, found: Pointers) -> Value:
+    """Emit the number of rows."""
+    return writer.get("i64", found["first_cell"], writer.sizes.N + 1) + (writer.sizes.N + 1)
 
 
 def row_cases(writer: Writer, case: Value) -> Iterator[tuple[int, str]]:
@@ -265,28 +278,23 @@ def _sample_pointers(writer: Writer, k: int, own: Pointers, sample: Value) -> Po
 
 
 def _write_late_row(writer: Writer, k: int, found: Pointers, own: Pointers, sample: Value) -> tuple[Pointers, Value]:
-    """Write the forward step of a late sample's row; return pointers and the mode of the row."""
+    """Write the forward step of a late sample's row, which is behind all others in memory; return pointers and its
+    mode.
+    """
+    n, width = writer.sizes.n, writer.sizes.width
     cell, segment = (writer.get("i64", own[name], sample) for name in ("cell", "segment"))
-    row, place = cell + segment, start_row(writer, found, segment, cell)
+    row, place, last = cell + segment, start_row(writer, found, segment, cell), count_rows(writer, found)
+    times = writer.allocate("double", 3)
     for entry, name in ((0, "start"), (2, "origin")):
-        writer.put(place[name], found["late_row"], entry)
+        writer.put(place[name], times, entry)
     state = state_pointers(writer, found, row)
     if writer.library.reset_maps:
         state = choose_state(*find_reset(writer, found, segment, place["begins"]), state)
-    given = found | place | state | _sample_pointers(writer, k, own, sample)
-    given |= {
-        "row": found["late_row"],
-        "closes": found["late_closes"],
-        "X": found["late_stages"],
-        "XZ": found["late_stage_tangents"],
-        "kept": found["late_kept"],
-        "x_after": found["late_state"],
-        "Z_after": found["late_tangent"],
-        "psi": found["late_psi"],
-        "jump": found["late_psi"],
-        "late": writer.at(found["late"], row, writer.sizes.n),
-        "J": found["late_J"],
-    }
+    psi = writer.allocate("double", n)
+    given = found | place | state | _sample_pointers(writer, k, own, sample) | stage_pointers(writer, found, last)
+    given |= {f"{name}_after": pointer for name, pointer in state_pointers(writer, found, last + 1).items()}
+    given |= {"row": times, "closes": writer.allocate("double", width), "psi": psi, "jump": psi}
+    given |= {"late": writer.at(found["late"], row, n), "J": writer.allocate("double")}
     writer.call(f"late_time_{k}", given)
     mode = writer.get("i64", found["modes"], segment)
     for m in writer.cases(mode, len(writer.library.modes)):
@@ -306,13 +314,13 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
     with writer.loop(0, count) as sample:
         given, mode = _write_late_row(writer, k, found, own, sample)
         seen = writer.at(own["seen"], sample, 1 + writer.sizes.n)
-        writer.copy(seen, writer.at(found["late_row"], 1), 1)
-        writer.copy(writer.at(seen, 1), found["late_state"], writer.sizes.n)
+        time = writer.at(given["row"], 1)
+        writer.copy(seen, time, 1)
+        writer.copy(writer.at(seen, 1), given["x_after"], writer.sizes.n)
         # A late sample is forward and backward at once, as nothing follows it: psi = D_x l at its end, and what is left
         # at its start waits in `late` for the backward step of the row around it.
-        at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]}
-        at_end |= {"time": writer.at(found["late_row"], 1), "moves": found["late_closes"]}
-        writer.zero(found["late_psi"], writer.sizes.n)
+        at_end = {"x": given["x_after"], "Z": given["Z_after"], "J": found["J"], "time": time, "moves": given["closes"]}
+        writer.zero(given["psi"], writer.sizes.n)
         writer.call(f"sample_{k}", given | at_end)
         if writer.order > Order.COST:
             for m in writer.cases(mode, len(writer.library.modes)):

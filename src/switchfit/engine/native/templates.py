@@ -13,12 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.mesh import Arguments, Samples
-from switchfit.discretization.model import (
-    Model,
-    Piece,
-    apply_weights,
-    get_transition_function,
-)
+from switchfit.discretization.model import Model, Piece, apply_weights, get_transition_function
 from switchfit.engine.native.scalars import Template
 from switchfit.engine.native.trace import trace_scalars
 from switchfit.problem.structure import Structure
@@ -201,9 +196,7 @@ class Templates:
         """Trace the terminal costs."""
 
         def end(model: Model, x: Any, p: Any) -> Any:
-            cost = lambda t, x, p: model.terminal(x, p)  # noqa: E731
-            at = jnp.zeros(()), x, p
-            return self._cost(cost, *at, lambda: _differentiate_twice(cost, *at))
+            return self._cost(lambda t, x, p: model.terminal(x, p), jnp.zeros(()), x, p)
 
         return self._trace(end, (self.sizes.n,), (self.sizes.M,), name="a terminal cost")
 
@@ -215,12 +208,9 @@ class Templates:
 
         def at(model: Model, t: Any, x: Any, p: Any, weight: Any, origin: Any, coefficients: Any) -> Any:
             function = get_transition_function(model, kind, which, Piece(origin, coefficients))
-            if function is None:
-                raise ValueError("there is no function at this transition")
             if kind == "guards":
                 return self._map(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
-            # The second derivatives of a cost belong to the Gauss-Newton matrix too.
-            return self._cost(function, t, x, p, lambda: _differentiate_twice(function, t, x, p))
+            return self._cost(function, t, x, p)
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,), (), (4, self.sizes.signals)
         return self._trace(at, *shapes, name=f"one of the {kind}")
@@ -268,7 +258,9 @@ class Templates:
 
         return trace_scalars(call, *shapes, *self.sizes.constants, name=name)
 
-    def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any]) -> Any:
+    def _cost(
+        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any] | None = None
+    ) -> list[Any]:
         """Return a cost with the derivatives of the order."""
         return [value(t, x, p), *self._differentiate(value, t, x, p, gauss_newton)]
 
@@ -282,15 +274,17 @@ class Templates:
         return [function(t, x, p), *jacobians, *weighted]
 
     def _differentiate(
-        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any]
+        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any] | None
     ) -> list[Any]:
-        """Return the derivatives of the order; at order GAUSS_NEWTON the second ones are given, at GRADIENT zero."""
+        """Return the derivatives of the order; at order GAUSS_NEWTON, second ones that are given take their place."""
         if self.order == Order.COST:
             return []
-        if self.order == Order.HESSIAN:
-            second = _differentiate_twice(value, t, x, p)  # first, since the machine code of both is then faster
-        else:
-            second = gauss_newton() if self.order == Order.GAUSS_NEWTON else self._no_second()
+        # First, since the machine code of both is then a little faster.
+        if self.order == Order.GRADIENT:
+            gauss_newton = self._no_second
+        elif gauss_newton is None or self.order == Order.HESSIAN:
+            gauss_newton = partial(_differentiate_twice, value, t, x, p)
+        second = gauss_newton()
         return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), second]
 
     def _no_second(self) -> Any:

@@ -3,7 +3,7 @@
 The jaxpr contains the derivatives already. Operations that only move entries (reshape, slice, pad and so on) emit
 nothing. Operations without a scalar form (loops of unknown length, random numbers, solvers) raise `Unsupported`.
 
-An array whose entries are all known is a NumPy array of numbers, any other an object array of what `entries` describes.
+An array whose entries are all known is a NumPy array of numbers, any other an object array of what `arrays` describes.
 """
 
 from __future__ import annotations
@@ -18,26 +18,24 @@ import numpy as np
 from jax.interpreters import partial_eval
 
 from switchfit.engine.native.arrays import (
+    OF_INTEGERS,
+    Integer,
+    Meaning,
+    Unsupported,
     cholesky,
+    choose,
     compare_in_order,
     dynamic_slice,
     dynamic_update_slice,
+    from_double,
     gather,
+    known_number,
+    less,
     lu,
     scatter,
     search,
     sort,
     triangular_solve,
-)
-from switchfit.engine.native.entries import (
-    OF_INTEGERS,
-    Integer,
-    Meaning,
-    Unsupported,
-    choose,
-    from_double,
-    known_number,
-    less,
     within,
 )
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
@@ -144,7 +142,8 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
             places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
-            return [np.asarray(places, dtype=object)]
+            if places is not None:
+                return [np.asarray(places, dtype=object)]
         return _run(graph, inner, args)
     if name in MOVES:
         result = MOVES[name](params, *args)
@@ -250,11 +249,7 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     return _run(graph, jaxprs.solve, [*args[before : before + lengths.solve], *args[right:]])
 
 
-LOOPS: dict[str, Callable[..., list[Any]]] = {
-    "scan": _scan,
-    "cond": _cond,
-    "custom_linear_solve": _linear_solve,
-}
+LOOPS: dict[str, Callable[..., list[Any]]] = {"scan": _scan, "cond": _cond, "custom_linear_solve": _linear_solve}
 
 CALLS = "jit", "closed_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"
 """Operations that run another jaxpr. Custom derivatives have been applied before."""

@@ -39,11 +39,6 @@ values (K, q), weights (K, q); the segment that holds a late sample, (K,); resul
 the state, and this state, (K, 1 + n)."""
 
 
-def list_place_lengths(N: int) -> dict[str, int]:
-    """Return the lengths of the arrays that say what is active where: modes, then functions at N transitions."""
-    return {"modes": N + 1, "resets": N} | dict.fromkeys(AT_TRANSITIONS, N)
-
-
 class Length(NamedTuple):
     """A size, in doubles, that grows with the number of rows."""
 
@@ -55,70 +50,20 @@ class Length(NamedTuple):
         return self.fixed + self.each_row * rows
 
 
-def constraint_rows(library: Structure, sizes: Sizes) -> dict[str, int]:
-    """Return the rows of constraints: those of guards, one per transition, come first, "end" is the first terminal one.
-
-    "count" is the number of all rows.
-    """
-    end = sizes.N if library.guards else 0
-    return {"end": end, "count": end + sizes.m}
-
-
-def sums(library: Structure, sizes: Sizes) -> dict[str, int]:
-    """Return the sizes of the accumulators, which start at zero: they are the results."""
-    count = constraint_rows(library, sizes)["count"]
-    return {
-        "psi": sizes.n,
-        "J": 1,
-        "g": sizes.width,
-        "H": sizes.D * sizes.width,
-        "constraints": count,
-        "jacobian": count * sizes.width,
-        "errors": sizes.n,
-        CHECKED: 1,
-    }
-
-
-def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
-    """Return the sizes of the parts of the scratch space."""
-    n, N, width = sizes.n, sizes.N, sizes.width
-    derivatives = int(order > Order.COST)
-    resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
-    implicit = int(any(library.implicit))
-    late = int(any(sensor.delay is not None for sensor in library.measurements))
-    return {
-        "states": Length(n, n),
-        "reset_states": Length(N * n * resets),
-        "tangents": Length(n * width, n * width * derivatives),
-        "reset_tangents": Length(N * n * width * resets),
-        "stages": Length(0, STAGES * n * derivatives),
-        "stage_tangents": Length(0, STAGES * n * width * derivatives),
-        "kept": Length(0, count_kept(library, n, order) * derivatives),
-        "jumps": Length(n, n * derivatives * jumps),
-        "late": Length(0, n * derivatives * late),
-        "costates": Length(0, n * derivatives),
-        "increments": Length(len(STIFF.b) * n * implicit),
-        "newton": Length(2 * implicit),
-        "entries": Length(STAGES * (1 + n + sizes.M) ** 2),
-        "length": Length(width),
-        "late_row": Length(3 * late),
-        "late_closes": Length(width * late),
-        "late_stages": Length(STAGES * n * late),
-        "late_stage_tangents": Length(STAGES * n * width * late),
-        "late_kept": Length(count_kept(library, n, order) * late),
-        "late_state": Length(n * late),
-        "late_tangent": Length(n * width * late),
-        "late_psi": Length(n * late),
-        "late_J": Length(late),
-    }
-
-
 ZEROED = ("jumps", "late")
 """Parts of the scratch space that start at zero, as the accumulators do; others are written before they are read."""
 
 
 class Layout(NamedTuple):
-    """What `constraint_rows`, `sums` and `memory` return for one program and order."""
+    """Layout of the memory of a program.
+
+    Attributes
+    ----------
+    constraint_rows : the rows of constraints: those of guards, one per transition, come first, "end" is the first
+        terminal one, and "count" the number of all
+    sums : sizes of the accumulators, which start at zero: they are the results
+    memory : sizes of the parts of the scratch space; late samples have a row of their own behind all others
+    """
 
     constraint_rows: dict[str, int]
     sums: dict[str, int]
@@ -132,8 +77,32 @@ class Layout(NamedTuple):
 
 @lru_cache(maxsize=64)
 def layout_of(library: Structure, sizes: Sizes, order: Order) -> Layout:
-    """Return the layout of the memory of a program."""
-    return Layout(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order))
+    """Return the layout of the memory of a program with derivatives of an order."""
+    n, N, width = sizes.n, sizes.N, sizes.width
+    end = N if library.guards else 0
+    count = end + sizes.m
+    derivatives = int(order > Order.COST)
+    resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
+    implicit = int(any(library.implicit))
+    late = int(any(sensor.delay is not None for sensor in library.measurements))
+    of_row = {"stages": STAGES * n, "stage_tangents": STAGES * n * width, "kept": count_kept(library, n, order)}
+    sums = {"psi": n, "J": 1, "g": width, "H": sizes.D * width}
+    sums |= {"constraints": count, "jacobian": count * width, "errors": n, CHECKED: 1}
+    memory = {
+        "states": Length(n + n * late, n),
+        "reset_states": Length(N * n * resets),
+        "tangents": Length(n * width * (1 + late), n * width * derivatives),
+        "reset_tangents": Length(N * n * width * resets),
+        **{name: Length(size * late, size * derivatives) for name, size in of_row.items()},
+        "jumps": Length(n, n * derivatives * jumps),
+        "late": Length(0, n * derivatives * late),
+        "costates": Length(0, n * derivatives),
+        "increments": Length(len(STIFF.b) * n * implicit),
+        "newton": Length(2 * implicit),
+        "entries": Length(STAGES * (1 + n + sizes.M) ** 2),
+        "length": Length(width),
+    }
+    return Layout({"end": end, "count": count}, sums, memory)
 
 
 Pointers = dict[str, Value]
