@@ -12,12 +12,12 @@ import scipy.optimize
 import scipy.stats
 
 import switchfit as sf
+from switchfit.estimation import estimator
 from switchfit.estimation.local_fit import _drop_noise_of_times
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.result import termination_of
 from switchfit.fit.solution import REACH, _compute_reach, minimize_cost
-from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.runtime.errors import Issue
 
 # A capacitor that is charged through one resistor and discharged through another one
@@ -222,8 +222,8 @@ def test_a_callback_that_returns_true_and_ctrl_c_stop_the_fit_at_the_best_point_
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
     simulated = []
-    compare = SimulatedProblem.compare
-    monkeypatch.setattr(SimulatedProblem, "compare", lambda self: simulated.append(self) or compare(self))
+    compare = estimator.compare
+    monkeypatch.setattr(estimator, "compare", lambda *at: simulated.append(at) or compare(*at))
     fit = sf.estimate(capacitor(voltage(TIMES)))
     assert fit.status.successful
     assert not simulated

@@ -41,8 +41,7 @@ def clean(delay=0.0):
     blank = sf.Measurements(TIMES, np.zeros((24, 2)), observe=position, delay=delay, sigma=1.0)
     run = sf.Experiment(blank, ("free", "damped"), (1.23,), 0.0, 3.3)
     problem = sf.Problem(SYSTEM, run, TRUTH)
-    theta = problem.initial_theta
-    return compare(problem, theta, evaluator_of(problem).simulate(theta))[1][0][0].fitted
+    return compare(evaluator_of(problem), problem.initial_theta)[1][0][0].fitted
 
 
 def problem(*, sigma=0.02, noise=0.02, outliers=0, seed=0, values=None, more=None, k=2.0, tau=1.1, start=None, **data):

@@ -243,7 +243,7 @@ def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
         places += [(e, k) for k in items]
     sampled = replace(problem, experiments=runs)
     evaluator = Evaluator(sampled, meshes=[mesh.divide() for mesh in Evaluator(sampled, truth).meshes])
-    _, comparisons = compare(sampled, truth, evaluator.simulate(truth))
+    _, comparisons = compare(evaluator, truth)
     return dict(zip(places, (comparison.fitted for run in comparisons for comparison in run), strict=True))
 
 

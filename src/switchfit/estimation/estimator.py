@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.estimation.saved import Provenance, describe_python_problem, digest_data, load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import CovarianceKind, Fit, inverse_on
-from switchfit.fit.trajectory import SimulatedProblem
+from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
@@ -98,8 +98,8 @@ class Estimate(Fit, Tabular, Displayed):
         unknowns = (f"{name} = {value:.4g}" for name, value in zip(self.theta_names, self.theta, strict=True))
         return format_line(self, self.verdict.level, f"J = {self.cost:.6g}", join_first(unknowns))
 
-    def simulate_later(self, simulation: SimulatedProblem) -> None:
-        """Compute `trajectories` and `comparisons` from a simulation at the first access; many fits never need them.
+    def simulate_later(self, evaluator: Evaluator) -> None:
+        """Compute `trajectories` and `comparisons` on some meshes at the first access; many fits never need them.
 
         See Also
         --------
@@ -107,29 +107,26 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> from switchfit.fit.trajectory import SimulatedProblem
         >>> import switchfit as sf
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> len(fit.trajectories)
         1
-        >>> fit.simulate_later(SimulatedProblem(fit.evaluator_at_solution(), fit.theta))
+        >>> fit.simulate_later(fit.evaluator_at_solution())
         >>> fit.trajectory.states.shape[1]
         1
         """
         for name in ("trajectories", "comparisons"):
             del self.__dict__[name]
-        self.__dict__["_simulation"] = simulation
+        self.__dict__["_shown_on"] = evaluator
 
     def __getattr__(self, name: str) -> Any:
         """Compute `trajectories` or `comparisons` at the first access."""
-        simulation = self.__dict__.get("_simulation")
-        if simulation is None or name not in ("trajectories", "comparisons"):
+        if "_shown_on" not in self.__dict__ or name not in ("trajectories", "comparisons"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
-        trajectories, comparisons = simulation.compare()
+        trajectories, comparisons = compare(self.__dict__.pop("_shown_on"), self.theta)
         self.__dict__.update(trajectories=trajectories, comparisons=comparisons)
-        self.__dict__.pop("_simulation", None)
         return self.__dict__[name]
 
     @cached_property

@@ -238,7 +238,7 @@ def simulate_values(problem: Problem, e: int, theta: FloatArray, taken: list[NDA
         Sensors without any are left out.
     """
     run, data = problem.experiments[e], []
-    comparisons = compare(problem, theta, Evaluator(problem, theta).simulate(theta))[1][e]
+    comparisons = compare(Evaluator(problem, theta), theta)[1][e]
     for item, comparison, kept in zip(run.data, comparisons, taken, strict=True):
         if kept.any():
             sigma = item.sigma[kept] if getattr(item.sigma, "ndim", 0) == 2 else item.sigma

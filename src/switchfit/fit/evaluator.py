@@ -216,23 +216,18 @@ class Evaluator:
 
     def cost(self, theta: FloatArray) -> float:
         """Return J alone."""
-        return self.add_costs(
-            theta, [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]
-        )
-
-    def add_costs(self, theta: FloatArray, costs: Sequence[float]) -> float:
-        """Return J from the costs of all experiments at theta (d,)."""
-        return sum(costs, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
+        of_priors = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
+        return sum((engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)), of_priors)
 
     @property
     def engine(self) -> Engine:
         """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
         return summarize(self.engines, self.problem.run_names)
 
-    def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
-        """Simulate all experiments row by row, with derivatives in their own unknowns if `tangents`."""
+    def simulate(self, theta: FloatArray) -> list[Simulation]:
+        """Simulate all experiments row by row."""
         each = zip(self.engines, self._vectors(theta), strict=True)
-        return [engine.simulate(*at, tangents=tangents) for engine, at in each]
+        return [engine.simulate(*at, tangents=False) for engine, at in each]
 
     def _vectors(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Return the transition times (N,) and parameters (M,) of each experiment."""

@@ -502,7 +502,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     meaning: Meaning
     base = np.nan
     if all(isinstance(item, Measurements) for item in items):
-        comparisons = compare(problem, theta, own.simulate(theta))[1]
+        comparisons = compare(own, theta)[1]
         fitted = {(e, k): found.fitted for e, run in enumerate(comparisons) for k, found in enumerate(run)}
         clean = replace_values(problem, fitted)
         evaluator = Evaluator(clean, meshes=own.meshes)
