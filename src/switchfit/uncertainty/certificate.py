@@ -483,7 +483,7 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
     if fit.sigma_known is None:
         rise, meaning = 0.01 * abs(fit.cost), "1 % of J"
     else:
-        scale = fit.residual_variance if fit.sigma_known is False and fit.freedom > 0 else 1.0
+        scale = fit.variance_scale if fit.freedom > 0 else 1.0
         # The likelihood ratio 2 (J - J_0) / scale is at the square of the quantile there.
         rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
     subject = fit.theta_names, fit.theta_units, fit.is_time

@@ -123,7 +123,7 @@ class Trace:
         self.fit, self.evaluator, self.index = fit, evaluator.halved, index
         self.follower = Follower(self.evaluator)
         self.constraints = evaluator.problem.constraints
-        self.scale = fit.residual_variance if fit.sigma_known is False else 1.0
+        self.scale = fit.variance_scale
         self.starts = {side: self._describe(fit.theta, self.follower(fit.theta, side), True) for side in (-1, 1)}
         self.centre = self.starts[1]
         self.points = [self.centre]
