@@ -74,8 +74,9 @@ def fit_with_least_squares(case: Case, start: np.ndarray, evaluator: Evaluator) 
         if key not in found:
             found.clear()
             theta = back @ z
-            simulations = enumerate(evaluator.simulate(theta, tangents=True))
-            runs = [Sensitivity(simulation, problem.places[e], len(theta)) for e, simulation in simulations]
+            engines = enumerate(zip(evaluator.runs, evaluator.engines, strict=True))
+            simulations = [(e, engine.simulate(*run.vectors(theta), tangents=True)) for e, (run, engine) in engines]
+            runs = [Sensitivity(simulation, problem.places[e], theta) for e, simulation in simulations]
             found[key] = collect_sample_derivatives(problem, runs)
         return found[key]
 

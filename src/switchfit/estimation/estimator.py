@@ -40,7 +40,6 @@ from switchfit.uncertainty.prediction import (
     collect_sample_derivatives,
     compute_sensitivity,
     predict,
-    sum_score_products,
 )
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_covariance, correct_errors, diagnose
@@ -259,10 +258,10 @@ class Estimate(Fit, Tabular, Displayed):
             return super().covariance_from(hessian)
         if self.problem is None or self.sandwich_needs:
             raise ValueError(self.sandwich_needs)
-        B = sum_score_products(self.problem, collect_sample_derivatives(self.problem, self.sensitivities))
-        inverse = inverse_on(self.free_basis, self.hessian)
-        # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1
-        return np.asarray(self.samples / self.freedom * (inverse @ B @ inverse))
+        # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1, B = scores' scores
+        scores = collect_sample_derivatives(self.problem, self.sensitivities).scores
+        spread = scores @ inverse_on(self.free_basis, self.hessian)
+        return np.asarray(self.samples / self.freedom * (spread.T @ spread))
 
     @property
     def sandwich_needs(self) -> str:
