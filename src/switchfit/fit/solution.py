@@ -162,7 +162,6 @@ def minimize_cost(
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None = None,
     constraints: LinearConstraints | None = None,
-    by_blocks: bool | None = None,
     multipliers: Sequence[float] | None = None,
     follower: Follower | None = None,
 ) -> Result:
@@ -171,17 +170,16 @@ def minimize_cost(
     With a `follower` of the evaluator, meshes are made anew where they are too coarse: its own are then those of the
     result.
 
-    `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
-    several runs; by default, it is used where that is faster, and never with guards or terminal constraints, whose
-    `multipliers` may be known from a fit on other meshes.
+    `constraints` are by default those of the problem. The arrow shape of the Hessian of several runs is used where that
+    is faster, and never with guards or terminal constraints, whose `multipliers` may be known from a fit on other
+    meshes.
     """
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
     matrix: Matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
-    if by_blocks is None:
-        many = len(problem.experiments) >= MANY_RUNS and not names
-        by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
+    many = len(problem.experiments) >= MANY_RUNS and not names
+    by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = problem.constraints if constraints is None else constraints
     change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
