@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.estimation.saved import Provenance, describe_python_problem, digest_data, load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import CovarianceKind, Fit, inverse_on
-from switchfit.fit.trajectory import compare
+from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
 from switchfit.runtime.files import write_atomically
@@ -136,19 +137,16 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if self.saved_certificate is not None:
             return self.saved_certificate
+        self.__dict__.pop("verdict", None)  # from now on it includes the check of derivatives
         return certify(self, None if self.problem is None else Evaluator(self.problem, self.theta))
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """Whether to believe the numbers: good, doubtful or bad, why, and what to do next. Print it for one line.
 
         It includes the check of derivatives if the certificate was accessed before, or loaded.
         """
-        known = self.known_certificate
-        judged = self.__dict__.get("_verdict")
-        if judged is None or judged[0] is not known:
-            judged = self.__dict__["_verdict"] = known, judge(self, known)
-        return judged[1]
+        return judge(self, self.known_certificate)
 
     @property
     def success(self) -> bool:
@@ -844,8 +842,7 @@ class Estimate(Fit, Tabular, Displayed):
         fit = found.fit
         if problem is not None:
             _check_loaded(fit, problem, path)
-        own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
-        return cls(**own, saved_certificate=found.certificate, problem=problem, provenance=found.provenance)
+        return cls(**vars(fit), saved_certificate=found.certificate, problem=problem, provenance=found.provenance)
 
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
@@ -855,18 +852,15 @@ def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
             f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
             f"{', '.join(problem.theta_names)}: it is the fit of another problem."
         )
-    saved = [trajectory.time_unit for trajectory in fit.trajectories]
-    given = [experiment.time_unit for experiment in problem.experiments]
-    if saved != given:
+    runs = fit.trajectories, problem.experiments
+    clocks = [[(run.time_unit, run.origin and run.origin.instant) for run in each] for each in runs]
+    if clocks[0] != clocks[1]:
+        saved, given = (", ".join(map(_describe_clock, each)) for each in runs)
         raise ValueError(
-            f"{path} holds times in {', '.join(saved)}, the problem has them in {', '.join(given)}, and times are not "
-            "converted: give the problem's experiments the time_unit of the file."
+            f"{path} holds times in {saved}, the problem has them in {given}, and times are not converted: give the "
+            "problem's experiments the time_unit and the origin of the file."
         )
-    for trajectory, experiment in zip(fit.trajectories, problem.experiments, strict=True):
-        origins = (trajectory.origin, experiment.origin)
-        instants = [None if origin is None else origin.instant for origin in origins]
-        if instants[0] != instants[1]:
-            names = ["numbers" if origin is None else f"times since {origin.date}" for origin in origins]
-            raise ValueError(
-                f"{path} holds {names[0]}, the problem has {names[1]}: give its experiments the same origin."
-            )
+
+
+def _describe_clock(run: Trajectory | Experiment) -> str:
+    return run.time_unit if run.origin is None else f"{run.time_unit} since {run.origin.date}"

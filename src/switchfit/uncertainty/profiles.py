@@ -79,8 +79,6 @@ FAR = 1e2
 """A side is flat if the threshold is not crossed up to this many times the unknown's size or its standard error."""
 HALVINGS = 8
 """Largest number of times that a step is reduced because a fit fails or zeta rises too much."""
-MOST_KINKS = 10
-"""Largest number of sample times at which a profile is evaluated, to show the kinks there."""
 ITERATIONS = 100
 """Largest number of iterations of one fit along the profile."""
 
@@ -149,11 +147,6 @@ class Trace:
         """Return the points of one side from the estimate outwards, the estimate first."""
         chosen = [q for q in self.points if side * (q.value - self.centre.value) >= 0]
         return sorted(chosen, key=lambda q: side * q.value)
-
-    @property
-    def best(self) -> Point:
-        """The point with the lowest cost."""
-        return min(self.points, key=lambda q: q.cost)
 
     # --- adding points
 
@@ -375,20 +368,6 @@ class Trace:
             return last
         return float(side * np.inf) if end == "flat" else float("nan")
 
-    def find_edges(self, threshold: float) -> list[Point]:
-        """Return, on each side, the first point beyond the threshold, or the last one below it."""
-        sides = [self.list_side(side) for side in (-1, 1)]
-        return [next((q for q in points if abs(self.compute_zeta(q)) >= threshold), points[-1]) for points in sides]
-
-    def add_kinks(self, times: FloatArray, threshold: float) -> None:
-        """Add points at the sample times up to the threshold, where the slope may jump, unless there are many."""
-        low, high = (q.value for q in self.find_edges(threshold))
-        inside = times[(times > low) & (times < high)]
-        for time in inside if len(inside) <= MOST_KINKS else ():
-            if all(q.value != time for q in self.points):
-                nearest = int(np.argmin([abs(q.value - time) for q in self.points]))
-                self.add(float(time), self.points[nearest])
-
 
 @dataclass(frozen=True, eq=False)
 class Profile(Tabular, Displayed):
@@ -482,7 +461,7 @@ class Profile(Tabular, Displayed):
     @property
     def lower_cost(self) -> FloatArray | None:
         """Unknowns (d,) with a cost below that of the estimate, if any were found: start a new fit there."""
-        best = self.trace.best
+        best = min(self.trace.points, key=lambda q: q.cost)
         better = best.cost < self.trace.centre.cost - 1e-6 * self.trace.scale
         return best.theta.copy() if better else None
 
@@ -645,7 +624,6 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
         try:
             for side in (-1, 1):
                 trace.march(side, threshold)
-            trace.add_kinks(times, threshold)
             trace.find_regions(threshold)  # its points too are there from now on: tables, figure and repr agree
         except KeyboardInterrupt:
             trace.interrupted = True
