@@ -47,7 +47,7 @@ from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import count_times, show_time
 from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_level
+from switchfit.problem.validation import as_array, as_index, as_instance, as_level
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Drawn, draw_figure, format_html, format_line, join_first
 
@@ -439,9 +439,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
            [ 0.8,  1.6],
            [-0. ,  0.8]])
     """
-    fit: Fit = estimate
-    if not isinstance(fit, Fit):
-        raise TypeError(f"predict needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
+    fit = as_instance(estimate, "estimate", Fit, "what sf.estimate returns: fit the problem first")
     evaluator = estimate.evaluator_at_solution()
     problem: Problem = evaluator.problem
     experiment = as_index(experiment, "experiment", len(problem.experiments))

@@ -50,7 +50,7 @@ from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.problem.validation import as_callable, as_flag, as_level, as_name, join_names, shorten
+from switchfit.problem.validation import as_callable, as_flag, as_instance, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
@@ -603,9 +603,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     >>> [round(float(end), 1) for end in sf.profile(fit, "tau_1").interval(0.95)]
     [2.4, 2.5]
     """
-    fit: Fit = estimate
-    if not isinstance(fit, Fit):
-        raise TypeError(f"profile needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
+    fit = as_instance(estimate, "estimate", Fit, "what sf.estimate returns: fit the problem first")
     if as_name(name, "name") not in fit.theta_names:
         raise ValueError(f"there is no unknown {shorten(name)}; the unknowns are {join_names(fit.theta_names)}.")
     level = as_level(level)
