@@ -225,7 +225,7 @@ def test_what_cannot_be_predicted(fitted):
         (fitted, {"times": [1.0, -0.5]}, ValueError, r"times must not lie before t0 = 0.0 s, .*; got -0.5"),
         (fitted, {"times": [np.nan]}, ValueError, "times must be finite numbers of shape"),
         (fitted, {"experiment": 1}, ValueError, r"experiment must lie in 0..0; got 1"),
-        (fitted.problem, {}, TypeError, "estimate must be what sf.estimate returns: fit the problem first; got Problem"),
+        (fitted.problem, {}, TypeError, r"must be what sf.estimate returns: .*; got Problem"),
         (without, {}, ValueError, "There are no bands without a covariance"),
         (ends, {"times": [9.0]}, ValueError, r"times must not lie after tf where tf is estimated.*; got 9"),
     ):
