@@ -15,7 +15,7 @@ from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
 from switchfit.report.sentences import format_share
-from switchfit.uncertainty.answers import Doubt, Numbers, compare_with_sigma, find_doubts, find_levels
+from switchfit.uncertainty.answers import Numbers, compare_with_sigma, find_doubts
 from switchfit.uncertainty.residuals import correct_correlation
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -114,11 +114,6 @@ def test_chi_square_is_beyond_chance_and_clearly_off(chi_square, freedom, fits, 
     """Of 98 degrees of freedom a thousandth is above 146 and below 60; of 10,000, the ratio decides."""
     probability, is_size = compare_with_sigma(chi_square, freedom)
     assert (probability >= 1e-3, is_size) == (fits, known)
-
-
-def test_the_level_of_many_fits_is_the_worst_of_each():
-    doubts = [Doubt("no noise", "doubtful", np.array([True, True, False])), Doubt("x", "bad", np.array([1, 0, 0]) > 0)]
-    assert find_levels(doubts, 3).tolist() == ["bad", "doubtful", "good"]
 
 
 # --- situations -------------------------------------------------------------------------------------------------------
