@@ -254,32 +254,22 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if as_choice(hessian, "hessian", get_args(CovarianceKind)) != "sandwich":
             return super().covariance_from(hessian)
-        if self.problem is None or self.sandwich_needs:
-            raise ValueError(self.sandwich_needs)
+        if self.problem is None or not self.has_sandwich:
+            raise ValueError(
+                "The sandwich covariance needs the gradient of each sample: the problem, with a cost of Measurements "
+                "alone, without guards, terminal constraints, priors, and parameters that are a sigma or a delay, and "
+                "with more values than free unknowns. Use hessian='exact', or sf.bootstrap."
+            )
         # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1, B = scores' scores
         scores = collect_sample_derivatives(self.problem, self.sensitivities).scores
         spread = scores @ inverse_on(self.free_basis, self.hessian)
         return np.asarray(self.samples / self.freedom * (spread.T @ spread))
 
     @property
-    def sandwich_needs(self) -> str:
-        """What ``covariance_from("sandwich")`` needs and this estimate lacks, as a sentence; empty if there is one."""
-        if self.problem is None:
-            return (
-                "The sandwich covariance needs the gradient of each sample: fit the problem again, or load the "
-                "estimate with its problem."
-            )
-        if self.sigma_known is None or self.constraints or not self.problem.has_plain_samples:
-            return (
-                "The sandwich covariance needs a cost of Measurements alone, without guards, terminal constraints, "
-                "priors, and parameters that are a sigma or a delay. Use hessian='exact', or sf.bootstrap."
-            )
-        if self.freedom < 1:
-            return (
-                f"The sandwich covariance needs more values than free unknowns; got {self.samples} values for "
-                f"{self.free_basis.shape[1]}. Use hessian='exact'."
-            )
-        return ""
+    def has_sandwich(self) -> bool:
+        """Whether there is a ``covariance_from("sandwich")``."""
+        has_gradients = self.problem is not None and self.sigma_known is not None and self.problem.has_plain_samples
+        return has_gradients and not self.constraints and self.freedom > 0
 
     def has_room_for_sensitivities(self) -> bool:
         """Return whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.

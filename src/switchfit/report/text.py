@@ -355,7 +355,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     if not known or corrected:
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent." if known else ""
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
-    has_sandwich = isinstance(fit, Estimate) and not fit.sandwich_needs
+    has_sandwich = isinstance(fit, Estimate) and fit.has_sandwich
     other = ": covariance_from('sandwich') does not." if has_sandwich else "."
     exact = f"the exact Hessian{_compare_covariances(fit)}"
     matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else exact
