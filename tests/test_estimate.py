@@ -473,5 +473,3 @@ def test_a_minimum_to_the_accuracy_of_its_cost_has_converged():
     assert almost.cost - best.cost < almost.integration_error * best.cost
     assert almost.verdict.level == best.verdict.level == "good"
     assert "below the error of the cost" in almost.message
-
-
