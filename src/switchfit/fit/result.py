@@ -22,7 +22,7 @@ from switchfit.optimize.threads import one_thread
 from switchfit.problem.data import FloatArray
 from switchfit.problem.inspection import find_comparisons, find_unread
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import ActiveConstraint, Constraint
+from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.problem.validation import as_level
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
@@ -136,6 +136,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         Iterations before, on coarser meshes, where the optimizer resumed a fit.
     """
     names = problem.unknowns.names
+    multipliers = dict(zip(problem.constraints.names, result.multipliers.tolist(), strict=True))
     smallest: float = np.nan
     flat: tuple[tuple[str, float], ...] = ()
     if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status needs them
@@ -147,7 +148,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         tolerance=result.tolerance,
         iterations=earlier + result.iterations,
         earlier_iterations=earlier,
-        active=_list_active(result, problem),
+        active=tuple(ActiveConstraint(**vars(each), multiplier=multipliers[each]) for each in result.active),
         kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
         idle=tuple(names[i] for i in result.idle),
         smallest_eigenvalue=smallest,
@@ -163,14 +164,6 @@ def _list_largest(direction: FloatArray, names: Sequence[str]) -> tuple[tuple[st
     parts = np.abs(direction)
     largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
     return tuple((names[i], float(direction[i])) for i in largest)
-
-
-def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
-    if not result.active:
-        return ()
-    multipliers = dict(zip(problem.constraints.names, result.multipliers.tolist(), strict=True))
-    found = [constraint for constraint in result.active if isinstance(constraint, Constraint)]
-    return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
 
 def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:
