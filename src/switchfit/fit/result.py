@@ -703,6 +703,8 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     If it is not positive definite in some directions, only unknowns with a component in these are NaN. For the others
     the pseudo-inverse is used: if one of many runs is not determined, the other runs keep their variances.
     """
+    if not np.isfinite(hessian).all():
+        return np.full(hessian.shape, np.nan)
     values, vectors, size = compute_scaled_spectrum(hessian, Z)
     kept = values > UNDETERMINED
     root = size[:, None] * vectors[:, kept] / np.sqrt(values[kept])
@@ -742,14 +744,14 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     """Return the scaled spectrum of a Hessian (d, d) on the directions Z (d, k), which need not be orthonormal.
 
     Eigenvalues of the size of rounding, whose digits differ from processor to processor, are 0. NaN if the Hessian is
-    not finite, or near the limits of float64.
+    not finite, or its numbers are near the limits of float64.
     """
     diagonal = np.abs(np.diag(hessian))
     size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
     basis = np.linalg.qr(Z / size[:, None])[0] * Z.any(axis=1)[:, None]  # exactly 0 for what is held
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = basis.T @ (hessian * np.outer(size, size)) @ basis
-    if not (np.isfinite(hessian).all() and np.isfinite(scaled).all()):
+    if not np.isfinite(scaled).all():
         return ScaledSpectrum(np.full(len(scaled), np.nan), np.full(basis.shape, np.nan), size)
     values, vectors = np.linalg.eigh(scaled)
     rounding = len(values) * np.finfo(float).eps * np.abs(values).max(initial=0.0)
