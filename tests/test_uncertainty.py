@@ -72,6 +72,11 @@ def test_the_factor_between_the_covariances_goes_either_way(part):
     assert (unseen in warnings_of(fit)[0]) == (part < 1e-4)
 
 
+def test_what_no_sample_shows_to_first_order_is_not_hidden_by_rounding():
+    hessian, unseen = np.array([[100.0, 60.0, 0.0], [60.0, 400.0, 0.0], [0.0, 0.0, 900.0]]), np.diag([1.0, 1e-11, 1.0])
+    assert disagreement(made(hessian=hessian, saved_gauss_newton=unseen @ hessian @ unseen)).factor > 1e10
+
+
 def test_no_covariance_of_another_kind():
     with pytest.raises(ValueError, match="hessian must be 'exact', 'gauss-newton' or 'sandwich'; got 'fisher'"):
         sf.estimate(noisy_decay(0.1)).covariance_from("fisher")

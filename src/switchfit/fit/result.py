@@ -672,14 +672,15 @@ def disagreement(fit: Fit) -> Disagreement | None:
     if not all(np.isfinite(covariance).all() for covariance in both):
         return None
     errors = np.sqrt([np.diag(covariance) for covariance in both])
-    values, vectors, size = compute_scaled_spectrum(fit.hessian, Z)
-    root = size[:, None] * vectors / np.sqrt(values)  # root' H root = 1
-    ratios = np.linalg.eigvalsh(root.T @ A @ root)
+    ratios = []
+    for one, other in ((fit.hessian, A), (A, fit.hessian)):  # of each the largest, which no rounding hides
+        values, vectors, size = compute_scaled_spectrum(one, Z)
+        root = size[:, None] * vectors / np.sqrt(values)  # root' one root = 1
+        ratios.append(float(np.linalg.eigvalsh(root.T @ other @ root)[-1]))
     held = errors[0] <= 0
     changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
     k = int(np.argmax(changes))
-    factor = float(np.sqrt(max(ratios[-1], 1 / ratios[0])))
-    return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
+    return Disagreement(max(ratios) ** 0.5, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:
