@@ -20,7 +20,7 @@ SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS, IMPLICIT_ROWS = "paper_adjoint.py", "discretization/rows.py", "discretization/implicit_rows.py"
 MODEL, PROPAGATION = "discretization/model.py", "discretization/propagation.py"
-STRUCTURE, CORNERS = "problem/structure.py", "problem/corners.py"
+STRUCTURE, CORNERS, EVALUATOR = "problem/structure.py", "problem/corners.py", "fit/evaluator.py"
 ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
 DIRECTION, POINT, QP, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "qp", "state"))
 PROGRAMS, COURSE, SPLIT = "engine/jax.py", "engine/branches.py", "engine/choice.py"
@@ -337,9 +337,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "information of one side": swap(CRITERION, "SIDES = (1, -1)", "SIDES = (1, 1)"),
         "scales left out": swap(CRITERION, "basis[self.chosen] / self.scales[:, None]", "basis[self.chosen]"),
         "priors and other runs left out": swap(CRITERION, "self.information - sum(found))", "0 * self.information)"),
-        "guarded times stay where they are": swap(
-            CRITERION, "= -np.linalg.solve(slopes", "= -0 * np.linalg.solve(slopes"
-        ),
+        "guarded times stay where they are": swap(EVALUATOR, "Z[guarded] = -np.linalg", "Z[guarded] = -0 * np.linalg"),
         "weights of samples left out": swap(CRITERION, "taken, C, w, C)", "taken, C, w**0, C)"),
         "samples that are not taken count": swap(CRITERION, "taken, C, w, C)", "taken**0, C, w, C)"),
         "information of sigma once": swap(CRITERION, "+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum"),

@@ -374,7 +374,7 @@ def test_a_saved_fit_has_the_dates(fits, tmp_path):
     assert str(loaded) == str(dated)
     assert loaded.trajectory.origin == dated.trajectory.origin
     for problem in (room(dated=True, origin="2020-03-19"), room(dated=False)):
-        with pytest.raises(ValueError, match=r"times since 2020-03-20T00:00:00\+01:00, the problem has (num|times s)"):
+        with pytest.raises(ValueError, match=r"since 2020-03-20T00:00:00\+01:00, the problem has them in"):
             sf.Estimate.load(tmp_path / "fit.json", problem=problem)
 
 

@@ -50,22 +50,6 @@ def test_fishing_from_equal_spacing():
     assert found.cost < 1.35
 
 
-def test_collapsed_modes_are_named():
-    """Fishing all of the time between the second and the third switch: two modes too many, which must vanish."""
-    times = (2.4, 4.1, 4.5, 4.6, 8.0, 8.5, 9.0, 10.0)
-    found = sf.estimate(fishing(times), strategy="local", hessian="exact")
-    assert found.success
-    assert found.optimality < 1e-7
-    tau = found.transition_times[0]
-    collapsed = np.flatnonzero(np.diff(tau) <= 4 * np.spacing(tau[1:]))  # feasible up to units in the last place
-    assert len(collapsed)
-    for i in collapsed:
-        assert ("collapsed", i + 1) in [(constraint.kind, constraint.position) for constraint in found.active]
-    assert str(found).startswith("Doubtful: ")
-    assert " collapsed" in str(found.verdict)
-    assert "has collapsed" in found.report(full=True)
-
-
 @pytest.mark.parametrize(
     "method", ["adjoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "discrete-adjoint"))]
 )

@@ -60,17 +60,6 @@ def test_the_gauss_newton_covariance_in_closed_form():
     np.testing.assert_array_equal(fit.covariance_from("exact"), fit.covariance)
 
 
-def test_where_the_covariances_differ_the_report_says_so():
-    """The model far from its data: the second derivatives of h matter."""
-    near, far = sf.estimate(noisy_decay(0.01)), sf.estimate(noisy_decay(0.4, seed=3))
-    assert disagreement(near).factor < 1.02
-    assert "Gauss-Newton's are within" in str(near)
-    ratios = np.linalg.eigvals(np.linalg.solve(far.covariance, far.covariance_from("gauss-newton"))).real
-    assert disagreement(far).factor == pytest.approx(np.sqrt(max(ratios.max(), 1 / ratios.min())), rel=1e-9)
-    assert disagreement(far).factor > 1.2
-    assert any("Standard errors from the exact Hessian and from the Gauss-Newton" in w for w in warnings_of(far))
-
-
 @pytest.mark.parametrize("part", [4.0, 0.25, 1e-8])
 def test_the_factor_between_the_covariances_goes_either_way(part):
     hessian = np.diag([100.0, 400.0, 900.0])
@@ -81,6 +70,11 @@ def test_the_factor_between_the_covariances_goes_either_way(part):
     assert found.gauss_newton == pytest.approx(0.05 / np.sqrt(part), rel=1e-12)
     unseen = "To first order the fitted values hardly depend on tau_2: its standard errors"
     assert (unseen in warnings_of(fit)[0]) == (part < 1e-4)
+
+
+def test_what_no_sample_shows_to_first_order_is_not_hidden_by_rounding():
+    hessian, unseen = np.array([[100.0, 60.0, 0.0], [60.0, 400.0, 0.0], [0.0, 0.0, 900.0]]), np.diag([1.0, 1e-11, 1.0])
+    assert disagreement(made(hessian=hessian, saved_gauss_newton=unseen @ hessian @ unseen)).factor > 1e10
 
 
 def test_no_covariance_of_another_kind():
@@ -374,17 +368,6 @@ def test_a_gap_of_unstable_adjoints_is_no_failure():
     assert check.passed, check
 
 
-def test_a_cost_that_is_not_finite_fails():
-    """A model that is defined at theta itself, and not a step beside it."""
-
-    def undefined(t, x, p):
-        return jnp.array([jnp.where(p["a"] == 1.0, 1.0, jnp.nan)])
-
-    check = sf.check_derivatives(observed(undefined, 0.0 * TIMES, {"a": 1.0}, 0.1), paper=False)
-    assert not check.passed
-    assert [issue.kind for issue in check.failures] == ["cost not finite"]
-
-
 def test_explicit_steps_that_blow_up_are_not_called_wrong_derivatives():
     """LuGre friction with the published stiffness, which takes 20,000 explicit steps at the limit of stability."""
     case = vehicle_coverage.CASES["lugre, spring"]()
@@ -466,11 +449,8 @@ def test_the_sandwich_of_a_line_is_that_of_white():
 def test_no_sandwich_without_the_gradients_of_the_samples(tmp_path):
     fit = location(np.random.default_rng(0).standard_normal(30))
     fit.save(tmp_path / "fit.json")
-    with pytest.raises(ValueError, match="needs the gradient of each sample: fit the problem again"):
-        sf.Estimate.load(tmp_path / "fit.json").covariance_from("sandwich")
     with_prior = location(np.zeros(30), m=sf.Parameter(0.1, prior=sf.Normal(0.0, 1.0)))
-    with pytest.raises(ValueError, match="needs a cost of Measurements alone, without guards"):
-        with_prior.covariance_from("sandwich")
     assert "They take the robust loss as that of the noise." in one_line(with_prior)
-    with pytest.raises(ValueError, match="needs more values than free unknowns; got 1 values for 1"):
-        location(np.array([0.3])).covariance_from("sandwich")
+    for without in (sf.Estimate.load(tmp_path / "fit.json"), with_prior, location(np.array([0.3]))):
+        with pytest.raises(ValueError, match="needs the gradient of each sample: the problem, with a cost of Meas"):
+            without.covariance_from("sandwich")

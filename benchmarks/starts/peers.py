@@ -45,7 +45,7 @@ def resume(fit: Fit) -> Callable[[Case, np.ndarray], End]:
             calls, iterations, seconds = calls + end.evaluations, iterations + end.iterations, seconds + end.optimizing
             theta = np.array(end.theta)
             held = evaluator.constrained(theta).constraints if problem.constraint_names else []
-            _, error, _ = judge_meshes(evaluator, theta, end.said, first_cost, held, first=not attempt)
+            _, _, error, _ = judge_meshes(evaluator, theta, end.said, first_cost, held, first=not attempt)
             excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
             if attempt == REFINEMENTS or not excess > 1:
                 break
@@ -74,8 +74,9 @@ def fit_with_least_squares(case: Case, start: np.ndarray, evaluator: Evaluator) 
         if key not in found:
             found.clear()
             theta = back @ z
-            simulations = enumerate(evaluator.simulate(theta, tangents=True))
-            runs = [Sensitivity(simulation, problem.places[e], len(theta)) for e, simulation in simulations]
+            engines = enumerate(zip(evaluator.runs, evaluator.engines, strict=True))
+            simulations = [(e, engine.simulate(*run.vectors(theta), tangents=True)) for e, (run, engine) in engines]
+            runs = [Sensitivity(simulation, problem.places[e], theta) for e, simulation in simulations]
             found[key] = collect_sample_derivatives(problem, runs)
         return found[key]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, make_dataclass
+from dataclasses import dataclass, make_dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Self, get_type_hints
@@ -32,7 +32,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.faults import refuse_hidden_switches
-from switchfit.fit.result import Fit, interval, measure_quantile
+from switchfit.fit.result import interval, measure_quantile
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
@@ -103,7 +103,7 @@ def load_best(content: Any) -> Estimate | None:
     if not isinstance(content, Mapping):
         raise ValueError("best must be an object")
     fit, certificate = parse_fit(content)
-    return Estimate(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
+    return Estimate(**vars(fit), saved_certificate=certificate)
 
 
 @dataclass(frozen=True, eq=False)

@@ -230,7 +230,7 @@ class LogPosterior:
         return np.asarray(np.linalg.solve(self.root, z - self.center), dtype=np.float64)
 
     def to_arviz(self, samples: ArrayLike) -> Any:
-        """Return samples with a variable for each unknown: ArviZ's InferenceData, or a DataTree for ArviZ 1.0.
+        """Return samples with a variable for each unknown: ArviZ's InferenceData.
 
         Parameters
         ----------

@@ -268,7 +268,7 @@ def _compute_acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
     A sample's influence is to first order ``-H^-1 g``, g being the gradient of its part of the cost.
     """
     found = collect_sample_derivatives(estimate.evaluator_at_solution().problem, estimate.sensitivities)
-    gradients = (found.weight * found.residual)[:, None] * found.derivative
+    gradients = found.scores
     if by_run:
         runs = len(estimate.trajectories)
         gradients = np.array([gradients[found.experiment == e].sum(0) for e in range(runs)])

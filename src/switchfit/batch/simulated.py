@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,7 @@ from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.mesh import Mesh, split_by_cell
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
-from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_near_guards
+from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_guards
 from switchfit.fit.trajectory import compare, replace_values
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
@@ -191,14 +192,10 @@ def monte_carlo(
 
 
 def _move_onto_guards(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Return `theta` with guarded times on their guards, found on meshes that resolve the trajectory there.
-
-    On the mesh of the first guess, the times of a stiff model miss their guards by more than their standard errors.
-    """
-    if not any(structure.guarded for structure in problem.structures):
-        return theta
-    near = place_on_near_guards(Evaluator(problem, theta), theta)
-    return place_on_near_guards(Evaluator(problem, near), near)
+    """Return `theta` with guarded times on their guards; as it is where there are none, or no such point is near."""
+    with suppress(ValueError):
+        return place_on_guards(problem, theta)[1]
+    return theta
 
 
 def _check_noise(noise: Noise) -> Noise:
@@ -243,7 +240,7 @@ def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
         places += [(e, k) for k in items]
     sampled = replace(problem, experiments=runs)
     evaluator = Evaluator(sampled, meshes=[mesh.divide() for mesh in Evaluator(sampled, truth).meshes])
-    _, comparisons = compare(sampled, truth, evaluator.simulate(truth))
+    _, comparisons = compare(evaluator, truth)
     return dict(zip(places, (comparison.fitted for run in comparisons for comparison in run), strict=True))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.estimation.saved import Provenance, describe_python_problem, digest_data, load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import CovarianceKind, Fit, inverse_on
-from switchfit.fit.trajectory import SimulatedProblem
+from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
 from switchfit.runtime.files import write_atomically
@@ -40,7 +41,6 @@ from switchfit.uncertainty.prediction import (
     collect_sample_derivatives,
     compute_sensitivity,
     predict,
-    sum_score_products,
 )
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_covariance, correct_errors, diagnose
@@ -98,8 +98,8 @@ class Estimate(Fit, Tabular, Displayed):
         unknowns = (f"{name} = {value:.4g}" for name, value in zip(self.theta_names, self.theta, strict=True))
         return format_line(self, self.verdict.level, f"J = {self.cost:.6g}", join_first(unknowns))
 
-    def simulate_later(self, simulation: SimulatedProblem) -> None:
-        """Compute `trajectories` and `comparisons` from a simulation at the first access; many fits never need them.
+    def simulate_later(self, evaluator: Evaluator) -> None:
+        """Compute `trajectories` and `comparisons` on some meshes at the first access; many fits never need them.
 
         See Also
         --------
@@ -107,29 +107,26 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> from switchfit.fit.trajectory import SimulatedProblem
         >>> import switchfit as sf
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> len(fit.trajectories)
         1
-        >>> fit.simulate_later(SimulatedProblem(fit.evaluator_at_solution(), fit.theta))
+        >>> fit.simulate_later(fit.evaluator_at_solution())
         >>> fit.trajectory.states.shape[1]
         1
         """
         for name in ("trajectories", "comparisons"):
             del self.__dict__[name]
-        self.__dict__["_simulation"] = simulation
+        self.__dict__["_shown_on"] = evaluator
 
     def __getattr__(self, name: str) -> Any:
         """Compute `trajectories` or `comparisons` at the first access."""
-        simulation = self.__dict__.get("_simulation")
-        if simulation is None or name not in ("trajectories", "comparisons"):
+        if "_shown_on" not in self.__dict__ or name not in ("trajectories", "comparisons"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
-        trajectories, comparisons = simulation.compare()
+        trajectories, comparisons = compare(self.__dict__.pop("_shown_on"), self.theta)
         self.__dict__.update(trajectories=trajectories, comparisons=comparisons)
-        self.__dict__.pop("_simulation", None)
         return self.__dict__[name]
 
     @cached_property
@@ -140,19 +137,16 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if self.saved_certificate is not None:
             return self.saved_certificate
+        self.__dict__.pop("verdict", None)  # from now on it includes the check of derivatives
         return certify(self, None if self.problem is None else Evaluator(self.problem, self.theta))
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """Whether to believe the numbers: good, doubtful or bad, why, and what to do next. Print it for one line.
 
         It includes the check of derivatives if the certificate was accessed before, or loaded.
         """
-        known = self.known_certificate
-        judged = self.__dict__.get("_verdict")
-        if judged is None or judged[0] is not known:
-            judged = self.__dict__["_verdict"] = known, judge(self, known)
-        return judged[1]
+        return judge(self, self.known_certificate)
 
     @property
     def success(self) -> bool:
@@ -260,32 +254,22 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if as_choice(hessian, "hessian", get_args(CovarianceKind)) != "sandwich":
             return super().covariance_from(hessian)
-        if self.problem is None or self.sandwich_needs:
-            raise ValueError(self.sandwich_needs)
-        B = sum_score_products(self.problem, collect_sample_derivatives(self.problem, self.sensitivities))
-        inverse = inverse_on(self.free_basis, self.hessian)
-        # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1
-        return np.asarray(self.samples / self.freedom * (inverse @ B @ inverse))
+        if self.problem is None or not self.has_sandwich:
+            raise ValueError(
+                "The sandwich covariance needs the gradient of each sample: the problem, with a cost of Measurements "
+                "alone, without guards, terminal constraints, priors, and parameters that are a sigma or a delay, and "
+                "with more values than free unknowns. Use hessian='exact', or sf.bootstrap."
+            )
+        # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1, B = scores' scores
+        scores = collect_sample_derivatives(self.problem, self.sensitivities).scores
+        spread = scores @ inverse_on(self.free_basis, self.hessian)
+        return np.asarray(self.samples / self.freedom * (spread.T @ spread))
 
     @property
-    def sandwich_needs(self) -> str:
-        """What ``covariance_from("sandwich")`` needs and this estimate lacks, as a sentence; empty if there is one."""
-        if self.problem is None:
-            return (
-                "The sandwich covariance needs the gradient of each sample: fit the problem again, or load the "
-                "estimate with its problem."
-            )
-        if self.sigma_known is None or self.constraints or not self.problem.has_plain_samples:
-            return (
-                "The sandwich covariance needs a cost of Measurements alone, without guards, terminal constraints, "
-                "priors, and parameters that are a sigma or a delay. Use hessian='exact', or sf.bootstrap."
-            )
-        if self.freedom < 1:
-            return (
-                f"The sandwich covariance needs more values than free unknowns; got {self.samples} values for "
-                f"{self.free_basis.shape[1]}. Use hessian='exact'."
-            )
-        return ""
+    def has_sandwich(self) -> bool:
+        """Whether there is a ``covariance_from("sandwich")``."""
+        has_gradients = self.problem is not None and self.sigma_known is not None and self.problem.has_plain_samples
+        return has_gradients and not self.constraints and self.freedom > 0
 
     def has_room_for_sensitivities(self) -> bool:
         """Return whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.
@@ -848,8 +832,7 @@ class Estimate(Fit, Tabular, Displayed):
         fit = found.fit
         if problem is not None:
             _check_loaded(fit, problem, path)
-        own = {f.name: getattr(fit, f.name) for f in fields(Fit)}
-        return cls(**own, saved_certificate=found.certificate, problem=problem, provenance=found.provenance)
+        return cls(**vars(fit), saved_certificate=found.certificate, problem=problem, provenance=found.provenance)
 
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
@@ -859,18 +842,15 @@ def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
             f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
             f"{', '.join(problem.theta_names)}: it is the fit of another problem."
         )
-    saved = [trajectory.time_unit for trajectory in fit.trajectories]
-    given = [experiment.time_unit for experiment in problem.experiments]
-    if saved != given:
+    runs = fit.trajectories, problem.experiments
+    clocks = [[(run.time_unit, run.origin and run.origin.instant) for run in each] for each in runs]
+    if clocks[0] != clocks[1]:
+        saved, given = (", ".join(map(_describe_clock, each)) for each in runs)
         raise ValueError(
-            f"{path} holds times in {', '.join(saved)}, the problem has them in {', '.join(given)}, and times are not "
-            "converted: give the problem's experiments the time_unit of the file."
+            f"{path} holds times in {saved}, the problem has them in {given}, and times are not converted: give the "
+            "problem's experiments the time_unit and the origin of the file."
         )
-    for trajectory, experiment in zip(fit.trajectories, problem.experiments, strict=True):
-        origins = (trajectory.origin, experiment.origin)
-        instants = [None if origin is None else origin.instant for origin in origins]
-        if instants[0] != instants[1]:
-            names = ["numbers" if origin is None else f"times since {origin.date}" for origin in origins]
-            raise ValueError(
-                f"{path} holds {names[0]}, the problem has {names[1]}: give its experiments the same origin."
-            )
+
+
+def _describe_clock(run: Trajectory | Experiment) -> str:
+    return run.time_unit if run.origin is None else f"{run.time_unit} since {run.origin.date}"

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.accuracy import Follower, worst_error
+from switchfit.fit.accuracy import Follower, constraint_errors, cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
 from switchfit.fit.faults import explain_nonfinite
 from switchfit.fit.result import termination_of
 from switchfit.fit.solution import minimize_cost
-from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
 from switchfit.optimize.matrix import Dense, null_space
@@ -111,8 +110,8 @@ def fit_locally(
         values = [value for _, value, _ in result.equalities]
         multipliers = [multiplier for _, _, multiplier in result.equalities] or None
         first_meshes = not attempt and not followed
-        simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=first_meshes)
-        if _is_within_error(problem, result, abs(simulation.cost - result.cost)):
+        fine, fine_cost, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=first_meshes)
+        if _is_within_error(problem, result, abs(fine_cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if attempt == REFINEMENTS or result.status in STOPPED or not excess > 1:
@@ -135,12 +134,12 @@ def fit_locally(
         evaluations=evaluations,
         trajectories=(),
         comparisons=(),
-        integration_error=float(error),
+        integration_error=error,
         integration_error_of=output,
         seconds=time.perf_counter() - began,
         initial_cost=history[0].cost if history else np.nan,
     )
-    found.simulate_later(simulation)
+    found.simulate_later(fine)
     return found
 
 
@@ -239,8 +238,8 @@ def judge_meshes(
     constraints: Sequence[float],
     *,
     first: bool,
-) -> tuple[SimulatedProblem, float, str]:
-    """Return the simulation at theta with all steps halved, the largest integration error and its output.
+) -> tuple[Evaluator, float, float, str]:
+    """Return the problem with all steps at theta halved, J there, the largest integration error and its output.
 
     The first meshes are mostly too coarse. Halved cells show this as well as halved rows do: they are tried first on
     the problem's own meshes, for their evaluator is kept for the next fit of the same problem.
@@ -257,12 +256,17 @@ def judge_meshes(
         Whether the meshes are those that the fit began with.
     """
     by_cells = first and is_kept(evaluator)
+    problem = evaluator.problem
+    outputs = ("J", *problem.constraint_names)
     for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not by_cells :]:
-        simulation = SimulatedProblem(halve(), theta)
-        error, output = worst_error(simulation, cost=cost, first_cost=first_cost, constraints=constraints)
-        if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
+        fine = halve()
+        fine_cost = fine.cost(theta)
+        errors = [cost_error(problem, fine_cost, cost, first_cost), *constraint_errors(fine, theta, constraints)]
+        worst = int(np.argmax(errors))  # NaN counts as the largest
+        error, output = float(errors[worst]), outputs[worst]
+        if error > max(LARGEST_INTEGRATION_ERROR, problem.rtol):
             break
-    return simulation, error, output
+    return fine, fine_cost, error, output
 
 
 def refine_meshes(

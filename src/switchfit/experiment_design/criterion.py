@@ -48,7 +48,7 @@ from switchfit.discretization.mesh import Arguments, build_arguments, split_by_c
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate, see_samples
 from switchfit.engine.choice import engine_of
-from switchfit.fit.evaluator import Evaluator, find_guarded_places, on_guards
+from switchfit.fit.evaluator import Evaluator, find_free_directions, place_on_guards
 from switchfit.fit.result import inverse_on
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import FloatArray
@@ -195,12 +195,8 @@ class Nominal:
         self.problem, self.e, self.theta, self.evaluator = problem, e, theta, Evaluator(problem, theta)
         self.basis = np.eye(len(theta))
         if problem.constraint_names:
-            self.evaluator = Evaluator(problem, on_guards(self.evaluator, theta))
-            self.theta = on_guards(self.evaluator, theta)
-            slopes, guarded = self.evaluator.constrained(self.theta).jacobian, find_guarded_places(problem)
-            free = np.setdiff1d(np.arange(len(theta)), guarded)
-            self.basis = self.basis[:, free]
-            self.basis[guarded] = -np.linalg.solve(slopes[:, guarded], slopes[:, free])
+            self.evaluator, self.theta = place_on_guards(problem, theta)
+            self.basis = find_free_directions(problem, self.evaluator.constrained(self.theta).jacobian)
         each_side = (self.evaluator(self.theta, side, matrix="gauss-newton").hessian for side in SIDES)
         self.information = 0.5 * sum(each_side, np.zeros((len(theta),) * 2))
         self.covariance = inverse_on(self.basis, self.information)
@@ -238,7 +234,7 @@ def simulate_values(problem: Problem, e: int, theta: FloatArray, taken: list[NDA
         Sensors without any are left out.
     """
     run, data = problem.experiments[e], []
-    comparisons = compare(problem, theta, Evaluator(problem, theta).simulate(theta))[1][e]
+    comparisons = compare(Evaluator(problem, theta), theta)[1][e]
     for item, comparison, kept in zip(run.data, comparisons, taken, strict=True):
         if kept.any():
             sigma = item.sigma[kept] if getattr(item.sigma, "ndim", 0) == 2 else item.sigma

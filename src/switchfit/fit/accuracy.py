@@ -42,9 +42,8 @@ from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.discretization.model import Model, list_transition_functions
 from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import SplitEngine
-from switchfit.engine.protocol import Evaluation, Matrix, Simulation
+from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
@@ -56,9 +55,6 @@ PERFECT_FIT = 1e-3
 """If J has fallen below this part of its first value, the integration error is relative to that part, since a cost that
 vanishes has no relative error."""
 
-COST = "J"
-"""Name of the cost among the outputs."""
-
 
 def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: float) -> float:
     """Return the change of J by halving all steps, relative to the size of J."""
@@ -66,51 +62,24 @@ def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: floa
     return abs(fine_cost - cost) / size
 
 
-def worst_error(
-    fine: SimulatedProblem,
-    *,
-    cost: float,
-    first_cost: float,
-    constraints: Sequence[float],
-) -> tuple[float, str]:
-    """Return the largest relative integration error of the outputs of a problem, and the output that has it.
+def constraint_errors(fine: Evaluator, theta: FloatArray, constraints: Sequence[float]) -> FloatArray:
+    """Return the changes of the guards and terminal constraints at theta by halving all steps, by their scales: (m,).
+
+    They are computed from the states alone, so that nothing is compiled for the meshes of `fine`.
 
     Parameters
     ----------
-    fine : SimulatedProblem
-        At theta, on the meshes of the fit with every step halved.
-    cost, first_cost : float
-        J on the meshes of the fit, at theta and at the first guess.
+    fine : Evaluator
+        On the meshes of the fit with every step halved.
+    theta : (d,)
     constraints : (m,)
-        Guards and terminal constraints on the meshes of the fit at theta.
-
-    Returns
-    -------
-    error : float
-        NaN counts as the largest.
-    output : str
-        J, or a guard or terminal constraint.
+        On the meshes of the fit.
     """
-    problem = fine.evaluator.problem
-    errors: list[tuple[float, str]] = []
-    if problem.constraint_names:
-        values, scales = constraint_values(fine.evaluator, fine.theta, fine.simulations)
-        changes = np.abs(values - constraints) / np.where(scales > 0, scales, 1.0)
-        errors += zip(changes.tolist(), problem.constraint_names, strict=True)
-    errors = [(cost_error(problem, fine.cost, cost, first_cost), COST), *errors]
-    return max(errors, key=lambda found: np.inf if np.isnan(found[0]) else found[0])
-
-
-def constraint_values(
-    evaluator: Evaluator, theta: FloatArray, simulations: Sequence[Simulation]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the guards and terminal constraints of a simulation and their scales: (m,) each.
-
-    They are computed from the states alone, so that nothing is compiled for the meshes of `evaluator`.
-    """
-    problem = evaluator.problem
+    problem = fine.problem
+    if not problem.constraint_names:
+        return np.zeros(0)
     values, scales = [np.zeros(0)], [np.zeros(0)]
-    given = zip(problem.structures, evaluator.arguments, simulations, strict=True)
+    given = zip(problem.structures, fine.arguments, fine.simulate(theta), strict=True)
     for e, (structure, arguments, simulation) in enumerate(given):
         if structure.constrained:
             tau, p = problem.vectors(theta, e)
@@ -123,7 +92,8 @@ def constraint_values(
             compiled.add(e)
             values.append(np.asarray(found[0]))
             scales.append(np.abs(found[1]) @ np.ptp(states, axis=0))
-    return np.concatenate(values), np.concatenate(scales)
+    scale = np.concatenate(scales)
+    return np.abs(np.concatenate(values) - constraints) / np.where(scale > 0, scale, 1.0)
 
 
 @partial(jax.jit, static_argnames=("structure",))

@@ -11,7 +11,6 @@ A guard makes tau_i a function of the other unknowns q: ``c(tau(q), q) = 0``. By
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Literal
@@ -205,23 +204,18 @@ class Evaluator:
 
     def cost(self, theta: FloatArray) -> float:
         """Return J alone."""
-        return self.add_costs(
-            theta, [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]
-        )
-
-    def add_costs(self, theta: FloatArray, costs: Sequence[float]) -> float:
-        """Return J from the costs of all experiments at theta (d,)."""
-        return sum(costs, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
+        of_priors = 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0])
+        return sum((engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)), of_priors)
 
     @property
     def engine(self) -> Engine:
         """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
         return summarize(self.engines, self.problem.run_names)
 
-    def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
-        """Simulate all experiments row by row, with derivatives in their own unknowns if `tangents`."""
+    def simulate(self, theta: FloatArray) -> list[Simulation]:
+        """Simulate all experiments row by row."""
         each = zip(self.engines, self._vectors(theta), strict=True)
-        return [engine.simulate(*at, tangents=tangents) for engine, at in each]
+        return [engine.simulate(*at, tangents=False) for engine, at in each]
 
     def _vectors(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Return the transition times (N,) and parameters (M,) of each experiment."""
@@ -448,43 +442,60 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     (('g',), array([0.452]))
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
-    find_guarded_places(problem)  # an error where there are no guards
-    evaluator = evaluator_of(problem)
-    at = on_guards(evaluator, problem.check_theta(theta))
-    evaluator = Evaluator(problem, at)  # a mesh for where the transitions really are
-    at = on_guards(evaluator, at)
-    guarded = find_guarded_places(problem)
-    free = np.setdiff1d(np.arange(len(at)), guarded)
-    rows = guard_rows(problem)
-    # Implicit function theorem on the guards, C being their Jacobian, g the guarded times and f the free unknowns:
-    #     S = -C_g^-1 C_f,  lam = -C_g^-T J_g,  Z = (1, S),  gradient Z'J',  Hessian Z' D^2 (J + lam . c) Z
+    evaluator, at = place_on_guards(problem, problem.check_theta(theta))
+    guarded, rows = find_guarded_places(problem), guard_rows(problem)
+    # lam = -C_g^-T J_g, gradient Z'J', Hessian Z' D^2 (J + lam . c) Z
     here = evaluator.constrained(at)
-    C = here.jacobian[rows]
-    slope: FloatArray = np.asarray(-np.linalg.solve(C[:, guarded], C[:, free]), dtype=np.float64)
+    Z = find_free_directions(problem, here.jacobian)
     multipliers = np.zeros(len(problem.constraint_names))
-    multipliers[rows] = -np.linalg.solve(C[:, guarded].T, here.gradient[guarded])
-    Z = np.zeros((len(at), len(free)))
-    Z[free, np.arange(len(free))] = 1.0
-    Z[guarded] = slope
+    multipliers[rows] = -np.linalg.solve(here.jacobian[np.ix_(rows, guarded)].T, here.gradient[guarded])
     return GuardedEvaluation(
         theta=at,
-        names=tuple(problem.theta_names[k] for k in free),
+        names=tuple(name for k, name in enumerate(problem.theta_names) if k not in guarded),
         cost=here.cost,
         gradient=here.gradient @ Z,
         hessian=Z.T @ evaluator.constrained(at, multipliers=multipliers).hessian @ Z,
         times=at[guarded],
-        times_slope=slope,
+        times_slope=Z[guarded],
     )
 
 
-def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Move the guarded transition times of `theta` onto their guards, by Newton's method.
+def place_on_guards(problem: Problem, theta: FloatArray) -> tuple[Evaluator, FloatArray]:
+    """Return theta with guarded transition times on their guards, and the problem on meshes for where they are.
+
+    On the mesh of the first guess, the times of a stiff model miss their guards by more than their standard errors.
 
     Raises
     ------
     ValueError
-        If they cannot be.
+        Without guards, or if no transition times near `theta` meet them.
     """
+    find_guarded_places(problem)  # an error where there are no guards
+    near = _solve_guards(Evaluator(problem, theta), theta)
+    evaluator = Evaluator(problem, near)
+    return evaluator, _solve_guards(evaluator, near)
+
+
+def find_free_directions(problem: Problem, jacobian: FloatArray) -> FloatArray:
+    """Return the changes of theta that guards allow, one for each of the r unknowns that they leave free: (d, r).
+
+    By the implicit function theorem, C being the Jacobian of the guards, g the guarded times and f the free unknowns,
+    ``Z = (1, S)`` with ``S = -C_g^-1 C_f``.
+
+    Parameters
+    ----------
+    problem : Problem
+    jacobian : (m, d)
+        Of all constraints.
+    """
+    guarded, C = find_guarded_places(problem), jacobian[guard_rows(problem)]
+    Z = np.delete(np.eye(jacobian.shape[1]), guarded, axis=1)
+    Z[guarded] = -np.linalg.solve(C[:, guarded], np.delete(C, guarded, axis=1))
+    return Z
+
+
+def _solve_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """Move the guarded transition times of `theta` onto their guards, by Newton's method."""
     problem = evaluator.problem
     guarded, rows = find_guarded_places(problem), guard_rows(problem)
     theta = theta.copy()
@@ -508,18 +519,6 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
         "reach a guard there, or grazes it. Give transition_times nearer to where the guards vanish (sf.simulate shows "
         "the states), or another mode_sequence."
     )
-
-
-def place_on_near_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Return `theta` on its guards as of `on_guards`, or as it is where there are none, or no such point is near.
-
-    The optimizer may find one that is farther off.
-    """
-    if not any(structure.guarded for structure in evaluator.problem.structures):
-        return theta
-    with suppress(ValueError):
-        return on_guards(evaluator, theta)
-    return theta
 
 
 def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:

@@ -22,7 +22,7 @@ from switchfit.optimize.threads import one_thread
 from switchfit.problem.data import FloatArray
 from switchfit.problem.inspection import find_comparisons, find_unread
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import ActiveConstraint, Constraint
+from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.problem.validation import as_level
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
@@ -136,6 +136,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         Iterations before, on coarser meshes, where the optimizer resumed a fit.
     """
     names = problem.unknowns.names
+    multipliers = dict(zip(problem.constraints.names, result.multipliers.tolist(), strict=True))
     smallest: float = np.nan
     flat: tuple[tuple[str, float], ...] = ()
     if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status needs them
@@ -147,7 +148,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         tolerance=result.tolerance,
         iterations=earlier + result.iterations,
         earlier_iterations=earlier,
-        active=_list_active(result, problem),
+        active=tuple(ActiveConstraint(**vars(each), multiplier=multipliers[each]) for each in result.active),
         kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
         idle=tuple(names[i] for i in result.idle),
         smallest_eigenvalue=smallest,
@@ -163,14 +164,6 @@ def _list_largest(direction: FloatArray, names: Sequence[str]) -> tuple[tuple[st
     parts = np.abs(direction)
     largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
     return tuple((names[i], float(direction[i])) for i in largest)
-
-
-def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
-    if not result.active:
-        return ()
-    multipliers = dict(zip(problem.constraints.names, result.multipliers.tolist(), strict=True))
-    found = [constraint for constraint in result.active if isinstance(constraint, Constraint)]
-    return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
 
 def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:
@@ -510,6 +503,14 @@ class Fit(Termination):
         return 2 * self.cost / freedom if judged else np.nan
 
     @property
+    def variance_scale(self) -> float:
+        """By what the inverse of the Hessian is multiplied: 1 if sigma is known, the residual variance if it is not.
+
+        NaN if the cost has no noise model.
+        """
+        return 1.0 if self.sigma_known else self.residual_variance
+
+    @property
     def freedom(self) -> int:
         """Degrees of freedom: number of measured values and priors minus number of free unknowns."""
         return self.samples + len(self.priors) - self.free_basis.shape[1]
@@ -563,8 +564,7 @@ class Fit(Termination):
                 "The Gauss-Newton matrix of this fit is not known: it needs a cost of Measurements alone, and the "
                 "problem. Use hessian='exact'."
             )
-        scale = self.residual_variance if self.sigma_known is False else 1.0
-        return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
+        return self.variance_scale * inverse_on(self.free_basis, matrix)
 
     @property
     def standard_errors(self) -> FloatArray:
@@ -672,15 +672,15 @@ def disagreement(fit: Fit) -> Disagreement | None:
     if not all(np.isfinite(covariance).all() for covariance in both):
         return None
     errors = np.sqrt([np.diag(covariance) for covariance in both])
-    size = 1 / np.sqrt(np.diag(Z.T @ fit.hessian @ Z))
-    root = np.linalg.cholesky((Z.T @ fit.hessian @ Z) * np.outer(size, size))
-    half = np.linalg.solve(root, (Z.T @ A @ Z) * np.outer(size, size))
-    ratios = np.linalg.eigvalsh(np.linalg.solve(root, half.T))
+    ratios = []
+    for one, other in ((fit.hessian, A), (A, fit.hessian)):  # of each the largest, which no rounding hides
+        values, vectors, size = compute_scaled_spectrum(one, Z)
+        root = size[:, None] * vectors / np.sqrt(values)  # root' one root = 1
+        ratios.append(float(np.linalg.eigvalsh(root.T @ other @ root)[-1]))
     held = errors[0] <= 0
     changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
     k = int(np.argmax(changes))
-    factor = float(np.sqrt(max(ratios[-1], 1 / ratios[0])))
-    return Disagreement(factor, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
+    return Disagreement(max(ratios) ** 0.5, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:
@@ -698,33 +698,23 @@ PART = 1e-6
 """Component of an unknown in such a direction above which the unknown has no standard error."""
 
 
-@one_thread()
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN if H is not finite, or not positive definite on Z (d, k).
 
     If it is not positive definite in some directions, only unknowns with a component in these are NaN. For the others
     the pseudo-inverse is used: if one of many runs is not determined, the other runs keep their variances.
     """
-    nothing = np.full(hessian.shape, np.nan)
     if not np.isfinite(hessian).all():
-        return nothing
-    reduced = Z.T @ hessian @ Z
-    size = 1 / np.sqrt(np.maximum(np.abs(np.diag(reduced)), np.finfo(float).tiny))
-    with np.errstate(over="ignore", invalid="ignore"):
-        scaled = reduced * np.outer(size, size)
-    if not np.isfinite(scaled).all():  # numbers near the limits of float64
-        return nothing
-    values, vectors = np.linalg.eigh(scaled)
+        return np.full(hessian.shape, np.nan)
+    values, vectors, size = compute_scaled_spectrum(hessian, Z)
     kept = values > UNDETERMINED
-    directions = Z @ (size[:, None] * vectors)
-    root = directions[:, kept] / np.sqrt(values[kept])
-    inverse = root @ root.T
-    if not kept.all():
-        part = np.abs(directions[:, ~kept]).max(axis=1) / np.maximum(np.linalg.norm(Z * size, axis=1), 1e-300)
-        unknown = part > PART
-        inverse[unknown] = np.nan
-        inverse[:, unknown] = np.nan
-    return np.asarray(inverse)
+    root = size[:, None] * vectors[:, kept] / np.sqrt(values[kept])
+    inverse: FloatArray = root @ root.T
+    part = np.abs(vectors[:, ~kept]).max(axis=1, initial=0.0)
+    unknown = ~(part <= PART * np.linalg.norm(vectors, axis=1))
+    inverse[unknown] = np.nan
+    inverse[:, unknown] = np.nan
+    return inverse
 
 
 def list_without_effect(fit: Fit) -> tuple[str, ...]:
@@ -752,13 +742,18 @@ class ScaledSpectrum(NamedTuple):
 
 @one_thread()
 def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
-    """Return the scaled spectrum of a finite Hessian (d, d) on the directions Z (d, k).
+    """Return the scaled spectrum of a Hessian (d, d) on the directions Z (d, k), which need not be orthonormal.
 
-    Eigenvalues of the size of rounding, whose digits differ from processor to processor, are 0.
+    Eigenvalues of the size of rounding, whose digits differ from processor to processor, are 0. NaN if the Hessian is
+    not finite, or its numbers are near the limits of float64.
     """
     diagonal = np.abs(np.diag(hessian))
     size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
-    basis = np.linalg.qr(Z / size[:, None])[0]
-    values, vectors = np.linalg.eigh(basis.T @ (hessian * np.outer(size, size)) @ basis)
+    basis = np.linalg.qr(Z / size[:, None])[0] * Z.any(axis=1)[:, None]  # exactly 0 for what is held
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = basis.T @ (hessian * np.outer(size, size)) @ basis
+    if not np.isfinite(scaled).all():
+        return ScaledSpectrum(np.full(len(scaled), np.nan), np.full(basis.shape, np.nan), size)
+    values, vectors = np.linalg.eigh(scaled)
     rounding = len(values) * np.finfo(float).eps * np.abs(values).max(initial=0.0)
     return ScaledSpectrum(np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size)

@@ -31,6 +31,7 @@ from switchfit.optimize.state import Finding
 from switchfit.optimize.threads import with_own_threads
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment, drop_jumps
+from switchfit.problem.inspection import find_unread
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.unknowns import Variables
 
@@ -39,9 +40,6 @@ CHANGES = (0.1, -0.1)
 
 NO_EFFECT = 1e-12
 """Relative change of the cost that may be rounding: a parameter that changes it by less has no effect."""
-
-OPENED = 1e-3
-"""Duration of collapsed modes, as a part of the horizon, when the effect of a parameter in them is tested."""
 
 
 def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> NDArray[np.bool_]:
@@ -59,10 +57,9 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     idle = np.zeros(len(theta), dtype=bool)
     for group in _list_idle_groups(problem, theta):
         idle[group[0]] = True
-    opened = _open_modes(problem, theta) if parameters else theta
-    if not np.array_equal(opened, theta):
+    if parameters and any(_has_collapsed(problem, theta, e) for e in range(len(problem.experiments))):
         for i in _list_parameters(problem):
-            idle[i] = _is_idle(evaluator, theta, opened, i)
+            idle[i] = not _has_effect(evaluator, theta, i)
     return idle
 
 
@@ -99,24 +96,11 @@ def _list_coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tu
             yield first, last
 
 
-def _open_modes(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Return theta with transition times moved so that every collapsed mode lasts a little, if there is room."""
-    opened = theta.copy()
-    for e, (experiment, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        times = _get_times(problem, theta, e)
-        lengths = np.diff(experiment.ends_of_modes(times))
-        # A free tf is the transition to a mode that lasts.
-        short = np.append(lengths, [np.inf] * experiment.has_free_tf) <= _estimate_rounding(experiment)
-        if not short.any():
-            continue
-        gap = OPENED * experiment.initial_length * short
-        knots = np.concatenate([[experiment.t0], times, [experiment.end]])
-        for i in range(1, len(times) + 1):
-            knots[i] = max(knots[i], knots[i - 1] + gap[i - 1])
-        for i in range(len(times), 0, -1):
-            knots[i] = min(knots[i], knots[i + 1] - gap[i])
-        opened[where[where >= 0]] = knots[1:-1][where >= 0]
-    return opened
+def _has_collapsed(problem: Problem, theta: FloatArray, e: int) -> bool:
+    """Return whether a mode of experiment e has no duration."""
+    experiment = problem.experiments[e]
+    lengths = np.diff(experiment.ends_of_modes(_get_times(problem, theta, e)))
+    return bool(np.any(lengths <= _estimate_rounding(experiment)))
 
 
 def _get_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:
@@ -131,19 +115,17 @@ def _estimate_rounding(experiment: Experiment) -> float:
 
 
 def _list_parameters(problem: Problem) -> list[int]:
-    """Return the indices in theta of the model's parameters."""
-    return [i for span in problem.unknowns.parameters.values() for i in range(span.start, span.stop)]
+    """Return the indices in theta of the parameters that a function reads which acts."""
+    spans = problem.unknowns.parameters.values()
+    without = {name for names in find_unread(problem) for name in names}
+    return [i for span in spans for i in range(span.start, span.stop) if problem.theta_names[i] not in without]
 
 
-def _is_idle(evaluator: Evaluator, theta: FloatArray, opened: FloatArray, i: int) -> bool:
-    """Return whether parameter i has no effect on J at theta, but has one where the collapsed modes last a little."""
-
-    def has_effect(at: FloatArray) -> bool:
-        base = evaluator.cost(at)
-        moved = map(evaluator.cost, list_changes(evaluator.problem, at, i, CHANGES))
-        return any(not abs(cost - base) <= NO_EFFECT * abs(base) for cost in moved)
-
-    return not has_effect(theta) and has_effect(opened)
+def _has_effect(evaluator: Evaluator, theta: FloatArray, i: int) -> bool:
+    """Return whether J changes with unknown i."""
+    base = evaluator.cost(theta)
+    moved = map(evaluator.cost, list_changes(evaluator.problem, theta, i, CHANGES))
+    return any(not abs(cost - base) <= NO_EFFECT * abs(base) for cost in moved)
 
 
 MANY_RUNS = 16
@@ -162,7 +144,6 @@ def minimize_cost(
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None = None,
     constraints: LinearConstraints | None = None,
-    by_blocks: bool | None = None,
     multipliers: Sequence[float] | None = None,
     follower: Follower | None = None,
 ) -> Result:
@@ -171,17 +152,16 @@ def minimize_cost(
     With a `follower` of the evaluator, meshes are made anew where they are too coarse: its own are then those of the
     result.
 
-    `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
-    several runs; by default, it is used where that is faster, and never with guards or terminal constraints, whose
-    `multipliers` may be known from a fit on other meshes.
+    `constraints` are by default those of the problem. The arrow shape of the Hessian of several runs is used where that
+    is faster, and never with guards or terminal constraints, whose `multipliers` may be known from a fit on other
+    meshes.
     """
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
     matrix: Matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
-    if by_blocks is None:
-        many = len(problem.experiments) >= MANY_RUNS and not names
-        by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
+    many = len(problem.experiments) >= MANY_RUNS and not names
+    by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = problem.constraints if constraints is None else constraints
     change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []

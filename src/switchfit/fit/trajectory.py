@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -275,40 +274,11 @@ def _select_times(trajectory: Trajectory, asked: FloatArray) -> Trajectory:
     )
 
 
-class SimulatedProblem:
-    """A problem at one theta, simulated when first accessed: J alone takes half of a trajectory's time.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Its meshes are used.
-    theta : (d,)
-    """
-
-    def __init__(self, evaluator: Evaluator, theta: FloatArray) -> None:
-        self.evaluator, self.theta = evaluator, theta
-
-    @cached_property
-    def cost(self) -> float:
-        """J."""
-        if "simulations" in self.__dict__:
-            return self.evaluator.add_costs(self.theta, [simulation.cost for simulation in self.simulations])
-        return self.evaluator.cost(self.theta)
-
-    @cached_property
-    def simulations(self) -> list[Simulation]:
-        """States and outputs of each experiment."""
-        return self.evaluator.simulate(self.theta)
-
-    def compare(self) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
-        """Return the trajectories and comparisons of all experiments."""
-        return compare(self.evaluator.problem, self.theta, self.simulations)
-
-
 def compare(
-    problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]
+    evaluator: Evaluator, theta: FloatArray
 ) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
-    """Return the trajectories and comparisons of all experiments."""
+    """Return the trajectories and comparisons of all experiments at theta (d,), on the meshes of an evaluator."""
+    problem, simulations = evaluator.problem, evaluator.simulate(theta)
     trajectories = tuple(_build_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
     pairs = enumerate(zip(simulations, trajectories, strict=True))
     return trajectories, tuple(_build_comparisons(problem, e, theta, *pair) for e, pair in pairs)

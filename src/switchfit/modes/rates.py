@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.engine.protocol import Costates
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.trajectory import SimulatedProblem, Trajectory
+from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
@@ -238,7 +238,7 @@ def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, .
     """Return the insertion rates of each experiment at theta (d,); the problem must have `max_transitions`."""
     problem = evaluator.problem
     multipliers = np.split(_estimate_multipliers(evaluator, theta), np.cumsum(problem.constraint_counts)[:-1])
-    trajectories, _ = SimulatedProblem(evaluator, theta).compare()
+    trajectories, _ = compare(evaluator, theta)
     found = []
     for e, (engine, name) in enumerate(zip(evaluator.engines, problem.run_names, strict=True)):
         tau, p = problem.vectors(theta, e)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.trajectory import SimulatedProblem
+from switchfit.fit.trajectory import compare
 from switchfit.online.tracker import drop_artificial, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
@@ -339,7 +339,7 @@ def calibrate(
         as_callable(callback, "callback", "a function callback(run, maximum)", arguments=2)
     problem = build_quiet_problem(online, length)
     theta = problem.initial_theta
-    comparisons = SimulatedProblem(Evaluator(problem, theta), theta).compare()[1][0]
+    comparisons = compare(Evaluator(problem, theta), theta)[1][0]
     trial = online.build_like(problem, NEVER)
     rng, maxima = np.random.default_rng(seed), []
     for run in range(runs):

@@ -368,9 +368,9 @@ _ISSUES: dict[str, Sentence] = {
     "trade off": _write_combination,
     **_LOG_ISSUES,
     # Before the numbers are believed
-    "mode collapsed": "{held mode} has collapsed to nothing: the data want no such mode there. Leave it out of "
+    "a mode collapsed": "{held mode} has collapsed to nothing: the data want no such mode there. Leave it out of "
     "mode_sequence, start from another guess, or give min_duration.",
-    "minimum duration": "{held mode} is at its minimum duration: the data would have it shorter. Lower min_duration, "
+    "a mode is short": "{held mode} is at its minimum duration: the data would have it shorter. Lower min_duration, "
     "or leave the mode out.",
     "lower bound": _BOUND,
     "upper bound": _BOUND,
@@ -378,14 +378,14 @@ _ISSUES: dict[str, Sentence] = {
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "at a kink": lambda issue: _AT_KINKS[len(issue.subjects) == 1].format(join_first(issue.subjects)),
+    "at kinks": lambda issue: _AT_KINKS[len(issue.subjects) == 1].format(join_first(issue.subjects)),
     "not read": "No function of the model reads {names}: the data say nothing about it, and its value above is the "
     "first guess. Remove it from parameters, or use it in the model, whose functions may spell its name otherwise.",
     "acts elsewhere": "{names}: read only by modes, or at transitions, that do not occur in mode_sequence. The data "
     "say nothing about it, and its value above is the first guess. Fix it, or fit a log in which it acts too.",
     "without effect": "The cost does not depend on {names}, to second order: the data say nothing about it, and its "
     "value above is the first guess. Fix it, or let it act on what is measured.",
-    "hardly determined": "The data hardly determine {undetermined} (smallest eigenvalue {eigenvalue:.2g} of the "
+    "not determined": "The data hardly determine {undetermined} (smallest eigenvalue {eigenvalue:.2g} of the "
     "Hessian scaled to unit curvature). Fix one of the unknowns, or add data that tell them apart.",
     "no errors: not finite": "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "

@@ -355,7 +355,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     if not known or corrected:
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent." if known else ""
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
-    has_sandwich = isinstance(fit, Estimate) and not fit.sandwich_needs
+    has_sandwich = isinstance(fit, Estimate) and fit.has_sandwich
     other = ": covariance_from('sandwich') does not." if has_sandwich else "."
     exact = f"the exact Hessian{_compare_covariances(fit)}"
     matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else exact
@@ -497,15 +497,10 @@ def _list_sentences(sentences: Sequence[str], most: int, what: str) -> list[str]
 
 
 _COVERED = {
-    "a mode collapsed": {"mode collapsed", "idle times", "idle parameters"},
+    "a mode collapsed": {"idle times", "idle parameters"},
     "idle": {"idle times", "idle parameters"},
-    "a mode is short": {"minimum duration"},
     "at bounds": {"lower bound", "upper bound"},
-    "at kinks": {"at a kink"},
-    "not determined": {"hardly determined", "no errors: not positive definite"},
-    "not read": {"not read"},
-    "acts elsewhere": {"acts elsewhere"},
-    "without effect": {"without effect"},
+    "not determined": {"no errors: not positive definite"},
     "not converged": {"no errors: not positive definite", "no errors: not finite"},
     "too few samples": {"no errors: too few samples"},
     "unexplained": {"sigma too small", "correlated residuals"},
@@ -514,13 +509,13 @@ _COVERED = {
     "sigma suspected": {"sigma too small"},
     "integration error": {"large integration error"},
 }
-"""Kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
+"""Other kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
 
 
 def _format_warnings(estimate: Estimate, most: int, *, full: bool) -> list[str]:
     """Return the warnings as lines; on one screen without those that the verdict covers."""
-    reasons = () if full else estimate.verdict.reasons
-    covered = set().union(*(_COVERED.get(reason.kind, set()) for reason in reasons))
+    reasons = set() if full else {reason.kind for reason in estimate.verdict.reasons}
+    covered = reasons.union(*(_COVERED.get(kind, set()) for kind in reasons))
     issues = [add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
     return _list_sentences(issues, most, "warning")
 

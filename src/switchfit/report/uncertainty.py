@@ -275,7 +275,7 @@ def write_profile(profile: Profile) -> str:
         f"  estimate              {value} {error}{unit}".rstrip(),
         f"  {percent:<4} interval         [{intervals[0]}]{unit}   (likelihood ratio, {law})",
         f"  quadratic             {f'[{intervals[1]}]{unit}' if np.isfinite(quadratic).all() else 'none'}",
-        f"  points, fits          {len(profile.values)}, {profile.trace.fits}",
+        f"  points, fits          {len(profile.values)}, {profile.fits}",
     ]
     run = _find_run(profile)
     if run is not None:
@@ -315,7 +315,7 @@ def list_profile_notes(profile: Profile) -> Iterator[str]:
     """
     run, (low, high) = _find_run(profile), profile.interval()
     show, unit = partial(format_time, run=run), "" if run is not None else unit_suffix(profile.unit)
-    limits, outermost = profile.trace.limits.values(), profile.values[[0, -1]]
+    limits, outermost = profile.limits.values(), profile.values[[0, -1]]
     for side, end, limit, last in zip(("downward", "upward"), profile.ends, limits, outermost, strict=True):
         if end in _ENDS:
             yield _ENDS[end].format(side=side, limit=show(limit), last=show(last))
@@ -332,8 +332,8 @@ def list_profile_notes(profile: Profile) -> Iterator[str]:
     if len(inside):
         count = f"{len(inside)} sample times lie" if len(inside) > 1 else f"the sample at {show(inside[0])}{unit} lies"
         yield f"{count} in the interval, where the slope of the profile may jump"
-    if profile.trace.jumps:
-        yield _JUMPS.format(", ".join(map(show, sorted(set(profile.trace.jumps)))))
+    if profile.jumps:
+        yield _JUMPS.format(", ".join(map(show, sorted(set(profile.jumps)))))
     if not profile.converged.all():
         yield f"{int((~profile.converged).sum())} of the fits did not converge"
 

@@ -235,7 +235,7 @@ def _make_attributes(unit: str) -> dict[str, str]:
 
 
 def build_arviz(draws: Iterable[Variable], attributes: Mapping[str, str]) -> Any:
-    """Return draws as ArviZ takes them: InferenceData up to its version 0.23, a DataTree of xarray since 1.0.
+    """Return draws as ArviZ takes them, as InferenceData.
 
     Parameters
     ----------
@@ -253,10 +253,7 @@ def build_arviz(draws: Iterable[Variable], attributes: Mapping[str, str]) -> Any
     posterior = {each.name: (each.dimensions, each.values, _make_attributes(each.unit)) for each in draws}
     chains, size = next((np.shape(values) for _, values, _ in posterior.values()), (0, 0))
     places = {"chain": np.arange(chains), "draw": np.arange(size)}
-    groups = {"posterior": xarray.Dataset(posterior, places, dict(attributes))}
-    if hasattr(arviz, "InferenceData"):
-        return arviz.InferenceData(**groups)
-    return xarray.DataTree.from_dict(groups)
+    return arviz.InferenceData(posterior=xarray.Dataset(posterior, places, dict(attributes)))
 
 
 def _import_library(name: str, what: str) -> Any:

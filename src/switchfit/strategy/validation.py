@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, inverse_on
-from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
+from switchfit.fit.trajectory import Comparison, Trajectory, compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import PriorTerms
 from switchfit.problem.problem import Problem
@@ -456,7 +456,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
         places = [problem.theta_names.index(name) for name in found.theta_names]
         theta[places] = found.theta
     evaluator = Evaluator(problem, theta)
-    trajectories, comparisons = SimulatedProblem(evaluator, theta).compare()
+    trajectories, comparisons = compare(evaluator, theta)
     sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
     noise = _choose_noise(estimate, problem)
     whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, found, noise)

@@ -27,10 +27,11 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,7 +47,7 @@ from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import count_times, show_time
 from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_level
+from switchfit.problem.validation import as_array, as_index, as_instance, as_level
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Drawn, draw_figure, format_html, format_line, join_first
 
@@ -79,45 +80,42 @@ class Sensitivity:
         With derivatives in the experiment's own unknowns.
     places : (D,) int
         Indices of these unknowns in theta, -1 for fixed ones.
-    d : int
-        Length of theta.
+    theta : (d,)
+        Where they are.
     """
 
     simulation: Simulation
     places: NDArray[np.intp]
-    d: int
+    theta: FloatArray
 
     @property
     def nodes(self) -> Points:
         """Points at all nodes in order, as in `Trajectory`: each transition occurs twice, before and after it."""
-        s, along = self.simulation, self._tangents
-        columns = (s.start, s.end), (s.before, s.after), along[:2], (s.y_before, s.y_after), along[2:]
-        times, states, states_d, outputs, outputs_d = (select_visible(s, *pair) for pair in columns)
-        return Points(times, states, self._spread_over_theta(states_d), outputs, self._spread_over_theta(outputs_d))
+        select = partial(select_visible, self.simulation)
+        return self._collect(select(self.simulation.start, self.simulation.end), select)
 
     def at(self, times: FloatArray) -> Points:
         """Return the sensitivity at nodes (K,) of the mesh; at a transition, that just before it, as for a sample."""
-        s, along = self.simulation, self._tangents
-        row = s.row_ending(np.searchsorted(s.nodes, times) - 1)
+        row = self.simulation.row_ending(np.searchsorted(self.simulation.nodes, times) - 1)
 
         def pick(before: FloatArray, after: FloatArray) -> FloatArray:
             first = (row < 0).reshape(-1, *[1] * (after.ndim - 1))
             return np.where(first, before[:1], after[row])
 
-        states, outputs = pick(s.before, s.after), pick(s.y_before, s.y_after)
-        derivatives = [self._spread_over_theta(pick(*pair)) for pair in (along[:2], along[2:])]
-        return Points(np.asarray(times, dtype=np.float64), states, derivatives[0], outputs, derivatives[1])
+        return self._collect(np.asarray(times, dtype=np.float64), pick)
 
-    @property
-    def _tangents(self) -> Tangents:
-        if self.simulation.tangents is None:
-            raise ValueError("the simulation has no derivatives: pass tangents=True.")
-        return self.simulation.tangents
+    def _collect(self, times: FloatArray, choose: Callable[[FloatArray, FloatArray], FloatArray]) -> Points:
+        """Return the points at times (L,), which are chosen from what is known before and after all rows."""
+        s, along = self.simulation, cast(Tangents, self.simulation.tangents)
+        states, outputs = choose(s.before, s.after), choose(s.y_before, s.y_after)
+        slopes = choose(along.before, along.after), choose(along.y_before, along.y_after)
+        states_d, outputs_d = map(self._spread_over_theta, slopes)
+        return Points(times, states, states_d, outputs, outputs_d)
 
     def _spread_over_theta(self, derivative: FloatArray) -> FloatArray:
         """Return derivatives in theta (..., d) from those in the experiment's own unknowns (..., D)."""
         own = self.places >= 0
-        full = np.zeros((*derivative.shape[:-1], self.d))
+        full = np.zeros((*derivative.shape[:-1], len(self.theta)))
         # Two names of the model may refer to one parameter: both count.
         np.add.at(np.moveaxis(full, -1, 0), self.places[own], np.moveaxis(derivative, -1, 0)[own])
         return full
@@ -138,7 +136,7 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
     run = runs_of(problem)[e]
     engine = engine_of(run, run.build_arguments(mesh), mesh)
     simulation = engine.simulate(*run.vectors(theta), tangents=True)
-    return Sensitivity(simulation, problem.places[e], len(problem.theta_names))
+    return Sensitivity(simulation, problem.places[e], theta)
 
 
 class SampleDerivatives(NamedTuple):
@@ -147,20 +145,25 @@ class SampleDerivatives(NamedTuple):
     Attributes
     ----------
     experiment : (S,) int
-    item, channel : (S,) int
-        Indices of the Measurements in the experiment, and of the channel in it.
-    residual, weight : (S,)
-        Fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown).
+    item : (S,) int
+        Index of the Measurements in the experiment.
+    residual, weight, influence : (S,)
+        Fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown), and rho' of the loss (`problem.data`).
     derivative : (S, d)
         Derivative of the fitted value in theta.
     """
 
     experiment: NDArray[np.intp]
     item: NDArray[np.intp]
-    channel: NDArray[np.intp]
     residual: FloatArray
     weight: FloatArray
+    influence: FloatArray
     derivative: FloatArray
+
+    @property
+    def scores(self) -> FloatArray:
+        """Gradients of the costs of all samples, ``rho' w r D h``, if no sigma is a parameter: (S, d)."""
+        return (self.influence * self.weight * self.residual)[:, None] * self.derivative
 
 
 def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -> SampleDerivatives:
@@ -169,30 +172,22 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     Parameters
     ----------
     problem : Problem
-        With Measurements.
+        With Measurements; no delay of it is a parameter.
     sensitivities : sequence of Sensitivity, one per experiment
     """
     columns: list[tuple[NDArray[Any], ...]] = []
     for e, (experiment, found) in enumerate(zip(problem.experiments, sensitivities, strict=True)):
         first = sum(q for _, q in problem.structures[e].references)
-        items = [item for item in experiment.data if isinstance(item, Measurements)]
-        for k, item in enumerate(items):
-            q = item.values.shape[1]
-            points = found.at(item.seen_times)
-            there = ~np.isnan(item.values)
-            channels = np.nonzero(there)[1]
-            fitted, slope = points.outputs[:, first : first + q], points.outputs_d[:, first : first + q]
-            columns.append(
-                (
-                    np.full(len(channels), e),
-                    np.full(len(channels), k),
-                    channels,
-                    (fitted - np.nan_to_num(item.values))[there],
-                    item.weights[there],
-                    slope[there],
-                )
-            )
-            first += q
+        for k, item in enumerate(experiment.measurements):
+            points, there = found.at(item.seen_times), ~np.isnan(item.values)
+            channels = slice(first, first + item.values.shape[1])
+            first = channels.stop
+            sigma = item.noise(problem.name_parameters(found.theta, e))
+            residual = (points.outputs[:, channels] - np.nan_to_num(item.values))[there]
+            weight = np.ones(len(residual)) if sigma is None else sigma[there] ** -2.0
+            pull = influence(item.loss, item.loss_scale, weight * residual**2)
+            places = np.full(len(residual), e), np.full(len(residual), k)
+            columns.append((*places, residual, weight, pull, points.outputs_d[:, channels][there]))
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
@@ -210,51 +205,16 @@ def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDeriv
     samples : SampleDerivatives
         At theta.
     """
-    weight = samples.weight.copy()
     information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
-    for e, k, item in _list_measurements(problem):
-        here = (samples.experiment == e) & (samples.item == k)
-        noise = item.noise(problem.name_parameters(theta, e)) if item.sigma_names else None
-        if noise is not None:
-            weight[here] = noise[~np.isnan(item.values)] ** -2.0
-            names = problem.experiments[e].parameter_map
-            for channel, name in enumerate(item.sigma_names):
-                span = None if name is None else problem.unknowns.parameters.get(names.get(name, name))
+    for run in problem.experiments:
+        for item in run.measurements:
+            for values, name in zip(item.values.T, item.sigma_names, strict=False):
+                span = None if name is None else problem.unknowns.parameters.get(run.parameter_map.get(name, name))
                 if span is not None:  # it is not fixed
-                    count = np.count_nonzero(samples.channel[here] == channel)
                     # In log sigma each sample has the information 2, in sigma 2 / sigma^2.
-                    information[span, span] += 2.0 * count / theta[span] ** 2
-        weight[here] *= influence(item.loss, item.loss_scale, weight[here] * samples.residual[here] ** 2)
+                    information[span, span] += 2.0 * np.count_nonzero(~np.isnan(values)) / theta[span] ** 2
+    weight = samples.influence * samples.weight
     return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
-
-
-def sum_score_products(problem: Problem, samples: SampleDerivatives) -> FloatArray:
-    """Return ``sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: (d, d).
-
-    With ``u = w r^2`` a sample costs ``1/2 C^2 rho(u / C^2)`` (`problem.data`): ``g = rho'(u / C^2) w r D h``.
-
-    Parameters
-    ----------
-    problem : Problem
-        No sigma and no delay of it is a parameter.
-    samples : SampleDerivatives
-    """
-    pull = samples.weight * samples.residual
-    for e, k, item in _list_measurements(problem):
-        here = (samples.experiment == e) & (samples.item == k)
-        u = samples.weight[here] * samples.residual[here] ** 2
-        pull[here] *= influence(item.loss, item.loss_scale, u)
-    scores = pull[:, None] * samples.derivative
-    return np.asarray(scores.T @ scores)
-
-
-def _list_measurements(problem: Problem) -> list[tuple[int, int, Measurements]]:
-    """Return each experiment's index, the index among its Measurements, and the Measurements."""
-    return [
-        (e, k, item)
-        for e, experiment in enumerate(problem.experiments)
-        for k, item in enumerate(item for item in experiment.data if isinstance(item, Measurements))
-    ]
 
 
 NEAR = 2.0
@@ -479,9 +439,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
            [ 0.8,  1.6],
            [-0. ,  0.8]])
     """
-    fit: Fit = estimate
-    if not isinstance(fit, Fit):
-        raise TypeError(f"predict needs the result of sf.estimate; got {type(fit).__name__}. Fit the problem first.")
+    fit = as_instance(estimate, "estimate", Fit, "what sf.estimate returns: fit the problem first")
     evaluator = estimate.evaluator_at_solution()
     problem: Problem = evaluator.problem
     experiment = as_index(experiment, "experiment", len(problem.experiments))
@@ -584,22 +542,9 @@ def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatAr
             # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
             unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
             sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
-            columns.append(sigma[find_nearest(item.times, times)])
+            halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
+            columns.append(sigma[np.searchsorted(halfway, times)])
     return np.concatenate([np.zeros((len(times), 0)), *columns], axis=1)
-
-
-def find_nearest(samples: FloatArray, times: FloatArray) -> NDArray[np.intp]:
-    """Return the index of the sample time nearest to each time, of two at the same distance the earlier: (K,).
-
-    Parameters
-    ----------
-    samples : (N,), increasing
-    times : (K,)
-    """
-    after = np.clip(np.searchsorted(samples, times), 1, max(len(samples) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(samples) - 1)
-    return np.where(times - samples[before] <= samples[after] - times, before, after)
 
 
 def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:

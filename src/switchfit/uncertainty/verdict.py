@@ -51,7 +51,8 @@ def find_issues(fit: Fit) -> list[Issue]:
     fit : Fit
     """
     sources = (
-        _find_active,
+        _find_short_modes,
+        _find_bounds,
         _find_idle,
         _find_kinks,
         find_without_effect,
@@ -65,33 +66,33 @@ def find_issues(fit: Fit) -> list[Issue]:
     return [issue for source in sources for issue in source(fit)]
 
 
-def _find_active(fit: Fit) -> Iterator[Issue]:
-    """Find the constraints that hold with equality."""
+def _find_short_modes(fit: Fit) -> Iterator[Issue]:
+    """Find modes that have collapsed, or are at their minimum duration."""
     for constraint in fit.active:
         if constraint.position is not None:
-            figures = {"position": float(constraint.position), "value": constraint.value}
-            kind = "mode collapsed" if constraint.kind == "collapsed" else constraint.kind
-            yield Issue(kind, (constraint.mode, constraint.run), figures)
-        elif constraint.unknown not in fit.idle:
+            kind = "a mode collapsed" if constraint.kind == "collapsed" else "a mode is short"
+            yield Issue(kind, (constraint.mode, constraint.run), {"position": float(constraint.position)})
+
+
+def _find_bounds(fit: Fit) -> Iterator[Issue]:
+    """Find unknowns that bounds hold which the user gave."""
+    for constraint in fit.active:
+        if constraint.position is None and constraint.unknown not in fit.idle:
             yield Issue(constraint.kind, (constraint.unknown,), {"value": constraint.value})
 
 
 def _find_idle(fit: Fit) -> Iterator[Issue]:
     """Find unknowns on which the cost does not depend, because a mode has collapsed."""
-    times = {name for name, is_time in zip(fit.theta_names, fit.is_time.tolist(), strict=True) if is_time}
-    for kind, names in (
-        ("idle times", tuple(name for name in fit.idle if name in times)),
-        ("idle parameters", tuple(name for name in fit.idle if name not in times)),
-    ):
-        if names:
+    is_time = dict(zip(fit.theta_names, fit.is_time.tolist(), strict=True))
+    for kind, wanted in (("idle times", True), ("idle parameters", False)):
+        if names := tuple(name for name in fit.idle if is_time[name] is wanted):
             yield Issue(kind, names)
 
 
 def _find_kinks(fit: Fit) -> Iterator[Issue]:
     """Find unknowns at which the derivative jumps through zero."""
     if fit.kinks:
-        figures = {"left": tuple(k.left for k in fit.kinks), "right": tuple(k.right for k in fit.kinks)}
-        yield Issue("at a kink", tuple(kink.unknown for kink in fit.kinks), figures)
+        yield Issue("at kinks", tuple(kink.unknown for kink in fit.kinks))
 
 
 def find_without_effect(fit: Fit) -> Iterator[Issue]:
@@ -103,23 +104,18 @@ def find_without_effect(fit: Fit) -> Iterator[Issue]:
     fit : Fit
     """
     without = list_without_effect(fit)
-    unread = [name for name in without if name in fit.unread]
-    absent = [name for name in without if name in fit.absent]
-    others = [name for name in without if name not in unread and name not in absent]
-    for kind, names in (
-        ("not read", name_whole_parameters(unread)),
-        ("acts elsewhere", name_whole_parameters(absent)),
-        ("without effect", tuple(others)),
-    ):
-        if names:
+    for kind, group in (("not read", fit.unread), ("acts elsewhere", fit.absent)):
+        if names := name_whole_parameters([name for name in without if name in group]):
             yield Issue(kind, names)
+    if others := tuple(name for name in without if name not in (*fit.unread, *fit.absent)):
+        yield Issue("without effect", others)
 
 
 def _find_undetermined(fit: Fit) -> Iterator[Issue]:
     """Find a direction along which the cost hardly changes, of the unknowns on which it depends."""
     smallest, names = _find_weakest(fit)
     if abs(smallest) < BARELY_DETERMINED:
-        yield Issue("hardly determined", names, {"eigenvalue": smallest})
+        yield Issue("not determined", names, {"eigenvalue": smallest})
 
 
 def _find_weakest(fit: Fit) -> tuple[float, tuple[str, ...]]:
@@ -247,8 +243,7 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     found += _find_others(fit, certify(fit, None) if certificate is None else certificate)
     answers = _answer(fit, quality, {f.reason.kind: f.reason for f in found})
     if not found:
-        merits = [Issue("at kinks", tuple(kink.unknown for kink in fit.kinks))] if fit.kinks else []
-        return Verdict("good", (answers[-1], *merits), answers=answers)
+        return Verdict("good", (answers[-1], *_find_kinks(fit)), answers=answers)
     if has_looked(fit):  # it is no remedy any more
         found = [f._replace(steps=tuple(step for step in f.steps if step != "more starts")) for f in found]
     return build_verdict(found, answers)
@@ -292,7 +287,7 @@ def _list_numbers(fit: Fit, quality: Quality | None) -> Numbers:
     found = replace(
         ended,
         collapsed=fit.status is Status.COLLAPSED or any(c.position is not None for c in fit.active),
-        at_bounds=len(list_held(fit)) if any(fit.comparisons) else 0,
+        at_bounds=len(list(_find_bounds(fit))) if any(fit.comparisons) else 0,
         smallest=0.0 if is_flat else _find_weakest(fit)[0],
     )
     if not quality.channels:
@@ -307,16 +302,6 @@ def _list_numbers(fit: Fit, quality: Quality | None) -> Numbers:
         freedom=np.inf if fit.sigma_known is None else fit.freedom,
         references=any(channel.kind == "reference" for channel in quality.channels),
     )
-
-
-def list_held(fit: Fit) -> tuple[str, ...]:
-    """Return the unknowns that bounds hold which the user gave.
-
-    Parameters
-    ----------
-    fit : Fit
-    """
-    return tuple(c.unknown for c in fit.active if c.position is None and c.unknown not in fit.idle)
 
 
 ELSEWHERE = ("more starts", "look at the residuals")
@@ -365,7 +350,8 @@ def _explain(fit: Fit, quality: Quality | None, doubt: Doubt) -> Iterator[Findin
     elif kind == "a mode collapsed":
         yield from _find_collapsed(fit)
     elif kind == "at bounds":
-        yield Finding(level, Issue(kind, list_held(fit)), ("move the bound",))
+        held = tuple(name for issue in _find_bounds(fit) for name in issue.subjects)
+        yield Finding(level, Issue(kind, held), ("move the bound",))
     elif kind == "not determined":
         smallest, names = _find_weakest(fit)
         weakest = names or tuple(name for name, _ in fit.flat_direction)
@@ -405,18 +391,12 @@ def _find_ending(fit: Fit) -> Iterator[Finding]:
 
 
 def _find_collapsed(fit: Fit) -> Iterator[Finding]:
-    """Find modes that have collapsed, or are at their minimum duration."""
-    collapsed, leave_out = False, ("more starts", "leave the mode out")
-    for constraint in fit.active:
-        if constraint.position is None:
-            continue
-        is_collapsed = constraint.kind == "collapsed"
-        kind, steps = ("a mode collapsed", leave_out) if is_collapsed else ("a mode is short", ("lower min_duration",))
-        collapsed = collapsed or is_collapsed
-        subjects, figures = (constraint.mode, constraint.run), {"position": float(constraint.position)}
-        yield Finding("doubtful", Issue(kind, subjects, figures), steps)
-    if fit.status is Status.COLLAPSED and not collapsed:
-        yield Finding("doubtful", Issue("idle", fit.idle), leave_out)
+    """Yield findings about modes that have collapsed, or are at their minimum duration."""
+    steps = {"a mode collapsed": ("more starts", "leave the mode out"), "a mode is short": ("lower min_duration",)}
+    found = list(_find_short_modes(fit))
+    if fit.status is Status.COLLAPSED and all(issue.kind == "a mode is short" for issue in found):
+        found.append(Issue("idle", fit.idle))
+    yield from (Finding("doubtful", issue, steps.get(issue.kind, steps["a mode collapsed"])) for issue in found)
 
 
 def _find_cut_search(fit: Fit, quality: Quality | None) -> Iterator[Finding]:

@@ -443,10 +443,7 @@ def compute_threshold(fit: Fit, level: float) -> float:
 
     NaN for a fit without a noise model, or one that did not converge.
     """
-    if fit.sigma_known is None or not fit.status.successful:
-        return np.nan
-    scale = 1.0 if fit.sigma_known else 2.0 * fit.cost / max(fit.freedom, 1)
-    return 0.5 * fit.quantile(level) ** 2 * scale
+    return 0.5 * fit.quantile(level) ** 2 * fit.variance_scale if fit.status.successful else np.nan
 
 
 def is_any_near(samples: FloatArray, values: FloatArray, errors: FloatArray) -> NDArray[np.bool_]:
