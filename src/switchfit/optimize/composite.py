@@ -11,8 +11,8 @@ composite step of Byrd and Omojokun ([1]_, section 18.5, algorithm 18.4) asks of
 2. the *tangential step* t minimizes the model within ``A t = 0``, the rest of the trust region and the inequalities.
 
 With an orthonormal basis Z of the null space of A the second is a programme in w, t = Z w, of which w = 0 is a feasible
-point, as `solve_qp` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are solved in
-units of `reach`.
+point, as `solve_programme` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are
+solved in units of `reach`.
 
 References
 ----------
@@ -28,7 +28,7 @@ import numpy as np
 from switchfit.optimize import lapack
 from switchfit.optimize.algebra import FloatArray, IntArray, largest, norm
 from switchfit.optimize.matrix import factorize_rows, shift_to_positive
-from switchfit.optimize.qp import CholeskyFactor, Room, newton_step, solve_programme
+from switchfit.optimize.qp import CholeskyFactor, Room, solve_programme
 
 NORMAL_PART = 0.95
 """Part of the trust region in which the normal step has to stay; the rest is left for the tangential step."""
@@ -127,8 +127,6 @@ class Composite(NamedTuple):
     Attributes
     ----------
     step : array, shape (d,)
-    forces : array, shape (m,)
-        Multipliers of the rows of the inequalities.
     multipliers : array, shape (k,)
         Of the equality constraints: ``g + H d + Aᵀ lam`` is what the inequalities exert, as nearly as that can be had.
     definite : bool
@@ -136,7 +134,6 @@ class Composite(NamedTuple):
     """
 
     step: FloatArray
-    forces: FloatArray
     multipliers: FloatArray
     definite: bool
 
@@ -166,7 +163,7 @@ def solve_composite(
     """
     d = gradient.size
     if not d:
-        return Composite(gradient, np.zeros(len(room.normals)), np.zeros(len(equalities.values)), True)
+        return Composite(gradient, np.zeros(len(equalities.values)), True)
     # Units of `reach`: the trust region is the cube |d_i| <= radius, and unlike unknowns have comparable lengths.
     slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
     scaled, room = Equalities(equalities.values, equalities.jacobian * reach), _scale_room(room, reach)
@@ -183,7 +180,7 @@ def solve_composite(
     # What the inequalities exert is taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the
     # least-squares sense.
     multipliers = rows.multipliers(force - room.normals.T.dot(pull))
-    return Composite(step * reach, pull[:-d], multipliers, definite)
+    return Composite(step * reach, multipliers, definite)
 
 
 def _scale_room(room: Room, reach: FloatArray) -> Room:
@@ -202,16 +199,12 @@ def _add_tangential_step(
     """
     # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
     (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
-    factor = CholeskyFactor.of(matrix)
-    step = normal + null.dot(newton_step(slope, matrix, factor))
-    if cube.holds(step):
-        return step, np.zeros(len(cube.lower)), definite
     # What bounds v + Z w bounds w by rows alone.
     products, free = cube.normals.dot(normal), np.full(slope.size, np.inf)
     lower = np.concatenate([np.minimum(cube.lower - products, 0.0), -free])
     upper = np.concatenate([np.maximum(cube.upper - products, 0.0), free])
     inside = Room(np.concatenate([cube.normals.dot(null), np.eye(slope.size)]), lower, upper)
-    found, pull = solve_programme(slope, matrix, factor, inside)
+    found, pull = solve_programme(slope, matrix, CholeskyFactor.of(matrix), inside)
     pull = pull[: -slope.size]
     return cube.press(normal + null.dot(found), pull), pull, definite
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, is_finite, largest, project_on_row
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, largest, project_on_row
 from switchfit.optimize.qp import LinearConstraints
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
@@ -135,22 +135,11 @@ class Breakpoints:
     of_coordinates: tuple[tuple[int, list[float]], ...]
 
     @classmethod
-    def of(cls, given: Sequence[ArrayLike] | None, d: int) -> Breakpoints:
-        """Check one array for each of d coordinates; coordinates may share one, which is read once."""
-        given = [()] * d if given is None else given
-        read: dict[int, list[float]] = {}
-        found = []
-        for i, points in enumerate(given):
-            if id(points) not in read:
-                array = np.asarray(points, dtype=float).reshape(-1)
-                if not (np.isfinite(array).all() and (array[1:] > array[:-1]).all()):
-                    raise ValueError(
-                        f"the breakpoints of coordinate {i} must be finite and strictly increasing; use np.unique"
-                    )
-                read[id(points)] = array.tolist()
-            if read[id(points)]:
-                found.append((i, read[id(points)]))
-        return cls(tuple(found))
+    def of(cls, given: Sequence[ArrayLike]) -> Breakpoints:
+        """Return those of one ascending array for each coordinate; coordinates may share one, which is read once."""
+        each = {id(points): points for points in given}
+        read = {key: np.asarray(points, dtype=float).tolist() for key, points in each.items()}
+        return cls(tuple((i, read[id(points)]) for i, points in enumerate(given) if read[id(points)]))
 
     def find_met(self, theta: FloatArray) -> list[int]:
         """Return the coordinates of theta (d,) that sit exactly on one of their breakpoints."""
@@ -231,8 +220,6 @@ def typical_reach(theta: FloatArray) -> FloatArray:
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
     """Return the start theta (d,) with violations of the size of rounding removed; ValueError for larger ones."""
     constraints = problem.constraints
-    if not is_finite(theta):
-        raise ValueError(f"theta0 is not finite: {theta}")
     start = move(problem, theta, np.zeros(theta.size), np.abs(theta))
     if start.far:
         return start

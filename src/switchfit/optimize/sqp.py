@@ -194,7 +194,7 @@ def minimize(
     constraints : LinearConstraints
         ``A theta >= b`` and bounds.
     breakpoints : sequence of d arrays, or Breakpoints, optional
-        Sorted values of each coordinate where the derivatives of J may jump; by default, J is smooth.
+        Ascending values of each coordinate where the derivatives of J may jump; by default, J is smooth.
     hessian : HessianKind
         Matrix of the quadratic program.
     blocks : array of int, shape (d,), optional
@@ -230,7 +230,7 @@ def minimize(
     Raises
     ------
     ValueError
-        If the start is infeasible or not finite, or breakpoints are not in order.
+        If the start is infeasible.
 
     Notes
     -----
@@ -244,7 +244,7 @@ def minimize(
     problem = Problem(
         evaluate=evaluate,
         constraints=constraints,
-        breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
+        breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints or ()),
         hessian=hessian,
         labels=np.asarray(blocks, dtype=float) if hessian == "block-diagonal" else None,
         tolerance=tolerance,
