@@ -102,9 +102,9 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
         if problem.equalities and measure_in_box(problem, direction.step) < SMALLEST_RADIUS:
             return None
         if not problem.equalities and k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
-            break
+            return None
         direction, piece = shrink_region(problem, state, direction, piece)
-    return None if problem.equalities else _blind_step(oracle, state, direction)
+    return None
 
 
 def _attempt_in_box(oracle: Oracle, state: State, direction: Direction, fraction: float) -> Accepted | None:
@@ -126,7 +126,7 @@ def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted |
         alpha *= 0.5 if k < 5 else 0.25
         if k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost):
             break
-    return _blind_step(oracle, state, direction)
+    return None
 
 
 def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -151,7 +151,7 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
         stop = _attempt(oracle, state, nearer, 1.0, ARMIJO_ACROSS)
         if stop is not None and (accepted is None or stop.point.jumps):
             return Accepted(stop.point, alpha)
-    return _blind_step(oracle, state, direction) if accepted is None else Accepted(accepted.point, alpha)
+    return None if accepted is None else Accepted(accepted.point, alpha)
 
 
 def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float) -> Accepted | None:
@@ -179,23 +179,6 @@ def _judge(oracle: Oracle, state: State, there: Trial, decrease: float, fraction
         return None
     allowed = optimality_allows(trial.optimality, point.optimality, trial.cost, lowest, decrease, noise)
     return trial if allowed else None
-
-
-def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Take the full step on the word of the derivatives, where J is a small difference of large terms.
-
-    The rounding error of such a J is that of the largest cost seen, not of J; the KKT residual has to halve.
-    """
-    noise = NOISE * state.cost_scale
-    if direction.reduction > noise:
-        return None
-    there = move(oracle.problem, state.point.theta, direction.step, state.scale)
-    if there.is_at(state.point.theta):
-        return None
-    trial = oracle.point(there, state.scale)
-    if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
-        return None
-    return Accepted(trial, 1.0, state.radius)
 
 
 #: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [3]_, (18.36).
