@@ -160,9 +160,6 @@ RESTARTS = 3
 #: Statuses of minimizations that might have gone on.
 UNFINISHED = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED)
 
-#: Relative change of multipliers below which the Hessian of the Lagrangian is not evaluated again.
-SAME_MULTIPLIERS = 1e-9
-
 
 @one_thread()
 def minimize(
@@ -416,7 +413,6 @@ def _record(oracle: Oracle, state: State) -> IterationRecord:
 def _result(oracle: Oracle, state: State, status: Status, history: tuple[IterationRecord, ...]) -> Result:
     """Return the result at the state's point."""
     problem = oracle.problem
-    state = _with_own_multipliers(oracle, state)
     point = state.point
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = curvature_at(problem, state, point.active)
@@ -442,18 +438,6 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
         equalities=_list_equalities(oracle, point),
     )
-
-
-def _with_own_multipliers(oracle: Oracle, state: State) -> State:
-    """Return the state with the Hessian of the Lagrangian at its own multipliers; itself without equalities."""
-    point = state.point
-    used = point.plus.multipliers
-    if used is None or not oracle.problem.equalities:
-        return state
-    if (np.abs(used - point.forces) <= SAME_MULTIPLIERS * np.abs(point.forces)).all():
-        return state
-    again = oracle.with_own_multipliers(point)
-    return state if again is None else state._replace(point=again)
 
 
 def _list_violated(oracle: Oracle, point: Point) -> tuple[tuple[str, float], ...]:
