@@ -26,7 +26,8 @@ from switchfit.fit.faults import list_changes, refuse_hidden_switches
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
 from switchfit.optimize.algebra import EPS
 from switchfit.optimize.arrow import Arrow
-from switchfit.optimize.problem import REACH, HessianKind
+from switchfit.optimize.problem import Breakpoints, HessianKind
+from switchfit.optimize.problem import Problem as Minimization
 from switchfit.optimize.state import Finding
 from switchfit.optimize.threads import with_own_threads
 from switchfit.problem.data import FloatArray
@@ -150,8 +151,9 @@ MANY_RUNS = 16
 """Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
 
-TIME_REACH = 0.01
-"""Largest change of a transition time in the first trust-region step, as a part of the horizon."""
+REACH, TIME_REACH = 0.1, 0.01
+"""Largest change in the first trust-region step: of an unknown as a part of its size, of a transition time as a part of
+the horizon."""
 
 
 def minimize_cost(
@@ -162,7 +164,6 @@ def minimize_cost(
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None = None,
     constraints: LinearConstraints | None = None,
-    by_blocks: bool | None = None,
     multipliers: Sequence[float] | None = None,
     follower: Follower | None = None,
 ) -> Result:
@@ -171,17 +172,15 @@ def minimize_cost(
     With a `follower` of the evaluator, meshes are made anew where they are too coarse: its own are then those of the
     result.
 
-    `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
-    several runs; by default, it is used where that is faster, and never with guards or terminal constraints, whose
-    `multipliers` may be known from a fit on other meshes.
+    `constraints` are by default those of the problem. The arrow shape of the Hessian of many runs is used where that is
+    faster, and never with guards or terminal constraints, whose `multipliers` may be known from a fit on other meshes.
     """
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
     matrix: Matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
-    if by_blocks is None:
-        many = len(problem.experiments) >= MANY_RUNS and not names
-        by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
+    many = len(problem.experiments) >= MANY_RUNS and not names
+    by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = problem.constraints if constraints is None else constraints
     change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
@@ -214,23 +213,22 @@ def minimize_cost(
         return None if callback is None else with_own_threads(callback)(record)
 
     natively = all(isinstance(engine, NativeEngine) for engine in evaluator.engines)  # calls no functions of the user
-    result = minimize(
-        evaluate if natively else with_own_threads(evaluate),
-        theta if change is None else change.variables.inward(np.asarray(theta)),
+    posed = Minimization(
+        evaluate=evaluate if natively else with_own_threads(evaluate),
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
-        breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
+        breakpoints=evaluator.sorted_breakpoints if change is None else Breakpoints.of(change.points),
         hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
-        blocks=unknowns.is_time,  # of (4), with hessian="block-diagonal"
+        labels=unknowns.is_time.astype(float) if hessian == "block-diagonal" else None,  # of (4)
         tolerance=tolerance,
         max_iterations=max_iterations,
-        callback=None if follower is None and callback is None else report,
         size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
         idle=None if names else idle if natively else with_own_threads(idle),
         reach=_compute_reach(problem),
         equalities=names,
-        multipliers=multipliers,
         accuracy=None if follower is None else follower.get_accuracy,
     )
+    start = np.array(theta, dtype=float) if change is None else change.variables.inward(np.asarray(theta))
+    result = minimize(posed, start, None if follower is None and callback is None else report, multipliers)
     if change is None:
         return result
     converted = change.convert_result(result)

@@ -26,10 +26,6 @@ HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss
 - "none": steepest descent in the metric of theta, as in the paper.
 """
 
-REACH = 0.1
-"""Part of an unknown's size by which it may move in the first step inside a trust region."""
-
-
 Evaluate = Callable[..., Any]
 """``evaluate(theta, side)`` returns ``cost`` J, ``gradient`` (d,), and ``hessian``: (d, d), an `Arrow`, or None.
 
@@ -54,21 +50,29 @@ class Problem:
     Attributes
     ----------
     evaluate : callable
+        Cost, gradient and Hessian, and equality constraints if there are any.
     constraints : LinearConstraints
+        ``A theta >= b`` and bounds.
     breakpoints : Breakpoints
     hessian : HessianKind
     labels : array, shape (d,), or None
-        Labels of the blocks, where the Hessian is cut into blocks.
-    tolerance, max_iterations : float, int
+        Labels of the blocks, where the Hessian is cut into blocks ("block-diagonal").
+    tolerance : float
+        Bound on the KKT residual. Unless `hessian` is "none", the next step has to be negligible too: at most 1e-10 of
+        the size of each unknown, or a few iterations later.
+    max_iterations : int
     size : array, shape (d,)
-        Typical size of each coordinate; zero if only its values are known.
+        Typical size of each unknown, to which rounding errors are relative; zero if only its values are known. For a
+        time this is the length of the horizon, even if the time itself is small.
     idle : callable or None
+        Finds the coordinates on which J does not depend.
     reach : array, shape (d,)
-        Largest change of each coordinate in the first step inside a trust region.
+        Largest change of each unknown in the first step inside a trust region.
     equalities : tuple of str
-        Names of the equality constraints; empty if there are none.
+        Names of the equality constraints c(theta) = 0; empty if there are none.
     accuracy : callable or None
-        Relative accuracy of J; None where it is that of rounding.
+        Returns the relative accuracy of J, which may be known only after some evaluations: the minimum is found where
+        less is to be gained. None where it is that of rounding.
     """
 
     evaluate: Evaluate
@@ -187,12 +191,6 @@ class Breakpoints:
         return min(fractions, default=np.inf)
 
 
-def as_vector(given: ArrayLike, d: int) -> FloatArray:
-    """Return one number for each of d coordinates, (d,), from as many or from one for all."""
-    array = np.asarray(given, dtype=float)
-    return array if array.shape == (d,) else np.broadcast_to(array, (d,))
-
-
 def _nearest(points: list[float], x: float) -> float:
     above = bisect_left(points, x)
     if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
@@ -204,12 +202,6 @@ def _next(points: list[float], x: float, step: float) -> float:
     """Return the fraction of a step of one coordinate up to the next breakpoint; infinite if it meets none."""
     k = bisect_right(points, x) if step > 0.0 else bisect_left(points, x) - 1
     return (points[k] - x) / step if step != 0.0 and 0 <= k < len(points) else np.inf
-
-
-def typical_reach(theta: FloatArray) -> FloatArray:
-    """Return the default of the largest changes in a first step, a part of the unknowns' sizes: (d,)."""
-    size = np.abs(theta)
-    return REACH * np.where(size > 0.0, size, 1.0)
 
 
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:

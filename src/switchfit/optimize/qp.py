@@ -105,15 +105,6 @@ class LinearConstraints:
         """Return the normals at the given places, shape (k, d)."""
         return self.normals[index]
 
-    @cached_property
-    def row_norms(self) -> FloatArray:
-        """Lengths of the normals, shape (m + 2 d,)."""
-        return np.concatenate([np.linalg.norm(self.A, axis=1), np.ones(2 * self.size)])
-
-    def slopes(self, step: FloatArray) -> FloatArray:
-        """Return the products of the normals with a step, shape (m + 2 d,)."""
-        return np.concatenate([self.A @ step, step, -step])
-
     def slack(self, theta: FloatArray) -> FloatArray:
         """Return how far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
         return np.asarray(algebra.slack(self, theta))

@@ -24,7 +24,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import numpy as np
@@ -43,19 +42,7 @@ from switchfit.optimize.direction import Direction, find_direction, measure_in_b
 from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.point import MET, Oracle, Point, Sample
-from switchfit.optimize.problem import (
-    Breakpoints,
-    Evaluate,
-    HessianKind,
-    Idle,
-    Problem,
-    Trial,
-    as_vector,
-    feasible_start,
-    move,
-    typical_reach,
-)
-from switchfit.optimize.qp import LinearConstraints
+from switchfit.optimize.problem import Problem, Trial, feasible_start, move
 from switchfit.optimize.state import (
     Accepted,
     Callback,
@@ -103,10 +90,11 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
     # No further than the first inactive constraint that the ray approaches.
-    slope = problem.constraints.slopes(ray)
+    normals = problem.constraints.normals
+    slope = normals @ ray
     slack = np.maximum(point.slack, 0.0)
     slack[point.active] = 0.0
-    approaching = slope < -1e-12 * problem.constraints.row_norms
+    approaching = slope < -1e-12 * np.linalg.norm(normals, axis=1)
     length = min(length, float(np.min(slack[approaching] / -slope[approaching], initial=np.inf)))
     for _ in range(40):
         decrease = -0.5 * bending * length**2
@@ -135,61 +123,20 @@ UNFINISHED = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED)
 
 @one_thread()
 def minimize(
-    evaluate: Evaluate,
-    theta0: ArrayLike,
-    *,
-    constraints: LinearConstraints,
-    breakpoints: Breakpoints | Sequence[ArrayLike] | None = None,
-    hessian: HessianKind = "exact",
-    blocks: ArrayLike | None = None,
-    tolerance: float = 1e-7,
-    max_iterations: int = 200,
-    callback: Callback | None = None,
-    size: ArrayLike | None = None,
-    idle: Idle | None = None,
-    reach: ArrayLike | None = None,
-    equalities: Sequence[str] = (),
-    multipliers: ArrayLike | None = None,
-    accuracy: Callable[[], float] | None = None,
+    problem: Problem, start: FloatArray, callback: Callback | None = None, multipliers: ArrayLike | None = None
 ) -> Result:
     """Minimize a piecewise smooth cost under linear constraints, which all iterates satisfy, and equality constraints.
 
     Parameters
     ----------
-    evaluate : Evaluate
-        Cost, gradient and Hessian, and equality constraints if there are any.
-    theta0 : array, shape (d,)
-        Start, feasible up to rounding.
-    constraints : LinearConstraints
-        ``A theta >= b`` and bounds.
-    breakpoints : sequence of d arrays, or Breakpoints, optional
-        Ascending values of each coordinate where the derivatives of J may jump; by default, J is smooth.
-    hessian : HessianKind
-        Matrix of the quadratic program.
-    blocks : array of int, shape (d,), optional
-        Label of each coordinate, for "block-diagonal".
-    tolerance : float
-        Bound on the KKT residual. Unless `hessian` is "none", the next step has to be negligible too: at most 1e-10 of
-        the size of each unknown, or a few iterations later.
-    max_iterations : int
+    problem : Problem
+    start : array, shape (d,)
+        Feasible up to rounding; it need not satisfy the equality constraints.
     callback : callable, optional
         Called with an `IterationRecord` after every iteration; a true return value stops with ``INTERRUPTED``.
-    size : array, shape (d,), optional
-        Typical size of each unknown, to which rounding errors are relative. For a time this is the length of the
-        horizon, even if the time itself is small. By default, the size of the unknown's own values.
-    idle : Idle, optional
-        Finds the coordinates on which J does not depend.
-    reach : array, shape (d,), optional
-        Largest change of each unknown in the first step inside a trust region ("auto"); a tenth of its value by
-        default.
-    equalities : sequence of str, optional
-        Names of the equality constraints c(theta) = 0, which the start need not satisfy.
     multipliers : array, shape (k,), optional
         Of the equality constraints at the start, where they are known. Otherwise they are found there by least squares,
         and where constraints are fewer than unknowns, the start is evaluated once more for the Lagrangian's Hessian.
-    accuracy : callable, optional
-        Returns the relative accuracy of J, which may be known only after some evaluations: the minimum is found where
-        less is to be gained. By default, it is that of rounding.
 
     Returns
     -------
@@ -208,27 +155,11 @@ def minimize(
 
     Linear algebra has one thread, also in the functions that are called, unless these are `with_own_threads`.
     """
-    start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    d = constraints.size
-    problem = Problem(
-        evaluate=evaluate,
-        constraints=constraints,
-        breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints or ()),
-        hessian=hessian,
-        labels=np.asarray(blocks, dtype=float) if hessian == "block-diagonal" else None,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        size=np.zeros(d) if size is None else as_vector(size, d),
-        idle=idle,
-        reach=typical_reach(start) if reach is None else as_vector(reach, d),
-        equalities=tuple(equalities),
-        accuracy=accuracy,
-    )
     trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
     # The Hessian of the Lagrangian needs multipliers, and these need derivatives: the start is evaluated with zero
     # ones.
     point = oracle.point(trial, np.abs(trial.theta))
-    if point is not None and multipliers is None and 0 < len(equalities) < start.size:
+    if point is not None and multipliers is None and 0 < len(problem.equalities) < start.size:
         # As many constraints as unknowns leave no direction in which curvature counts.
         point = oracle.with_own_multipliers(point)
     if point is None:
