@@ -52,8 +52,7 @@ from switchfit.strategy.starts import fit_briefly
 
 
 def find_read(problem: Problem, structures: Iterable[Structure], *, library: bool) -> NDArray[np.bool_]:
-    """Return what the functions of a problem read, arrays as a whole, and the initial states, in the order of theta
-    after the times: (M,).
+    """Return what the functions of a problem read, and the initial states, in the order of theta after the times: (M,).
 
     Parameters
     ----------
@@ -65,18 +64,10 @@ def find_read(problem: Problem, structures: Iterable[Structure], *, library: boo
     unknowns, read = problem.unknowns, find_targets(problem, structures, library=library)
     found = np.zeros(len(unknowns.names), dtype=bool)
     for name, span in unknowns.parameters.items():
-        found[span] = name in read
+        found[[span.start + i for i in read.get(name, ())]] = True
     for states in unknowns.initial_states:
         found[states[states >= 0]] = True
     return found[int(unknowns.is_time.sum()) :]
-
-
-def find_arrays(problem: Problem) -> NDArray[np.bool_]:
-    """Return which of the parameters are entries of an array: (M,)."""
-    found = np.zeros(len(problem.theta_names), dtype=bool)
-    for span in problem.unknowns.parameters.values():
-        found[span] = span.stop - span.start > 1
-    return found[int(problem.unknowns.is_time.sum()) :]
 
 
 SEARCH_RTOL = 1e-6
@@ -598,23 +589,5 @@ class Fitter:
         key = tuple(sequences)
         if key not in self._acting:
             structures = [self.costs.structure_of(e, sequence) for e, sequence in enumerate(key)]
-            acting = find_read(self.problem, structures, library=False)
-            arrays = find_arrays(self.problem) & acting
-            if arrays.any():  # modes may read some entries of an array and not others
-                acting &= ~(arrays & self._find_without_effect(key))
-            self._acting[key] = acting
+            self._acting[key] = find_read(self.problem, structures, library=False)
         return self._acting[key]
-
-    def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
-        """Return the parameters in which J has no first and second derivatives at two points: (M,)."""
-        given = self._space_evenly(sequences)
-        if not given:
-            return np.zeros(len(self.start), dtype=bool)
-        idle = np.ones(len(self.start), dtype=bool)
-        for factor in (1.0, 1.1):
-            theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
-            with np.errstate(all="ignore"):
-                here = self.get_evaluator(given)(theta)
-            first = len(theta) - len(idle)
-            idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
-        return idle
