@@ -25,16 +25,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.optimize import lapack
-from switchfit.optimize.algebra import FloatArray, IntArray, largest, norm
-from switchfit.optimize.matrix import factorize_rows, shift_to_positive
+from switchfit.optimize.algebra import FloatArray, largest, norm
+from switchfit.optimize.matrix import shift_to_positive
 from switchfit.optimize.qp import CholeskyFactor, Room, solve_programme
 
 NORMAL_PART = 0.95
 """Part of the trust region in which the normal step has to stay; the rest is left for the tangential step."""
 
 DEPENDENT = 1e-10
-"""Rows of a Jacobian whose part across the others is below this part of the largest row depend on them."""
+"""Rows of a Jacobian are dependent where a singular value is below this part of the largest one."""
 
 FLAT = 1e-8
 """Curvature that counts as none, as a part of the largest slope: where J is linear, the trust region ends the step."""
@@ -63,62 +62,35 @@ class Equalities(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The factorization Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows.
+    """The singular value decomposition A = U S Vᵀ of a Jacobian A (k, d), which may have dependent rows.
 
     Attributes
     ----------
-    jacobian : array, shape (k, d)
-    orthogonal : array, shape (d, d)
-        Q.
-    triangular : array, shape (d, k)
-        R is its upper triangle; below it is what the factorization has left.
-    order : array, shape (k,)
-        P.
-    rank : int
-        Number of independent rows.
+    left, sizes, right : arrays, shape (k, r), (r,), (d, r)
+        U, the diagonal of S, and V, for the r singular values that count.
+    null : array, shape (d, d - r)
+        Orthonormal basis of the null space of A.
     """
 
-    jacobian: FloatArray
-    orthogonal: FloatArray
-    triangular: FloatArray
-    order: IntArray
-    rank: int
+    left: FloatArray
+    sizes: FloatArray
+    right: FloatArray
+    null: FloatArray
 
     @classmethod
     def of(cls, jacobian: FloatArray) -> Rows:
-        """Factorize a Jacobian (k, d), k > 0."""
-        orthogonal, triangular, order = factorize_rows(jacobian)
-        sizes = [abs(size) for size in triangular.diagonal().tolist()]
-        least = DEPENDENT * sizes[0]
-        return cls(jacobian, orthogonal, triangular, order, sum([size > least for size in sizes]))
-
-    @property
-    def null(self) -> FloatArray:
-        """Orthonormal basis of the null space of A: (d, d - rank)."""
-        return self.orthogonal[:, self.rank :]
-
-    @property
-    def _regular(self) -> FloatArray | None:
-        k = len(self.order)
-        return self.triangular[:k] if self.rank == k else None
+        """Decompose a Jacobian (k, d), k > 0."""
+        left, sizes, right = np.linalg.svd(jacobian)
+        rank = np.count_nonzero(sizes > DEPENDENT * sizes[0])
+        return cls(left[:, :rank], sizes[:rank], right[:rank].T, right[rank:].T)
 
     def solve(self, values: FloatArray) -> FloatArray:
         """Return the shortest v (d,) that minimizes ‖values + A v‖₂."""
-        regular = self._regular
-        if regular is None:
-            return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
-        # A' P = Q R, so that A v = -c is R' (Q'v) = -P'c: the solution in the range of Q is the shortest.
-        inside = lapack.dtrtrs(regular, values[self.order], trans=1)[0]
-        return -np.asarray(self.orthogonal[:, : self.rank].dot(inside))
+        return -np.asarray(self.right.dot(self.left.T.dot(values) / self.sizes))
 
     def multipliers(self, force: FloatArray) -> FloatArray:
         """Return the lam (k,) that minimizes ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
-        regular = self._regular
-        if regular is None:
-            return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
-        found = np.empty(len(self.order))
-        found[self.order] = -lapack.dtrtrs(regular, self.orthogonal[:, : self.rank].T.dot(force))[0]
-        return found
+        return -np.asarray(self.left.dot(self.right.T.dot(force) / self.sizes))
 
 
 class Composite(NamedTuple):
@@ -172,7 +144,7 @@ def solve_composite(
     # end.
     step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
     pull, definite, force = np.zeros(len(room.lower)), True, slope + bending.dot(step)
-    if rows.rank < d:
+    if rows.null.size:
         least = FLAT * largest(np.abs(slope)) + TINY
         cube = room.narrow(np.full(d, radius))
         step, pull, definite = _add_tangential_step(force, bending, rows.null, least, step, cube)

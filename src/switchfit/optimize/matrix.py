@@ -308,24 +308,8 @@ def null_space(normals: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
     if normals.size == 0:
         return np.eye(normals.shape[1])
-    Q, R, _ = factorize_rows(unit_rows(normals)[0])
-    rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
-    return Q[:, rank:]
-
-
-def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return the factorization ``rowsᵀ P = Q R`` of rows (k, d), k and d positive: Q (d, d), R (d, k) and P (k,).
-
-    R is the upper triangle of what is returned; the size of its diagonal falls. `scipy.linalg.qr` takes four times
-    longer on a small matrix.
-    """
-    k, d = rows.shape
-    packed, order, tau, _, _ = lapack.dgeqp3(rows.T)
-    full = packed
-    if k != d:
-        full = np.zeros((d, d), order="F")
-        full[:, :k] = packed[:, :d]
-    return lapack.dorgqr(full, tau)[0], packed, order - 1
+    _, sizes, right = np.linalg.svd(unit_rows(normals)[0])
+    return np.asarray(right[np.count_nonzero(sizes > 1e-11) :].T)
 
 
 def _add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
