@@ -730,11 +730,11 @@ def test_outliers_are_told_from_modes():
     assert found.best.problem.experiments[0].data[0].loss == "huber"
 
 
-def test_a_wrong_sigma_is_told_from_modes(factor=0.3):
+def test_a_wrong_sigma_is_told_from_modes():
     """The sequence is right, but whether it is sigma or the model that is wrong, the data cannot say."""
-    found = sf.find_modes(make_problem(times=(2.0, 5.0), sigma=factor * SIGMA), max_switches=5)
+    found = sf.find_modes(make_problem(times=(2.0, 5.0), sigma=0.3 * SIGMA), max_switches=5)
     assert found.status is sf.ModeStatus.NOT_EXPLAINED
     assert found.ending.reason == "sigma"
     assert found.mode_sequence == SEQUENCE
-    assert abs(found.ending.ratio * factor - 1.0) < 0.15
+    assert abs(0.3 * found.ending.ratio - 1.0) < 0.15
     assert abs(found.best.residual_variance - 1.0) < 0.25
