@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -42,12 +42,12 @@ from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
 from switchfit.optimize import LinearConstraints
-from switchfit.problem.data import FloatArray, TransitionCost
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.inspection import find_targets
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Function, Structure, trace_structure
-from switchfit.strategy.library import Library
+from switchfit.problem.structure import Structure
+from switchfit.strategy.library import Library, trace_transition
 from switchfit.strategy.starts import fit_briefly
 
 
@@ -174,7 +174,7 @@ class ScheduleCosts:
     def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
         self.problem, self._evaluator = problem, evaluator
         self._rows: dict[tuple[int, tuple[str, ...]], NDArray[np.int64]] = {}
-        self._pairs: dict[tuple[int, tuple[str, str]], tuple[Function | None, ...]] = {}
+        self._trace = cache(lambda e, pair: trace_transition(problem, problem.experiments[e], pair))
         self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
         times = sum(len(run.transition_times) for run in problem.experiments)
         counts = [len(run.times) + len(run.jump_times) for run in problem.experiments]
@@ -274,22 +274,9 @@ class ScheduleCosts:
         modes = tuple(base.mode_names.index(mode) for mode in sequence)
         if base.jumps:  # among whose reset maps those of the jumps stand
             return replace(base, mode_of_segment=modes)
-        found = [self._functions_between(e, pair) for pair in pairwise(sequence)]
-        resets, guards, costs = zip(*found, strict=True) if found else ((), (), ())
+        found = [self._trace(e, pair) for pair in pairwise(sequence)]
+        resets, costs, guards = zip(*found, strict=True) if found else ((), (), ())
         return replace(base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs)
-
-    def _functions_between(self, e: int, pair: tuple[str, str]) -> tuple[Function | None, ...]:
-        """Return the reset map, the guard and the transition cost of a transition."""
-        if (e, pair) not in self._pairs:
-            problem, run = self.problem, self.problem.experiments[e]
-            found: tuple[Function | None, ...] = (None, None, None)
-            costs = any(isinstance(item, TransitionCost) for item in run.data)
-            if costs or pair in problem.system.reset_maps or pair in problem.system.guards:
-                run = replace(run, mode_sequence=pair, transition_times=None)
-                alone = trace_structure(problem.system, run, problem._functions, problem.solver, 1)
-                found = alone.reset_maps[0], alone.guards[0], alone.transition_costs[0]
-            self._pairs[e, pair] = found
-        return self._pairs[e, pair]
 
 
 COLLAPSED = 1e-6
