@@ -1,22 +1,22 @@
 """The SQP as one function that JAX can trace, for thousands of fits at once.
 
 It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinary kind: Newton steps on the exact
-Hessian, made positive definite by the absolute values of its eigenvalues, coordinates held at a kink or released to one
-side, and Armijo backtracking with the same constants. What is rare it leaves alone: the escape from a saddle, a face on
-which the Hessian is indefinite, the way along constraints; where it makes no headway it stops. It has no trust region
-(`switchfit.optimize.direction`): where the Hessian is indefinite, its steps may go further than those of `minimize`,
-into the basin of another minimum. `Outcome.settled` is True only for a regular minimum: no constraint is active, the
-Hessian of the coordinates that no kink holds is positive definite, and the next step is negligible. Everything else is
-to be done by `minimize`.
+Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
+in the way, coordinates held at a kink or released to one side, and Armijo backtracking with the same constants. What
+is rare it leaves alone: the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway
+it stops. It has no trust region (`switchfit.optimize.direction`): where the Hessian is indefinite, its steps may go
+further than those of `minimize`, into the basin of another minimum. `Outcome.settled` is True only for a regular
+minimum: no constraint is active, the Hessian of the coordinates that no kink holds is positive definite, and the next
+step is negligible. Everything else is to be finished by `minimize`, from `Outcome.theta` on.
 
 Every function here is for one fit; `jax.lax.map` or `jax.vmap` make many of it. The loop evaluates J once a turn, at
 the point that is to be judged: fits in lockstep then never wait for another one's line search, and the program, which
 consists of little else than J, is compiled once. A point on a breakpoint takes two turns, one for each side.
 
-The formulas are those of `switchfit.optimize.algebra`. Two things are written anew, since a traced program has arrays
-of fixed shapes and does not stop early for one fit of many: a step that leaves bounds is one with the unknowns held
-there that leave, and ends where it meets a row; and a Hessian is made positive definite as a whole, not on the face of
-the active constraints.
+The formulas are those of `switchfit.optimize.algebra`. Three things are written anew, since a traced program has arrays
+of fixed shapes and does not stop early for one fit of many: nonnegative least squares with masks in place of index sets
+(`nonnegative_minimum`), the quadratic programme by its dual, with all rows in place of those that matter, and a Hessian
+that is made positive definite as a whole, not on the face of the active constraints.
 """
 
 from __future__ import annotations
@@ -54,6 +54,9 @@ CRAWLING = (12, 1)
 """A fit that has refused more fractions of steps than this, plus this many an iteration, makes no headway and is left
 to `minimize`. Fits that settle refuse a dozen at most; others would go on by hundreds, to no end."""
 
+RIDGE = 1e-14
+"""Added to the diagonal of the dual programme, whose rows are of unit length: constraints may depend on one another."""
+
 TracedEvaluate = Callable[[Array, Array], tuple[Array, Array, Array]]
 """``evaluate(theta, side)`` returns cost, gradient (d,) and Hessian (d, d); `side` is +1.0 or -1.0: the right or left
 derivatives by coordinates on a breakpoint."""
@@ -74,6 +77,12 @@ class Constraints(NamedTuple):
     def slack(self, theta: Array) -> Array:
         """Of rows, lower and upper bounds: (m + 2 d,)."""
         return algebra.slack(self, theta, jnp)
+
+    @property
+    def normals(self) -> Array:
+        """Inward normals in the same order: (m + 2 d, d)."""
+        identity = jnp.eye(self.lower.shape[0])
+        return jnp.concatenate([self.A, identity, -identity])
 
 
 class Breakpoints(NamedTuple):
@@ -343,7 +352,7 @@ def _evaluate(state: State, task: Task) -> Point:
         right=right,
         left=left,
         kink=kink,
-        optimality=_measure_optimality(constraints, theta, _steepest(left.gradient, right.gradient, kink)),
+        optimality=_kkt_residual(constraints, theta, state.scale, _steepest(left.gradient, right.gradient, kink)),
         crossed=breakpoints.count_crossed(state.point.theta, theta),
         finite=finite,
     )
@@ -402,8 +411,7 @@ def _find_step(state: State, task: Task) -> State:
     # A step inside the piece follows a refusal: the point is the old one, which has been judged already.
     fresh = ~state.inside
     stationary = fresh & (state.point.optimality <= task.tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
-    is_blocked = ~jnp.any(step != 0.0)
-    done = stationary | is_blocked | (fresh & (state.iterations >= task.max_iterations))
+    done = stationary | (fresh & (state.iterations >= task.max_iterations))
     return state._replace(step=step, slope=slope, undirected=jnp.zeros((), bool), stationary=stationary, done=done)
 
 
@@ -486,10 +494,65 @@ def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
     return algebra.is_active(constraints.slack(theta), size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
 
 
-def _measure_optimality(constraints: Constraints, theta: Array, gradient: Array) -> Array:
-    """Return the length of the gradient without what bounds hold; rows do not count."""
-    held = (theta <= constraints.lower) & (gradient > 0.0) | (theta >= constraints.upper) & (gradient < 0.0)
-    return jnp.linalg.norm(jnp.where(held, 0.0, gradient))
+def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient: Array) -> Array:
+    """Return min over lam >= 0, on the active constraints, of ‖g − Nᵀ lam‖."""
+    active = _active(constraints, theta, scale)
+
+    def solve_constrained() -> Array:
+        # ||g - N' lam||^2 / 2 is lam' N N' lam / 2 - (N g)' lam up to a constant. The gradient is scaled to 1, since
+        # `nonnegative_minimum` compares slopes with an absolute floor.
+        normals, _ = algebra.unit_rows(constraints.normals, jnp)
+        size = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.finfo(float).tiny)
+        multipliers = nonnegative_minimum(normals @ normals.T, -normals @ (gradient / size), active)
+        return jnp.linalg.norm(gradient - size * multipliers @ normals)
+
+    return lax.cond(jnp.any(active), solve_constrained, lambda: jnp.linalg.norm(gradient))
+
+
+def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
+    """Minimize ½ lamᵀ M lam + vᵀ lam over lam >= 0 with zeros outside `allowed`: (k,).
+
+    Lawson and Hanson's active-set method with masks in place of index sets: the set of positive entries grows by the
+    steepest one and loses those that a step would make negative.
+
+    Parameters
+    ----------
+    matrix : (k, k), positive semi-definite with unit diagonal
+    vector : (k,)
+    allowed : (k,) bool
+    """
+    k = vector.shape[0]
+    index = jnp.arange(k)
+    vector = jnp.where(allowed, vector, 0.0)
+    # Optimal: M lam + v >= 0 where lam = 0, and = 0 where lam > 0. Slopes above the floor are rounding.
+    floor = -1e-13 * jnp.maximum(1.0, jnp.max(jnp.abs(vector), initial=0.0))
+
+    # M_PP lam_P = -v_P on the positive set P, all other rows being those of the identity: one shape for every set.
+    def solve_on(positive: Array) -> Array:
+        both = positive[:, None] & positive[None, :]
+        diagonal = jnp.where(positive, RIDGE, 1.0)
+        return jnp.linalg.solve(jnp.where(both, matrix, 0.0) + jnp.diag(diagonal), jnp.where(positive, -vector, 0.0))
+
+    def body(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        lam, positive, count, _ = state
+        target = solve_on(positive)
+        # As far towards the minimum on P as lam stays nonnegative; what reaches zero first leaves P.
+        leaving = positive & (target <= 0.0)
+        ratio = jnp.where(leaving, lam / jnp.where(leaving, lam - target, 1.0), jnp.inf)
+        length = jnp.minimum(jnp.min(ratio, initial=jnp.inf), 1.0)
+        lam = jnp.where(positive, lam + length * (target - lam), 0.0)
+        # At the minimum on P: the steepest of the others enters. It may enter only if nothing has just left.
+        slope = jnp.where(allowed & ~positive, vector + matrix @ lam, jnp.inf)
+        entering = jnp.argmin(slope)
+        shrunk = positive & ~(leaving & (ratio <= length))
+        grown = positive | ((index == entering) & (slope[entering] < floor))
+        positive = jnp.where(jnp.any(leaving), shrunk, grown)
+        finished = ~jnp.any(leaving) & ~(slope[entering] < floor)
+        return jnp.where(positive, jnp.maximum(lam, 0.0), 0.0), positive, count + 1, finished
+
+    # The bound on the iterations ends cycles that rounding makes; the multipliers are nonnegative at any iteration.
+    start = jnp.zeros(k), jnp.zeros(k, bool), jnp.zeros((), int), jnp.zeros((), bool)
+    return lax.while_loop(lambda state: ~state[3] & (state[2] < 3 * k + 10), body, start)[0]
 
 
 def _compute_scaling(hessian: Array, floor: Array) -> Array:
@@ -514,11 +577,7 @@ def _compute_scaling(hessian: Array, floor: Array) -> Array:
 
 
 def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints) -> tuple[Array, Array]:
-    """Return the step (d,) of the quadratic model, with kinks held or confined to one side, and its slope gᵀd.
-
-    Unknowns that leave their bounds, the piece or the side of their kink are held where they do so, and the others
-    follow, until none leaves. The step ends where it meets a row.
-    """
+    """Return the step (d,) of the quadratic programme, with kinks held or confined to one side, and its slope gᵀd."""
     point, theta, sides = state.point, state.point.theta, state.point.sides
     # The Hessian of the piece that the sides lead into; entries between one coordinate on its left and another on its
     # right are those of no piece that was evaluated, and the mean stands for them.
@@ -527,6 +586,9 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     hessian = _without(held, algebra.mix_sides(point.right.hessian, point.left.hessian, pair, jnp))
     gradient = jnp.where(held, 0.0, jnp.where(sides > 0, point.right.gradient, point.left.gradient))
     # B = D S D, with S of unit diagonal, so that eigenvalues of S are compared with numbers that have no unit.
+    narrowed = breakpoints.piece(theta, constraints)
+    lower = jnp.where(state.inside, narrowed[0], constraints.lower)
+    upper = jnp.where(state.inside, narrowed[1], constraints.upper)
     floor = algebra.curvature_floor(state.scale, state.cost_scale, point.slopes, jnp)
     scaling = _compute_scaling(hessian, floor)
     scaled = hessian / jnp.outer(scaling, scaling)
@@ -541,39 +603,39 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
         return (vectors * algebra.positive_eigenvalues(values, jnp)[None]) @ vectors.T
 
     matrix = lax.cond(definite, lambda: scaled, absolute)
-    narrowed = breakpoints.piece(theta, constraints)
-    lower = jnp.where(state.inside, narrowed[0], constraints.lower)
-    upper = jnp.where(state.inside, narrowed[1], constraints.upper)
-    # What a kink holds or confines is bounded by zero on the other side. d = 0 is feasible.
+    factor = jnp.linalg.cholesky(matrix)
+    # What a kink holds or confines is bounded by zero on the other side. All bounds c are <= 0: d = 0 is feasible.
     low = jnp.where(point.kink & (sides >= 0), 0.0, jnp.minimum(lower - theta, 0.0))
     high = jnp.where(point.kink & (sides <= 0), 0.0, jnp.maximum(upper - theta, 0.0))
+    slack = jnp.maximum(constraints.A @ theta - constraints.b, 0.0)
+    offsets = jnp.concatenate([-slack, low, -high])
 
-    def minimize_with(pinned: Array, at: Array) -> Array:
-        """Return the minimum of the model with the pinned unknowns at their values."""
-        factor = jnp.linalg.cholesky(_without(pinned, matrix))
+    def solve(right: Array) -> Array:
+        return jax.scipy.linalg.cho_solve((factor, True), right / scaling) / scaling
 
-        def improve(step: Array) -> Array:
-            slope = gradient + scaling * (matrix @ (scaling * step))
-            change = jax.scipy.linalg.cho_solve((factor, True), jnp.where(pinned, 0.0, slope / scaling))
-            return step - change / scaling
+    newton = -solve(gradient)
+    # Refined once: the residual is computed with B itself, not with its factor.
+    newton = newton - solve(gradient + scaling * (matrix @ (scaling * newton)))
 
-        # Refined once: the residual is computed with B itself, not with its factor.
-        return improve(improve(jnp.where(pinned, at, 0.0)))
+    def solve_constrained() -> Array:
+        # In white variables e = Lᵀ D d: minimize ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
+        normals = constraints.normals
+        rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling[None]).T, lower=True).T
+        unit, norms = algebra.unit_rows(rows, jnp)
+        # With lam the multipliers of the unit rows, e = e_0 + G' lam, and the dual is to minimize lam' G G' lam / 2 +
+        # (G e_0 - c)' lam over lam >= 0. `length` makes its vector of the order 1, and lam is in its units.
+        gap = (normals @ newton - offsets) / norms
+        allowed = jnp.isfinite(gap)
+        length = jnp.maximum(jnp.max(jnp.where(allowed, jnp.abs(gap), 0.0)), jnp.finfo(float).tiny)
+        multipliers = nonnegative_minimum(unit @ unit.T, jnp.where(allowed, gap / length, 0.0), allowed)
+        back = jax.scipy.linalg.solve_triangular(factor, length * multipliers @ unit, lower=True, trans=1)
+        # Exactly on each bound that has a multiplier: kinks depend on it.
+        at_low, at_high = jnp.split(multipliers[-2 * theta.size :] > 0.0, 2)
+        step = jnp.where(at_low, low, jnp.where(at_high, high, newton + back / scaling))
+        return jnp.clip(step, low, high)
 
-    def leaves(step: Array, pinned: Array) -> Array:
-        return ~pinned & ((step < low) | (step > high))
-
-    def pin(found: tuple[Array, Array]) -> tuple[Array, Array]:
-        step, pinned = found
-        more = pinned | leaves(step, pinned)
-        return minimize_with(more, jnp.clip(step, low, high)), more
-
-    none = jnp.zeros(theta.shape, bool)
-    first = minimize_with(none, jnp.zeros_like(theta)), none
-    step, _ = lax.while_loop(lambda found: jnp.any(leaves(*found)), pin, first)
-    rates = constraints.A @ step
-    room = jnp.maximum(constraints.A @ theta - constraints.b, 0.0)
-    step = step * jnp.min(jnp.where(rates < 0.0, room / -rates, 1.0), initial=1.0)
+    feasible = jnp.all(constraints.normals @ newton >= offsets)
+    step = lax.cond(feasible, lambda: newton, solve_constrained)
     return step, gradient @ step
 
 
