@@ -94,13 +94,13 @@ def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piec
     room, free = _room(problem, state, sides, piece)
     if problem.equalities:
         return _solve_constrained(problem, state, sides, room, free)
-    descends = _descends(problem, hessian, free)
+    # After a failed line search each unknown is taken by itself.
+    labels = np.arange(gradient.size, dtype=float) if state.careful else problem.labels
+    matrix, floor, descends = hessian, state.floor, _descends(problem, hessian, free)
     if descends:
         matrix, floor = Dense.identity(gradient.size, 1.0 / state.metric), np.zeros(gradient.size)
-    else:
-        # After a failed line search each unknown is taken by itself.
-        labels = np.arange(gradient.size, dtype=float) if state.careful else problem.labels
-        matrix, floor = hessian if labels is None else hessian.mask(labels), state.floor
+    elif labels is not None:
+        matrix = hessian.mask(labels)
     found = _minimize_model(problem, state, gradient, matrix, floor, room, free)
     return found._replace(regular=found.regular and matrix is hessian, descends=descends)
 
