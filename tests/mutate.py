@@ -205,14 +205,14 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "the constraints in the Hessian of the Lagrangian": swap(POINT, "self.multipliers / units)", "0.0 * units)"),
         "bounds of the normal step": swap(COMPOSITE, "if cube.holds(shortest):", "if True:"),
-        "dependent rows": swap(COMPOSITE, "self.triangular[:k] if self.rank == k else None", "self.triangular[:k]"),
+        "dependent rows": swap(COMPOSITE, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),
         "curvature along the constraints alone": swap(
             STATE,
             "np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])",
             "constraints.rows(rows)",
         ),
         "kinks that keep constraints from being met": swap(
-            DIRECTION, "if best.left > max(HALF * point.violation, MET):", "if False:"
+            DIRECTION, "if point.kink is None or found.left <= max(HALF * point.violation, MET):", "if True:"
         ),
     },
     "final time": {

@@ -227,9 +227,11 @@ def test_a_fit_that_does_not_converge_is_said_to_be_so(monkeypatch):
 def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
     values = simulate(("rise", "fall"), (3.0,), system=system)
-    problem = make_problem(system=system, parameters=FREE | {"force": 4.0}, values=values)
+    force = sf.Parameter(4.0, prior=sf.Normal(5.0, 0.5))  # which would move it to its mean
+    problem = make_problem(system=system, parameters=FREE | {"force": force}, values=values)
     found = sf.find_modes(problem, max_switches=3)
     assert found.mode_sequence == ("rise", "fall")
+    assert found.chosen[0].parameters[1] == found.fitted[0].parameters[1] == 4.0
     assert found.status is sf.ModeStatus.FOUND
     assert found.ending.held == ()
     [note] = found.warnings
@@ -238,6 +240,13 @@ def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     assert found.parameters["force"] == 4.0
     row = found.chosen[0]
     assert abs(row.bic - (2 * row.cost + 2 * np.log(162))) < 1e-4  # force does not count
+
+
+def test_of_an_array_the_entries_act_that_modes_read():
+    system = sf.HybridSystem({name: lambda t, x, p, k=k: -p["k"][k] * x for k, name in enumerate("abc")}, [0.2, 1.0])
+    problem = sf.Problem(system, make_run(given=("a",)), {"k": sf.Parameter([1.0, 2.0, 3.0])})
+    fitter = Fitter(problem, build_library(problem, max_switches=2))
+    assert fitter.find_acting([("a", "c")]).tolist() == [True, False, True]
 
 
 def test_a_parameter_that_no_mode_of_the_library_reads_is_unidentified():
@@ -435,19 +444,6 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters():
     assert "two:" in str(found)
 
 
-def test_what_acts_in_no_mode_is_held():
-    system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
-    force = sf.Parameter(4.0, prior=sf.Normal(4.0, 0.5))  # which would move it to its mean
-    problem = sf.Problem(system, make_run(), FREE | {"force": force})
-    library = build_library(problem, max_switches=3)
-    fitter = Fitter(problem, library)
-    assert fitter.find_acting([("rise", "fall")]).tolist() == [True, False]
-    assert fitter.find_acting([("rise", "pull")]).tolist() == [True, True]
-    fitted = fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], np.array([0.9, 3.21]))
-    assert fitted.parameters[1] == 3.21
-    assert np.isfinite(fitted.cost)
-
-
 def test_a_criterion_of_ones_own():
     found = sf.find_modes(make_problem(), max_switches=2, criterion=lambda fit: 2 * fit.cost + 1e9 * len(fit.theta))
     assert found.mode_sequence == found.fitted[0].sequences[0]
@@ -595,9 +591,6 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         ({"format": "switchfit fit"}, "is not a saved search"),
         ({"version": 1}, "of version 1; this switchfit reads version 3"),
         ({"search": content["search"] | {"fits": "many"}}, "is damaged"),
-        ({"search": content["search"] | {"modes": ["rise"]}}, "which is not in modes"),
-        ({"search": content["search"] | {"starts": []}}, "must have 1 entries"),
-        ({"search": content["search"] | {"parameter_names": []}}, "must have 0 parameters"),
     ):
         path.write_text(json.dumps(content | changes))
         with pytest.raises(ValueError, match=message):
@@ -702,14 +695,6 @@ def test_an_order_that_leaves_no_trace_is_ambiguous():
     assert orders <= {fit.sequences for fit in found.chosen}
 
 
-def test_a_parameter_without_a_trace_does_not_decide():
-    """The pump's flow is one more unknown of the sequence with "fill", of which nothing is seen."""
-    found = search_tanks(("open", "closed"), (2.5,))
-    assert found.status is sf.ModeStatus.AMBIGUOUS
-    assert found.ending.traceless
-    assert {found.mode_sequence[1], found.ending.other[0][1]} == {"closed", "fill"}
-
-
 def test_a_mode_that_leaves_no_trace_is_a_warning():
     """Behind a valve that stays closed the pump may run or not."""
     found = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed", "fill"))
@@ -745,12 +730,11 @@ def test_outliers_are_told_from_modes():
     assert found.best.problem.experiments[0].data[0].loss == "huber"
 
 
-@pytest.mark.parametrize("factor", [0.3, 0.5])
-def test_a_wrong_sigma_is_told_from_modes(factor):
+def test_a_wrong_sigma_is_told_from_modes():
     """The sequence is right, but whether it is sigma or the model that is wrong, the data cannot say."""
-    found = sf.find_modes(make_problem(times=(2.0, 5.0), sigma=factor * SIGMA), max_switches=5)
+    found = sf.find_modes(make_problem(times=(2.0, 5.0), sigma=0.3 * SIGMA), max_switches=5)
     assert found.status is sf.ModeStatus.NOT_EXPLAINED
     assert found.ending.reason == "sigma"
     assert found.mode_sequence == SEQUENCE
-    assert abs(found.ending.ratio * factor - 1.0) < 0.15
+    assert abs(0.3 * found.ending.ratio - 1.0) < 0.15
     assert abs(found.best.residual_variance - 1.0) < 0.25

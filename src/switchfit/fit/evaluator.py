@@ -265,7 +265,7 @@ class Evaluator:
     @cached_property
     def sorted_breakpoints(self) -> Breakpoints:
         """The breakpoints of theta in the optimizer's form."""
-        return Breakpoints(tuple((i, nodes.tolist()) for i, nodes in enumerate(self.breakpoints()) if len(nodes)))
+        return Breakpoints.of(self.breakpoints())
 
     def breakpoints(self) -> list[FloatArray]:
         """Return the nodes at which derivatives may jump for each entry of theta: an empty array for parameters."""

@@ -26,7 +26,8 @@ from switchfit.fit.faults import list_changes, refuse_hidden_switches
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
 from switchfit.optimize.algebra import EPS
 from switchfit.optimize.arrow import Arrow
-from switchfit.optimize.problem import REACH, HessianKind
+from switchfit.optimize.problem import Breakpoints, HessianKind
+from switchfit.optimize.problem import Problem as Minimization
 from switchfit.optimize.state import Finding
 from switchfit.optimize.threads import with_own_threads
 from switchfit.problem.data import FloatArray
@@ -132,8 +133,9 @@ MANY_RUNS = 16
 """Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
 
-TIME_REACH = 0.01
-"""Largest change of a transition time in the first trust-region step, as a part of the horizon."""
+REACH, TIME_REACH = 0.1, 0.01
+"""Largest change in the first trust-region step: of an unknown as a part of its size, of a transition time as a part of
+the horizon."""
 
 
 def minimize_cost(
@@ -194,23 +196,22 @@ def minimize_cost(
         return None if callback is None else with_own_threads(callback)(record)
 
     natively = all(isinstance(engine, NativeEngine) for engine in evaluator.engines)  # calls no functions of the user
-    result = minimize(
-        evaluate if natively else with_own_threads(evaluate),
-        theta if change is None else change.variables.inward(np.asarray(theta)),
+    posed = Minimization(
+        evaluate=evaluate if natively else with_own_threads(evaluate),
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
-        breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
+        breakpoints=evaluator.sorted_breakpoints if change is None else Breakpoints.of(change.points),
         hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
-        blocks=unknowns.is_time,  # of (4), with hessian="block-diagonal"
+        labels=unknowns.is_time.astype(float) if hessian == "block-diagonal" else None,  # of (4)
         tolerance=tolerance,
         max_iterations=max_iterations,
-        callback=None if follower is None and callback is None else report,
         size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
         idle=None if names else idle if natively else with_own_threads(idle),
         reach=_compute_reach(problem),
         equalities=names,
-        multipliers=multipliers,
         accuracy=None if follower is None else follower.get_accuracy,
     )
+    start = np.array(theta, dtype=float) if change is None else change.variables.inward(np.asarray(theta))
+    result = minimize(posed, start, None if follower is None and callback is None else report, multipliers)
     if change is None:
         return result
     converted = change.convert_result(result)

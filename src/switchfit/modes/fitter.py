@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -43,18 +43,17 @@ from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
 from switchfit.optimize import LinearConstraints
-from switchfit.problem.data import FloatArray, TransitionCost
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.inspection import find_targets
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Function, Structure, trace_structure
-from switchfit.strategy.library import Library
+from switchfit.problem.structure import Structure
+from switchfit.strategy.library import Library, trace_transition
 from switchfit.strategy.starts import fit_briefly
 
 
 def find_read(problem: Problem, structures: Iterable[Structure], *, library: bool) -> NDArray[np.bool_]:
-    """Return what the functions of a problem read, arrays as a whole, and the initial states, in the order of theta
-    after the times: (M,).
+    """Return what the functions of a problem read, and the initial states, in the order of theta after the times: (M,).
 
     Parameters
     ----------
@@ -66,18 +65,10 @@ def find_read(problem: Problem, structures: Iterable[Structure], *, library: boo
     unknowns, read = problem.unknowns, find_targets(problem, structures, library=library)
     found = np.zeros(len(unknowns.names), dtype=bool)
     for name, span in unknowns.parameters.items():
-        found[span] = name in read
+        found[[span.start + i for i in read.get(name, ())]] = True
     for states in unknowns.initial_states:
         found[states[states >= 0]] = True
     return found[int(unknowns.is_time.sum()) :]
-
-
-def find_arrays(problem: Problem) -> NDArray[np.bool_]:
-    """Return which of the parameters are entries of an array: (M,)."""
-    found = np.zeros(len(problem.theta_names), dtype=bool)
-    for span in problem.unknowns.parameters.values():
-        found[span] = span.stop - span.start > 1
-    return found[int(problem.unknowns.is_time.sum()) :]
 
 
 SEARCH_RTOL = 1e-6
@@ -183,8 +174,8 @@ class ScheduleCosts:
 
     def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
         self.problem, self._evaluator = problem, evaluator
-        self._pairs: dict[tuple[int, tuple[str, str]], tuple[Function | None, ...]] = {}
         self._sequences: dict[tuple[int, tuple[str, ...]], tuple[Structure, dict[str, NDArray[np.int64]]]] = {}
+        self._trace = cache(lambda e, pair: trace_transition(problem, problem.experiments[e], pair))
         self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
         times = sum(len(run.transition_times) for run in problem.experiments)
         counts = [len(run.times) + len(run.jump_times) for run in problem.experiments]
@@ -277,22 +268,9 @@ class ScheduleCosts:
         modes = tuple(base.mode_names.index(mode) for mode in sequence)
         if base.jumps:  # among whose reset maps those of the jumps stand
             return replace(base, mode_of_segment=modes)
-        found = [self._functions_between(e, pair) for pair in pairwise(sequence)]
-        resets, guards, costs = zip(*found, strict=True) if found else ((), (), ())
+        found = [self._trace(e, pair) for pair in pairwise(sequence)]
+        resets, costs, guards = zip(*found, strict=True) if found else ((), (), ())
         return replace(base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs)
-
-    def _functions_between(self, e: int, pair: tuple[str, str]) -> tuple[Function | None, ...]:
-        """Return the reset map, the guard and the transition cost of a transition."""
-        if (e, pair) not in self._pairs:
-            problem, run = self.problem, self.problem.experiments[e]
-            found: tuple[Function | None, ...] = (None, None, None)
-            costs = any(isinstance(item, TransitionCost) for item in run.data)
-            if costs or pair in problem.system.reset_maps or pair in problem.system.guards:
-                run = replace(run, mode_sequence=pair, transition_times=None)
-                alone = trace_structure(problem.system, run, problem._functions, problem.solver, 1)
-                found = alone.reset_maps[0], alone.guards[0], alone.transition_costs[0]
-            self._pairs[e, pair] = found
-        return self._pairs[e, pair]
 
 
 COLLAPSED = 1e-6
@@ -592,23 +570,5 @@ class Fitter:
         key = tuple(sequences)
         if key not in self._acting:
             structures = [self.costs.structure_of(e, sequence) for e, sequence in enumerate(key)]
-            acting = find_read(self.problem, structures, library=False)
-            arrays = find_arrays(self.problem) & acting
-            if arrays.any():  # modes may read some entries of an array and not others
-                acting &= ~(arrays & self._find_without_effect(key))
-            self._acting[key] = acting
+            self._acting[key] = find_read(self.problem, structures, library=False)
         return self._acting[key]
-
-    def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
-        """Return the parameters in which J has no first and second derivatives at two points: (M,)."""
-        given = self._space_evenly(sequences)
-        if not given:
-            return np.zeros(len(self.start), dtype=bool)
-        idle = np.ones(len(self.start), dtype=bool)
-        for factor in (1.0, 1.1):
-            theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
-            with np.errstate(all="ignore"):
-                here = self.get_evaluator(given)(theta)
-            first = len(theta) - len(idle)
-            idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
-        return idle

@@ -40,7 +40,6 @@ from switchfit.modes.schedule import (
     list_insertions,
     list_removals,
     list_substitutions,
-    space_evenly,
     splice,
     spread,
 )
@@ -591,14 +590,9 @@ class Hunt:
 
     def _list_given(self) -> list[Schedule]:
         """Return the schedule that each experiment was given; one of the library if that is not admitted."""
-        found = []
-        for run in self.runs:
-            schedule = Schedule(tuple(run.mode_sequence), run.initial_times, run.t0, run.end)
-            if not self.library.admits(schedule.sequence):
-                sequence = next(self.library.list_sequences(min(self.library.possible_switches)))
-                schedule = space_evenly(sequence, run.t0, run.end, self.library) or schedule
-            found.append(schedule)
-        return found
+        pairs = zip(self.runs, self.fitter.problem.experiments, strict=True)
+        runs = [given if self.library.admits(given.mode_sequence) else own for given, own in pairs]
+        return [Schedule(tuple(run.mode_sequence), run.initial_times, run.t0, run.end) for run in runs]
 
     def search_from(self, start: FloatArray, width: int) -> None:
         """Search with a generator at a start of the parameters, then move.

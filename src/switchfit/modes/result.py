@@ -7,7 +7,6 @@ The problem of a mode sequence, and its certified estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import cached_property
@@ -310,32 +309,6 @@ class ModeFit:
         return [self.sequences[e][k] for k in np.searchsorted(self.transition_times[e], t, "right").tolist()]
 
 
-class LazyEstimates(Mapping[int, Estimate]):
-    """The estimates for numbers of switches, each computed at its first access.
-
-    Parameters
-    ----------
-    fits : mapping of int to ModeFit
-    compute : callable
-        Returns the estimate of a fit.
-    """
-
-    def __init__(self, fits: Mapping[int, ModeFit], compute: Callable[[ModeFit], Estimate]) -> None:
-        self._fits, self._compute = fits, compute
-
-    def __getitem__(self, switches: int) -> Estimate:
-        return self._compute(self._fits[switches])
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._fits)
-
-    def __len__(self) -> int:
-        return len(self._fits)
-
-    def __repr__(self) -> str:
-        return format_line(self, f"switches {', '.join(map(str, self._fits))}")
-
-
 @dataclass(frozen=True, eq=False)
 class SearchRecord:
     """What of a search is saved, beside its best estimate; see `ModeSearch`."""
@@ -497,14 +470,13 @@ class ModeSearch(SearchRecord, Displayed):
         library = Library(self.modes, self.modes, self.modes, followers, durations, self.max_switches)
         return Certifier(build_library_problem(self.problem, library), self.problem, library)
 
-    @property
-    def by_switches(self) -> Mapping[int, Estimate]:
-        """The best estimate for each number of switches (of all experiments together), each fitted at its first access.
+    @cached_property
+    def by_switches(self) -> dict[int, Estimate]:
+        """The best estimate for each number of switches (of all experiments together), fitted at the first access.
 
         Not for a sequence with nothing to estimate.
         """
-        known = {fit.switches: fit for fit in self.fitted if fit.switches or fit.acting.any()}
-        return LazyEstimates(known, self._estimate)
+        return {fit.switches: self._estimate(fit) for fit in self.fitted if fit.switches or fit.acting.any()}
 
     @cached_property
     def alternatives(self) -> tuple[tuple[Estimate, float, float], ...]:
@@ -647,7 +619,6 @@ class ModeSearch(SearchRecord, Displayed):
         content = read_document(file, "a saved search", FORMAT, VERSION)
         try:
             record = from_json(SearchRecord, content.get("search"), "search")
-            _check_record(record)
             best = load_best(content.get("best"))
         except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
             raise ValueError(f"{file} is damaged: {error}.") from error
@@ -672,21 +643,3 @@ def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
             f"{path} holds the runs {join_names(record.run_names)}, the problem has {join_names(name_runs(runs))}, or "
             "their horizons differ: it is another problem's."
         )
-
-
-def _check_record(record: SearchRecord) -> None:
-    """Raise ValueError if sizes or names do not match one another."""
-    runs, M = len(record.run_names), len(record.parameter_names)
-    if not len(record.time_units) == len(record.starts) == len(record.ends) == runs:
-        raise ValueError(f"time_units, starts and ends must have {runs} entries, as run_names has")
-    for fit in (*record.fitted, *record.chosen):
-        if len(fit.sequences) != runs or len(fit.transition_times) != runs:
-            raise ValueError(f"each fit must have {runs} sequences, one for each run")
-        if fit.parameters.shape != (M,) or fit.acting.shape != (M,):
-            raise ValueError(f"each fit must have {M} parameters")
-        for sequence, times in zip(fit.sequences, fit.transition_times, strict=True):
-            if times.shape != (len(sequence) - 1,):
-                raise ValueError(f"a sequence of {len(sequence)} modes must have {len(sequence) - 1} transition times")
-            unknown = set(sequence) - set(record.modes)
-            if unknown:
-                raise ValueError(f"a sequence names the mode {min(unknown)!r}, which is not in modes")

@@ -1,7 +1,7 @@
 """Minimize a piecewise smooth cost under linear constraints and equalities; independent of differential equations."""
 
 from switchfit.optimize.problem import HessianKind
-from switchfit.optimize.qp import LinearConstraints, QPSolution, solve_qp
+from switchfit.optimize.qp import LinearConstraints
 from switchfit.optimize.sqp import minimize
 from switchfit.optimize.state import IterationRecord, Result, Status
 
@@ -9,9 +9,7 @@ __all__ = [
     "HessianKind",
     "IterationRecord",
     "LinearConstraints",
-    "QPSolution",
     "Result",
     "Status",
     "minimize",
-    "solve_qp",
 ]

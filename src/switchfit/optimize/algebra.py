@@ -187,34 +187,6 @@ def choose_sides(left: Array, right: Array, xp: Any = np) -> Array:
     return xp.where((left <= 0.0) & (right >= 0.0), 0, xp.where(-right >= left, 1, -1))
 
 
-def measure_forces(
-    sides: Array, kink: Array, left: Array, right: Array, step: Array, force: Array, scale: Array, xp: Any = np
-) -> tuple[Any, Any]:
-    """Return how far outside of [g₋, g₊] the force is that holds each coordinate at its kink, positive where it is, and
-    the side to which it pulls: (d,), (d,).
-
-    Parameters
-    ----------
-    sides : (d,) int
-        On which the programme was solved.
-    kink : (d,) bool
-    left, right : (d,)
-        One-sided derivatives.
-    step, force : (d,)
-        Solution of the programme, and what holds each coordinate there.
-    scale : (d,)
-        Sizes of the unknowns, zero where none is known.
-    """
-    tolerance = 1e-13 * (xp.abs(left) + xp.abs(right))
-    size = xp.where(scale > 0.0, scale, 1.0)
-    relative = xp.abs(step) / size
-    pinned = kink & (relative <= 8 * EPS * xp.maximum(1.0, xp.max(relative)))
-    to_right = xp.where(pinned & (sides <= 0), force - right - tolerance, 0.0)
-    to_left = xp.where(pinned & (sides >= 0), left - force - tolerance, 0.0)
-    # In units of J, or unknowns of different units could not be compared.
-    return xp.maximum(to_right, to_left) * size, xp.where(to_right > to_left, 1, -1)
-
-
 # --- when a step is accepted ------------------------------------------------------------------------------------------
 # Where the predicted decrease is below the rounding error of J, comparing costs says nothing (Hager & Zhang 2005):
 # then a smaller KKT residual counts, or a cost below every earlier one.

@@ -23,29 +23,17 @@ from functools import cached_property
 
 import numpy as np
 
-from switchfit.optimize.algebra import (
-    EIGENVALUE_FLOOR,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    positive_eigenvalues,
-    unit_rows,
-)
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR, BoolArray, FloatArray, IntArray, unit_rows
 from switchfit.optimize.matrix import (
     STIFFENINGS,
     Curvature,
     Dense,
-    ModelStep,
-    Programme,
     Spectrum,
     SymmetricMatrix,
-    convexify,
     diagonal_scaling,
+    make_absolute,
 )
 from switchfit.optimize.qp import CholeskyFactor, Room, newton_step, solve_programme
-
-#: Rounds of adding violated constraints to the quadratic programme; each adds one or more, a few are enough.
-MAX_ROUNDS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,26 +166,82 @@ class Arrow(SymmetricMatrix):
         pairs = zip(self.parts, self.pairs(np.asarray(free, dtype=float)), strict=True)
         return self.with_parts(*(part * a * b for part, (a, b) in pairs)).plus_diagonal(np.where(free, 0.0, 1.0))
 
-    def is_definite_on(self, free: BoolArray | None) -> bool:
-        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
-        return ArrowFactor.of(self if free is None else self.held(free)) is not None
+    def keep(self, free: BoolArray) -> tuple[Arrow, IntArray]:
+        """Return the matrix with those unknowns decoupled that are not free (d,), and the places of all."""
+        return self.held(free), np.arange(self.layout.size)
 
-    def minimize_model(self, programme: Programme) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside the room, as `Dense.minimize_model`, without a trust region.
+    def convexify(
+        self, normals: FloatArray, floor: FloatArray, reach: FloatArray | None = None
+    ) -> tuple[Arrow, ArrowFactor]:
+        """Return a positive definite B of the same shape that equals H wherever H can be kept, and its factorization.
 
-        What is held keeps its place, with a step of zero.
+        As `Dense.convexify` does, outside of a trust region. Where H is not positive definite on the face of the
+        constraints, eigenvalues of its blocks are replaced, and then those of the Schur complement of the shared
+        unknowns.
+
+        Parameters
+        ----------
+        normals : (r, d)
+            Normals of the constraints expected to be active; each joins unknowns of one run, or shared ones.
+        floor : (d,)
+            See `switchfit.optimize.matrix.diagonal_scaling`.
+        reach : None
+            There is no trust region, whose one radius would suit no run.
         """
-        gradient, room, free, pressed, floor, _ = programme
-        d = self.layout.size
-        free = np.ones(d, dtype=bool) if free is None else free
-        pressed = pressed * free
-        floor = np.zeros(d) if floor is None else floor * free
-        # Held unknowns stay in the arrays, decoupled and with curvature 1: blocks of all runs keep one shape.
-        kept = self.held(free)
-        convex = convexify_arrow(kept, pressed[np.any(pressed != 0.0, axis=1)], floor)
-        step, pull = solve_arrow_qp(gradient * free, convex, room, free)
-        # The product of held unknowns is with H: the force that a kink has to hold.
-        return ModelStep(step, np.where(free, convex @ step, self @ step), pull, convex is kept)
+        layout, scaling = self.layout, diagonal_scaling(self, floor)
+        scaled = self.scale(scaling)
+        # N'N, with the rows of the scaled unknowns.
+        rows = unit_rows(normals / scaling)[0]
+        own, shared = np.append(rows, np.zeros((len(rows), 1)), axis=1)[:, layout.own], rows[:, layout.shared]
+        across = Arrow(
+            layout, np.einsum("rek,rel->ekl", own, own), np.einsum("rek,rs->eks", own, shared), shared.T @ shared
+        )
+        convex = None
+        for stiffness in (0.0, *STIFFENINGS) if len(normals) else (0.0,):
+            pairs = zip(scaled.parts, across.parts, strict=True)
+            stiff = scaled.with_parts(*(part + stiffness * other for part, other in pairs))
+            if ArrowFactor.of(stiff.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
+                convex = stiff.scale(1.0 / scaling) if stiffness else self
+                break
+        if convex is None:
+            convex = _replace_eigenvalues(scaled).scale(1.0 / scaling)
+        factor, ridge = ArrowFactor.of(convex), EIGENVALUE_FLOOR
+        while factor is None:  # rounding, where a block is nearly singular
+            convex, ridge = convex.plus_diagonal(ridge * scaling**2), 10.0 * ridge
+            factor = ArrowFactor.of(convex)
+        return convex, factor
+
+    def solve(self, gradient: FloatArray, factor: ArrowFactor, room: Room) -> tuple[FloatArray, FloatArray]:
+        """Minimize ``gᵀd + ½ dᵀBd`` inside a room, B being this matrix; result as of `solve_programme`.
+
+        The programme is solved with the constraints that the step before has violated, until it violates no other:
+        since it is strictly convex, that is the solution with all of them.
+        """
+        step = newton = newton_step(gradient, self, factor)
+        pull, size = np.zeros(len(room.lower)), np.sqrt((room.normals**2).sum(1))
+        working = np.zeros(0, dtype=np.intp)
+        # Thousands of rows for many runs, few of which matter: the working set only grows, so that the loop ends.
+        while True:
+            products = room.normals @ step
+            # From the second round on rounding may violate a row.
+            rounding = 1e-13 * size * np.max(np.abs(step), initial=0.0) if working.size else 0.0
+            violated = (products < room.lower - rounding) | (products > room.upper + rounding)
+            violated[working] = False
+            if not violated.any():
+                return room.press(step, pull), pull
+            working = np.union1d(working, np.flatnonzero(violated))
+            rows = room.normals[working]
+            # The step is a combination of Newton's and of B⁻¹ C', C being the working set: as many unknowns as that
+            # has.
+            spanning = np.array([newton, *(factor.solve(row) for row in rows)]) * factor.scaling
+            own = np.linalg.qr(spanning.T)[0].T / factor.scaling
+            reduced = np.array([self @ direction for direction in own]) @ own.T
+            wide = np.full(len(own), np.inf)
+            lower, upper = np.append(room.lower[working], -wide), np.append(room.upper[working], wide)
+            inside = Room(np.concatenate([rows @ own.T, np.eye(len(own))]), lower, upper)
+            found, forces = solve_programme(own @ gradient, reduced, CholeskyFactor.of(reduced), inside)
+            pull[working] = forces[: working.size]
+            step = found @ own
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the curvature in the null space of normals (k, d), as `Dense.curvature`.
@@ -277,97 +321,17 @@ class ArrowFactor:
         return self.layout.join(own, shared) / self.scaling
 
 
-def solve_arrow_qp(gradient: FloatArray, matrix: Arrow, room: Room, free: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Minimize ``gᵀd + ½ dᵀBd`` inside a room; result as of `switchfit.optimize.qp.solve_programme`.
-
-    The programme is solved with the constraints that the step before has violated, until it violates no other: since it
-    is strictly convex, that is the solution with all of them. Unknowns that are not `free` (d,) are decoupled in B, and
-    stay where they are.
-    """
-    factor = ArrowFactor.of(matrix)
-    if factor is None:
-        raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
-    step = newton = newton_step(gradient, matrix, factor)
-    pull, size = np.zeros(len(room.lower)), np.sqrt((room.normals**2).sum(1))
-    working = np.zeros(0, dtype=np.intp)
-    # Thousands of rows for many runs, few of which matter: the working set only grows, so that the loop ends.
-    for _ in range(MAX_ROUNDS):
-        products = room.normals @ step
-        # From the second round on rounding may violate a row.
-        rounding = 1e-13 * size * np.max(np.abs(step), initial=0.0) if working.size else 0.0
-        violated = (products < room.lower - rounding) | (products > room.upper + rounding)
-        violated[working] = False
-        if not violated.any():
-            break
-        working = np.union1d(working, np.flatnonzero(violated))
-        rows = room.normals[working] * free
-        # The step is a combination of Newton's and of B⁻¹ C', C being the working set: as many unknowns as that has.
-        spanning = np.array([newton, *(factor.solve(row) for row in rows)]) * factor.scaling
-        own = np.linalg.qr(spanning.T)[0].T / factor.scaling
-        reduced = np.array([matrix @ direction for direction in own]) @ own.T
-        wide = np.full(len(own), np.inf)
-        lower, upper = np.append(room.lower[working], -wide), np.append(room.upper[working], wide)
-        inside = Room(np.concatenate([rows @ own.T, np.eye(len(own))]), lower, upper)
-        found, forces = solve_programme(own @ gradient, reduced, CholeskyFactor.of(reduced), inside)
-        pull[working] = forces[: working.size]
-        step = found @ own
-    return room.press(step, pull), pull
-
-
-def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> Arrow:
-    """Return a positive definite B of the same shape that equals H wherever H can be kept.
-
-    A positive definite H is kept. Otherwise directions across the constraints are made stiffer, as by `convexify`. If H
-    is not positive definite on their face either, eigenvalues of its blocks are replaced, and then those of the Schur
-    complement of the shared unknowns.
-
-    Parameters
-    ----------
-    hessian : Arrow
-    normals : (r, d)
-        Normals of the constraints expected to be active; each joins unknowns of one run, or shared ones.
-    floor : (d,)
-        See `switchfit.optimize.matrix.diagonal_scaling`.
-    """
-    layout = hessian.layout
-    scaling = diagonal_scaling(hessian, floor)
-    scaled = hessian.scale(scaling)
-    # N'N, with the rows of the scaled unknowns.
-    rows = unit_rows(normals / scaling)[0]
-    own, shared = np.append(rows, np.zeros((len(rows), 1)), axis=1)[:, layout.own], rows[:, layout.shared]
-    across = Arrow(
-        layout, np.einsum("rek,rel->ekl", own, own), np.einsum("rek,rs->eks", own, shared), shared.T @ shared
-    )
-    for stiffness in (0.0, *STIFFENINGS) if len(normals) else (0.0,):
-        pairs = zip(scaled.parts, across.parts, strict=True)
-        stiff = scaled.with_parts(*(part + stiffness * other for part, other in pairs))
-        if ArrowFactor.of(stiff.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
-            return stiff.scale(1.0 / scaling) if stiffness else hessian
-    blocks = _convex_blocks(scaled)
+def _replace_eigenvalues(scaled: Arrow) -> Arrow:
+    """Return the matrix with eigenvalues of its blocks, and of the Schur complement, that are not positive replaced."""
+    blocks = make_absolute(scaled.blocks)
     tie = np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(blocks, scaled.borders))
     # B has the borders of H: its Schur complement C - sum_e G_e' B_e^-1 G_e is convex with the tie added to the corner.
     complement = scaled.corner - tie
-    corner = convexify(0.5 * (complement + complement.T), np.zeros((0, len(tie)))) + tie
-    convex = Arrow(layout, blocks, scaled.borders, 0.5 * (corner + corner.T))
-    ridge = EIGENVALUE_FLOOR
-    while ArrowFactor.of(convex) is None:  # rounding, where a block is nearly singular
-        convex, ridge = convex.plus_diagonal(ridge), 10.0 * ridge
-    return convex.scale(1.0 / scaling)
-
-
-def _convex_blocks(scaled: Arrow) -> FloatArray:
-    """Return positive definite blocks: (R, k, k)."""
-    values, vectors = np.linalg.eigh(scaled.blocks)
-    # An eigenvalue that is replaced is made large enough for the shared unknowns not to lose their own curvature to it.
-    # (v' G)^2 / lam is what an eigenvalue lam takes from the diagonal of the Schur complement, which is 1 at most after
-    # scaling: with lam >= 2 sum_s (v' G_s)^2 one eigenvalue takes half of it at most.
-    coupling = (np.swapaxes(vectors, 1, 2) @ scaled.borders) ** 2
-    positive = positive_eigenvalues(values)
-    changed = np.where(values > EIGENVALUE_FLOOR, values, np.maximum(positive, 2.0 * coupling.sum(2)))
-    convex = (vectors * changed[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    # Blocks that are positive definite stay as they are, to the last bit.
-    indefinite = values[:, 0] <= EIGENVALUE_FLOOR
-    return np.where(indefinite[:, None, None], 0.5 * (convex + np.swapaxes(convex, 1, 2)), scaled.blocks)
+    corner = tie
+    if corner.size:
+        symmetric = Dense(0.5 * (complement + complement.T))
+        corner = symmetric.convexify(np.zeros((0, len(tie))))[0].array + tie
+    return Arrow(scaled.layout, blocks, scaled.borders, 0.5 * (corner + corner.T))
 
 
 def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatArray | None]:

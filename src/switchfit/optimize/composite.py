@@ -11,8 +11,8 @@ composite step of Byrd and Omojokun ([1]_, section 18.5, algorithm 18.4) asks of
 2. the *tangential step* t minimizes the model within ``A t = 0``, the rest of the trust region and the inequalities.
 
 With an orthonormal basis Z of the null space of A the second is a programme in w, t = Z w, of which w = 0 is a feasible
-point, as `solve_qp` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are solved in
-units of `reach`.
+point, as `solve_programme` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are
+solved in units of `reach`.
 
 References
 ----------
@@ -25,16 +25,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.optimize import lapack
-from switchfit.optimize.algebra import FloatArray, IntArray, largest, norm
-from switchfit.optimize.matrix import factorize_rows, shift_to_positive
-from switchfit.optimize.qp import CholeskyFactor, Room, newton_step, solve_programme
+from switchfit.optimize.algebra import FloatArray, largest, norm
+from switchfit.optimize.matrix import shift_to_positive
+from switchfit.optimize.qp import CholeskyFactor, Room, solve_programme
 
 NORMAL_PART = 0.95
 """Part of the trust region in which the normal step has to stay; the rest is left for the tangential step."""
 
 DEPENDENT = 1e-10
-"""Rows of a Jacobian whose part across the others is below this part of the largest row depend on them."""
+"""Rows of a Jacobian are dependent where a singular value is below this part of the largest one."""
 
 FLAT = 1e-8
 """Curvature that counts as none, as a part of the largest slope: where J is linear, the trust region ends the step."""
@@ -63,62 +62,35 @@ class Equalities(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The factorization Aᵀ P = Q R of a Jacobian A (k, d), which may have dependent rows.
+    """The singular value decomposition A = U S Vᵀ of a Jacobian A (k, d), which may have dependent rows.
 
     Attributes
     ----------
-    jacobian : array, shape (k, d)
-    orthogonal : array, shape (d, d)
-        Q.
-    triangular : array, shape (d, k)
-        R is its upper triangle; below it is what the factorization has left.
-    order : array, shape (k,)
-        P.
-    rank : int
-        Number of independent rows.
+    left, sizes, right : arrays, shape (k, r), (r,), (d, r)
+        U, the diagonal of S, and V, for the r singular values that count.
+    null : array, shape (d, d - r)
+        Orthonormal basis of the null space of A.
     """
 
-    jacobian: FloatArray
-    orthogonal: FloatArray
-    triangular: FloatArray
-    order: IntArray
-    rank: int
+    left: FloatArray
+    sizes: FloatArray
+    right: FloatArray
+    null: FloatArray
 
     @classmethod
     def of(cls, jacobian: FloatArray) -> Rows:
-        """Factorize a Jacobian (k, d), k > 0."""
-        orthogonal, triangular, order = factorize_rows(jacobian)
-        sizes = [abs(size) for size in triangular.diagonal().tolist()]
-        least = DEPENDENT * sizes[0]
-        return cls(jacobian, orthogonal, triangular, order, sum([size > least for size in sizes]))
-
-    @property
-    def null(self) -> FloatArray:
-        """Orthonormal basis of the null space of A: (d, d - rank)."""
-        return self.orthogonal[:, self.rank :]
-
-    @property
-    def _regular(self) -> FloatArray | None:
-        k = len(self.order)
-        return self.triangular[:k] if self.rank == k else None
+        """Decompose a Jacobian (k, d), k > 0."""
+        left, sizes, right = np.linalg.svd(jacobian)
+        rank = np.count_nonzero(sizes > DEPENDENT * sizes[0])
+        return cls(left[:, :rank], sizes[:rank], right[:rank].T, right[rank:].T)
 
     def solve(self, values: FloatArray) -> FloatArray:
         """Return the shortest v (d,) that minimizes ‖values + A v‖₂."""
-        regular = self._regular
-        if regular is None:
-            return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
-        # A' P = Q R, so that A v = -c is R' (Q'v) = -P'c: the solution in the range of Q is the shortest.
-        inside = lapack.dtrtrs(regular, values[self.order], trans=1)[0]
-        return -np.asarray(self.orthogonal[:, : self.rank].dot(inside))
+        return -np.asarray(self.right.dot(self.left.T.dot(values) / self.sizes))
 
     def multipliers(self, force: FloatArray) -> FloatArray:
         """Return the lam (k,) that minimizes ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
-        regular = self._regular
-        if regular is None:
-            return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
-        found = np.empty(len(self.order))
-        found[self.order] = -lapack.dtrtrs(regular, self.orthogonal[:, : self.rank].T.dot(force))[0]
-        return found
+        return -np.asarray(self.left.dot(self.right.T.dot(force) / self.sizes))
 
 
 class Composite(NamedTuple):
@@ -127,8 +99,6 @@ class Composite(NamedTuple):
     Attributes
     ----------
     step : array, shape (d,)
-    forces : array, shape (m,)
-        Multipliers of the rows of the inequalities.
     multipliers : array, shape (k,)
         Of the equality constraints: ``g + H d + Aᵀ lam`` is what the inequalities exert, as nearly as that can be had.
     definite : bool
@@ -136,7 +106,6 @@ class Composite(NamedTuple):
     """
 
     step: FloatArray
-    forces: FloatArray
     multipliers: FloatArray
     definite: bool
 
@@ -166,7 +135,7 @@ def solve_composite(
     """
     d = gradient.size
     if not d:
-        return Composite(gradient, np.zeros(len(room.normals)), np.zeros(len(equalities.values)), True)
+        return Composite(gradient, np.zeros(len(equalities.values)), True)
     # Units of `reach`: the trust region is the cube |d_i| <= radius, and unlike unknowns have comparable lengths.
     slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
     scaled, room = Equalities(equalities.values, equalities.jacobian * reach), _scale_room(room, reach)
@@ -175,7 +144,7 @@ def solve_composite(
     # end.
     step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
     pull, definite, force = np.zeros(len(room.lower)), True, slope + bending.dot(step)
-    if rows.rank < d:
+    if rows.null.size:
         least = FLAT * largest(np.abs(slope)) + TINY
         cube = room.narrow(np.full(d, radius))
         step, pull, definite = _add_tangential_step(force, bending, rows.null, least, step, cube)
@@ -183,7 +152,7 @@ def solve_composite(
     # What the inequalities exert is taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the
     # least-squares sense.
     multipliers = rows.multipliers(force - room.normals.T.dot(pull))
-    return Composite(step * reach, pull[:-d], multipliers, definite)
+    return Composite(step * reach, multipliers, definite)
 
 
 def _scale_room(room: Room, reach: FloatArray) -> Room:
@@ -202,16 +171,12 @@ def _add_tangential_step(
     """
     # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
     (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
-    factor = CholeskyFactor.of(matrix)
-    step = normal + null.dot(newton_step(slope, matrix, factor))
-    if cube.holds(step):
-        return step, np.zeros(len(cube.lower)), definite
     # What bounds v + Z w bounds w by rows alone.
     products, free = cube.normals.dot(normal), np.full(slope.size, np.inf)
     lower = np.concatenate([np.minimum(cube.lower - products, 0.0), -free])
     upper = np.concatenate([np.maximum(cube.upper - products, 0.0), free])
     inside = Room(np.concatenate([cube.normals.dot(null), np.eye(slope.size)]), lower, upper)
-    found, pull = solve_programme(slope, matrix, factor, inside)
+    found, pull = solve_programme(slope, matrix, CholeskyFactor.of(matrix), inside)
     pull = pull[: -slope.size]
     return cube.press(normal + null.dot(found), pull), pull, definite
 

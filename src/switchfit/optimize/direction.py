@@ -22,17 +22,17 @@ References
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import MANY_BREAKPOINTS, BoolArray, FloatArray, IntArray, largest, measure_forces
+from switchfit.optimize.algebra import MANY_BREAKPOINTS, BoolArray, FloatArray, IntArray, largest
 from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
-from switchfit.optimize.matrix import Box, Dense, Programme
+from switchfit.optimize.matrix import Dense
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
-from switchfit.optimize.qp import Room
+from switchfit.optimize.qp import NONE, Room, is_definite
 from switchfit.optimize.state import State
 
 FIRST_RADIUS = 1.0
@@ -68,11 +68,7 @@ class Direction(NamedTuple):
 
 
 def find_direction(problem: Problem, state: State, piece: Piece | None = None) -> Direction:
-    """Return the step of the quadratic programme, with the best sides for coordinates on a kink.
-
-    A coordinate on a kink is held (0) or confined to one side (+1, -1). Afterwards the force that holds it follows
-    from the programme's multipliers; where it is outside [g₋, g₊] that coordinate, the worst one first, is released
-    to the other side, and the programme is solved again, as long as that helps.
+    """Return the step of the quadratic programme, with coordinates on a kink held or confined to the downhill side.
 
     Parameters
     ----------
@@ -82,62 +78,78 @@ def find_direction(problem: Problem, state: State, piece: Piece | None = None) -
         Bounds to keep to, narrower than those of the problem.
     """
     point, sides = state.point, state.point.downhill
-    best, force = _solve_on_sides(problem, state, sides, piece)
-    if point.kink is None:
-        return best
-    if best.left > max(HALF * point.violation, MET):
-        # The equality constraints cannot be met while these coordinates are held, or kept to one side: they are
-        # released to where the normal step takes them.
-        room, _ = _room(problem, state, np.where(point.kink, 0, sides), piece)
-        normal = find_normal_step(point.equalities(sides), room, problem.reach, np.inf)
-        sides = np.where(point.kink, np.where(normal > 0.0, 1, -1), sides)
-        best, force = _solve_on_sides(problem, state, sides, piece)
-    # One coordinate at a time, the one that gains most J, as long as the model falls further with it released.
-    for _ in range(2 * int(point.kink.sum())):
-        left, right = point.minus.gradient, point.plus.gradient
-        worth, side = measure_forces(sides, point.kink, left, right, best.step, force, state.scale)
-        worst = int(np.argmax(worth))
-        if worth[worst] <= 0.0:
-            break
-        sides = sides.copy()
-        sides[worst] = side[worst]
-        direction, force = _solve_on_sides(problem, state, sides, piece)
-        if direction.reduction <= best.reduction:
-            break
-        best = direction
-    return best
+    found = _solve_on_sides(problem, state, sides, piece)
+    if point.kink is None or found.left <= max(HALF * point.violation, MET):
+        return found
+    # The equality constraints cannot be met while these coordinates are held, or kept to one side: they are released to
+    # where the normal step takes them.
+    room, _ = _room(problem, state, np.where(point.kink, 0, sides), piece)
+    normal = find_normal_step(point.equalities(sides), room, problem.reach, np.inf)
+    return _solve_on_sides(problem, state, np.where(point.kink, np.where(normal > 0.0, 1, -1), sides), piece)
 
 
-def _solve_on_sides(
-    problem: Problem, state: State, sides: IntArray, piece: Piece | None
-) -> tuple[Direction, FloatArray]:
-    """Solve the quadratic programme with kinks held or confined as `sides` say; with the force on each coordinate.
-
-    The force is Aᵀ lam − B d: at a coordinate that does not move, the derivative that would balance the others.
-    """
-    point, constraints = state.point, problem.constraints
-    gradient, hessian = point.derivatives(sides)
+def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> Direction:
+    """Solve the quadratic programme with kinks held or confined as `sides` say."""
+    gradient, hessian = state.point.derivatives(sides)
     room, free = _room(problem, state, sides, piece)
     if problem.equalities:
         return _solve_constrained(problem, state, sides, room, free)
-    matrix, floor = _model(problem, state, hessian, free)
+    # After a failed line search each unknown is taken by itself.
+    labels = np.arange(gradient.size, dtype=float) if state.careful else problem.labels
+    matrix, floor, descends = hessian, state.floor, _descends(problem, hessian, free)
+    if descends:
+        matrix, floor = Dense.identity(gradient.size, 1.0 / state.metric), np.zeros(gradient.size)
+    elif labels is not None:
+        matrix = hessian.mask(labels)
+    found = _minimize_model(problem, state, gradient, matrix, floor, room, free)
+    return found._replace(regular=found.regular and matrix is hessian, descends=descends)
+
+
+def _minimize_model(
+    problem: Problem,
+    state: State,
+    gradient: FloatArray,
+    hessian: Hessian,
+    floor: FloatArray,
+    room: Room,
+    free: BoolArray | None,
+) -> Direction:
+    """Minimize ``gᵀd + ½ dᵀBd`` inside the room and the trust region, B being H made positive definite where it is not.
+
+    `floor` (d,) is the curvature of each unknown that counts as none.
+    """
+    constraints, point = problem.constraints, state.point
     # Expected to be active: those with a multiplier at this point.
     pressed = constraints.normals[point.multipliers > 0.0 if point.active.size else slice(0)]
-    box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
-    found = matrix.minimize_model(Programme(gradient, room, free, pressed, floor, box))
-    regular = found.definite and matrix is hessian and free is None and point.is_interior
-    slope = float(gradient.dot(found.step))
-    force = -found.product
-    if found.pull is not None:
-        force += constraints.A.T.dot(found.pull[: constraints.b.size])
-    radius = np.inf if box is None else box.radius_for(found.definite)
-    reduction = -(slope + 0.5 * float(found.step.dot(found.product)))
-    return Direction(found.step, slope, reduction, regular, radius, _descends(problem, hessian, free)), force
+    kept, part, own, reach = hessian, NONE, gradient, problem.reach
+    if free is not None:
+        if not free.any():
+            return Direction(np.zeros(gradient.size), 0.0, 0.0, False, state.radius)
+        # What is held is left out, or decoupled.
+        kept, part = hessian.keep(free)
+        own, pressed, floor = (gradient * free)[part], (pressed * free)[:, part], (floor * free)[part]
+        room, reach = room.of(part, free), reach[part]
+    convex: Hessian
+    factor: Any
+    convex, factor = kept.convexify(pressed, floor, reach if problem.has_box else None)
+    definite, radius = convex is kept, state.radius
+    if problem.has_box and radius == np.inf and not definite:
+        radius = FIRST_RADIUS
+    if radius < np.inf:
+        room = room.narrow(radius * reach)
+    step, _ = convex.solve(own, factor, room)
+    curvature = float(step.dot(convex.dot(step)))
+    if free is not None:
+        moved, step = step, np.zeros(gradient.size)
+        step[part] = moved
+    slope = float(gradient.dot(step))
+    regular = definite and free is None and point.is_interior
+    return Direction(step, slope, -(slope + 0.5 * curvature), regular, radius)
 
 
 def _solve_constrained(
     problem: Problem, state: State, sides: IntArray, room: Room, free: BoolArray | None
-) -> tuple[Direction, FloatArray]:
+) -> Direction:
     """Do the work of `_solve_on_sides` where there are equality constraints."""
     equalities, (gradient, hessian) = state.point.equalities(sides), state.point.derivatives(sides)
     radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
@@ -149,11 +161,10 @@ def _solve_constrained(
     step[part] = found.step
     product = full.dot(step)
     slope = float(gradient.dot(step))
-    force = problem.constraints.A.T.dot(found.forces) - product - equalities.jacobian.T.dot(found.multipliers)
     reduction = -(slope + 0.5 * float(step.dot(product)))
     left = equalities.predict(step)
     regular = found.definite and free is None and state.point.is_interior and not state.careful
-    return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
+    return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left)
 
 
 def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> tuple[Room, BoolArray | None]:
@@ -180,24 +191,12 @@ def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) 
     return room, None if free.all() else free
 
 
-def _model(
-    problem: Problem, state: State, hessian: Hessian, free: BoolArray | None
-) -> tuple[Hessian, FloatArray | None]:
-    """Return the programme's matrix, to be made positive definite, and the curvature that counts as zero, (d,).
-
-    After a failed line search each unknown is taken by itself.
-    """
-    d = state.point.theta.size
-    if _descends(problem, hessian, free):
-        return Dense.identity(d, 1.0 / state.metric), None
-    labels = np.arange(d, dtype=float) if state.careful else problem.labels
-    return hessian if labels is None else hessian.mask(labels), state.floor
-
-
 def _descends(problem: Problem, hessian: Hessian, free: BoolArray | None) -> bool:
     """Return whether the step is one of steepest descent."""
-    indefinite = problem.hessian == "descent-first" and not hessian.is_definite_on(free)
-    return indefinite or not problem.uses_hessian
+    if problem.hessian != "descent-first":
+        return not problem.uses_hessian
+    kept = (hessian if free is None else hessian.keep(free)[0]).dense()
+    return kept.size > 0 and not is_definite(kept)
 
 
 #: Factors by which the radius falls after a step that the model misjudged, and grows after one that it judged well.

@@ -6,8 +6,8 @@ is smooth and backtracking must succeed.
 The merit function of equality constraints, ``J + mu ‖c‖₂``, and the search for a step that decreases it.
 
 The penalty mu is raised to where the model of the merit function decreases by a part of what the penalty itself makes
-of the step ([4]_, (18.36)); it never falls. A step that fails because the constraints bend is corrected: the
-*second-order correction* is the shortest step that meets the constraints as they are at its end ([4]_, section 15.6).
+of the step ([3]_, (18.36)); it never falls. A step that fails because the constraints bend is corrected: the
+*second-order correction* is the shortest step that meets the constraints as they are at its end ([3]_, section 15.6).
 Without it the merit function refuses full steps near the solution (Maratos). If that fails too, the trust region
 shrinks.
 
@@ -16,10 +16,8 @@ References
 .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapter 3.
 .. [2] W. W. Hager, H. Zhang, A new conjugate gradient method with guaranteed descent and an efficient line search,
    SIAM J. Optim. 16 (2005) 170-192 (line searches below the rounding error of the cost).
-.. [3] R. M. Chamberlain, M. J. D. Powell, C. Lemarechal, H. C. Pedersen, The watchdog technique for forcing convergence
-   in algorithms for constrained optimization, Math. Program. Study 16 (1982) 1-17.
-.. [4] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
-.. [5] J. J. More, S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011) 1292-1314.
+.. [3] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
+.. [4] J. J. More, S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011) 1292-1314.
 """
 
 from __future__ import annotations
@@ -59,8 +57,6 @@ from switchfit.optimize.threads import one_thread
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
 MAX_HALVINGS = 200
-#: Iterations after which a step that fails in a trust region is followed by one more before the region shrinks.
-PATIENCE = 15
 
 
 def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -92,48 +88,32 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
 def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
     """Shrink the trust region until the step of the programme in it is accepted."""
     problem, point, whole, piece = oracle.problem, state.point, direction.step, None
-    attempt = _attempt_merit if problem.equalities else _attempt_in_box
     for k in range(MAX_BACKTRACKS):
         crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
         state = state._replace(penalty=raise_penalty(state.penalty, point, direction))
-        accepted = attempt(oracle, state, direction, ARMIJO_ACROSS if crossed else ARMIJO, k == 0)
+        fraction = ARMIJO_ACROSS if crossed else ARMIJO
+        if problem.equalities:
+            accepted = _attempt_merit(oracle, state, direction, fraction, k == 0)
+        else:
+            accepted = _attempt_in_box(oracle, state, direction, fraction)
         if accepted is not None:
             part = measure_in_box(problem, direction.step) / measure_in_box(problem, whole) if k else 1.0
             return accepted._replace(step_length=part)
         if problem.equalities and measure_in_box(problem, direction.step) < SMALLEST_RADIUS:
             return None
         if not problem.equalities and k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
-            break
+            return None
         direction, piece = shrink_region(problem, state, direction, piece)
-    return None if problem.equalities else _blind_step(oracle, state, direction)
+    return None
 
 
-def _attempt_in_box(
-    oracle: Oracle, state: State, direction: Direction, fraction: float, first: bool
-) -> Accepted | None:
+def _attempt_in_box(oracle: Oracle, state: State, direction: Direction, fraction: float) -> Accepted | None:
     """Return the point of a step inside the trust region that decreases J, and the next radius."""
     accepted = _attempt(oracle, state, direction, 1.0, fraction)
     if accepted is None:
-        # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
-        return _step_back(oracle, state, direction) if first and state.iteration >= PATIENCE else None
+        return None
     decrease, noise = state.point.cost - accepted.point.cost, NOISE * abs(state.point.cost)
     return accepted._replace(radius=next_radius(oracle.problem, direction, decrease, direction.reduction, noise))
-
-
-def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Take one more step from where a step has failed: in a curved valley it leads back to the valley's floor ([3]_).
-
-    The point of the failed step is evaluated once more, for the line search keeps none that it refuses.
-    """
-    problem, point = oracle.problem, state.point
-    trial = oracle.point(move(problem, point.theta, direction.step, state.scale), state.scale)
-    if trial is None:
-        return None
-    radius = min(direction.radius, measure_in_box(problem, direction.step))
-    second = find_direction(problem, state._replace(point=trial, radius=radius))
-    back = move(problem, trial.theta, second.step, state.scale)
-    end = _judge(oracle, state, back, -direction.slope, ARMIJO_ACROSS)  # None where it leads back to the point itself
-    return None if end is None else Accepted(end, 1.0, direction.radius)
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -146,7 +126,7 @@ def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted |
         alpha *= 0.5 if k < 5 else 0.25
         if k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost):
             break
-    return _blind_step(oracle, state, direction)
+    return None
 
 
 def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -171,7 +151,7 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
         stop = _attempt(oracle, state, nearer, 1.0, ARMIJO_ACROSS)
         if stop is not None and (accepted is None or stop.point.jumps):
             return Accepted(stop.point, alpha)
-    return _blind_step(oracle, state, direction) if accepted is None else Accepted(accepted.point, alpha)
+    return None if accepted is None else Accepted(accepted.point, alpha)
 
 
 def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float) -> Accepted | None:
@@ -201,24 +181,7 @@ def _judge(oracle: Oracle, state: State, there: Trial, decrease: float, fraction
     return trial if allowed else None
 
 
-def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Take the full step on the word of the derivatives, where J is a small difference of large terms.
-
-    The rounding error of such a J is that of the largest cost seen, not of J; the KKT residual has to halve.
-    """
-    noise = NOISE * state.cost_scale
-    if direction.reduction > noise:
-        return None
-    there = move(oracle.problem, state.point.theta, direction.step, state.scale)
-    if there.is_at(state.point.theta):
-        return None
-    trial = oracle.point(there, state.scale)
-    if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
-        return None
-    return Accepted(trial, 1.0, state.radius)
-
-
-#: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [4]_, (18.36).
+#: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [3]_, (18.36).
 SHARE = 0.1
 #: Factor by which the penalty is raised beyond what is needed, so that the next step does not raise it again.
 RAISED = 1.1
@@ -231,7 +194,7 @@ FALL = 0.9
 
 
 def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
-    """Return the penalty for which a step of the model decreases the merit function by enough ([4]_, (18.36))."""
+    """Return the penalty for which a step of the model decreases the merit function by enough ([3]_, (18.36))."""
     # mu >= rise / ((1 - rho) (||c|| - ||c + A d||)): a composite step need not meet the linearization, so that its gain
     # stands where [1] has ||c||.
     gain = point.violation - direction.left
@@ -335,7 +298,7 @@ def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> boo
 def _measure_noise(oracle: Oracle, state: State, step: FloatArray) -> float:
     """Return the standard deviation of the error of J along a step (d,); infinite if unknown.
 
-    Differences of the fourth order of a smooth J at equal distances vanish, those of its error do not ([5]_). A jump or
+    Differences of the fourth order of a smooth J at equal distances vanish, those of its error do not ([4]_). A jump or
     a kink makes them large too; it is on one side of the point, so that the smaller of both sides counts.
     """
     found = []

@@ -35,82 +35,7 @@ from switchfit.optimize.algebra import (
     smallest,
     unit_rows,
 )
-from switchfit.optimize.qp import CholeskyFactor, Room, is_definite, newton_step, solve_programme
-
-
-class Box(NamedTuple):
-    """A trust region about a point: no unknown moves by more than ``radius * reach``.
-
-    Attributes
-    ----------
-    reach : array, shape (d,)
-        Half-widths at radius 1, in whose metric an indefinite Hessian is shifted.
-    radius : float
-        Infinite where there has been no box yet; an indefinite Hessian then gets one of radius `first`.
-    first : float
-    """
-
-    reach: FloatArray
-    radius: float
-    first: float
-
-    def radius_for(self, definite: bool) -> float:
-        """Return the radius for a Hessian that is positive definite, or is not."""
-        return self.first if self.radius == np.inf and not definite else self.radius
-
-    def narrow(self, room: Room, definite: bool) -> Room:
-        """Return the room narrowed to the box."""
-        radius = self.radius_for(definite)
-        return room if radius == np.inf else room.narrow(radius * self.reach)
-
-    def of(self, part: IntArray) -> Box:
-        """Return the box of some of the unknowns."""
-        return Box(self.reach[part], self.radius, self.first)
-
-
-class Programme(NamedTuple):
-    """The quadratic programme of an iteration but for its matrix.
-
-    Attributes
-    ----------
-    gradient : array, shape (d,)
-    room : Room
-    free : array of bool, shape (d,), or None
-        Unknowns that may move at all; None if all may.
-    pressed : array, shape (k, d)
-        Normals of the constraints expected to be active: on their face B is H wherever it can be.
-    floor : array, shape (d,), or None
-        Curvature of each unknown that counts as none.
-    box : Box, or None
-        The trust region, in whose metric an indefinite H is shifted to make B.
-    """
-
-    gradient: FloatArray
-    room: Room
-    free: BoolArray | None
-    pressed: FloatArray
-    floor: FloatArray | None
-    box: Box | None
-
-
-class ModelStep(NamedTuple):
-    """Solution of the quadratic programme of an iteration.
-
-    Attributes
-    ----------
-    step : array, shape (d,)
-    product : array, shape (d,)
-        B d, with the rows of H for unknowns that are not free.
-    pull : array, shape (m + d,), or None
-        As of `solve_programme`, without the bounds of unknowns that are not free; None where nothing presses.
-    definite : bool
-        Whether H was positive definite as it is on the free unknowns: B is H there.
-    """
-
-    step: FloatArray
-    product: FloatArray
-    pull: FloatArray | None
-    definite: bool
+from switchfit.optimize.qp import CholeskyFactor, Room, is_definite, solve_programme
 
 
 class Spectrum(NamedTuple):
@@ -302,35 +227,50 @@ class Dense(SymmetricMatrix):
         """Return the product with a vector: (d,)."""
         return np.asarray(self.array.dot(vector))
 
-    def is_definite_on(self, free: BoolArray | None) -> bool:
-        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
-        part = self.array if free is None else self.array[np.ix_(free, free)]
-        return bool(np.all(np.linalg.eigvalsh(part) > 0.0))
-
-    def minimize_model(self, programme: Programme) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside the room, where B is H made positive definite on the free unknowns."""
-        gradient, room, free, pressed, floor, box = programme
-        if free is None:
-            return _minimize(self.array, programme)
+    def keep(self, free: BoolArray) -> tuple[Dense, IntArray]:
+        """Return the matrix of the free unknowns (d,) alone, and their places."""
         part = np.flatnonzero(free)
-        step = np.zeros(len(self.array))
-        if part.size == 0:
-            return ModelStep(step, step, None, True)
-        # What is held is left out of the programme.
-        own = Programme(
-            gradient[part],
-            room.of(part),
-            None,
-            pressed[:, part],
-            None if floor is None else floor[part],
-            None if box is None else box.of(part),
-        )
-        found = _minimize(self.array[np.ix_(part, part)], own)
-        step[part] = found.step
-        # The product of what is held is with H: the force that holds it at its kink.
-        product = self.array[:, part] @ found.step
-        product[part] = found.product
-        return ModelStep(step, product, found.pull, found.definite)
+        return Dense(self.array[part[:, None], part]), part
+
+    def convexify(
+        self, normals: FloatArray, floor: FloatArray | None = None, reach: FloatArray | None = None
+    ) -> tuple[Dense, CholeskyFactor]:
+        """Return a positive definite B that equals H wherever H can be kept, and its factorization; d > 0.
+
+        A positive definite H is kept. Otherwise directions across the constraints expected to be active are made
+        stiffer, which leaves Newton's step on their face unspoiled. If H is not positive definite on the face either,
+        eigenvalues are replaced by their absolute values, or inside a trust region shifted. All of this is done in
+        scaled variables.
+
+        Parameters
+        ----------
+        normals : array, shape (k, d)
+            Normals of the constraints expected to be active.
+        floor : array, shape (d,), optional
+            See `diagonal_scaling`.
+        reach : array, shape (d,), optional
+            Half-widths of the trust region.
+
+        References
+        ----------
+        .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
+        """
+        # The usual case: a Cholesky factorization of the scaled H less the floor shows that H is definite.
+        diagonal = self.diagonal()
+        square = diagonal if floor is None else np.maximum(diagonal, floor)
+        if smallest(square) > 0.0:
+            # A positive definite matrix needs no more than Jacobi's scaling.
+            scaling = np.sqrt(square)
+            scaled = self.array / (scaling[:, None] * scaling)
+            factor = CholeskyFactor.of_scaled(scaled, scaling) if _has_curvature(scaled) else None
+            if factor is not None:
+                return self, factor
+        convex = _convex(self.array, normals, floor, reach)
+        return (self if convex is self.array else Dense(convex)), CholeskyFactor.of(convex)
+
+    def solve(self, gradient: FloatArray, factor: CholeskyFactor, room: Room) -> tuple[FloatArray, FloatArray]:
+        """Minimize ``gᵀd + ½ dᵀBd`` inside a room, B being this matrix; result as of `solve_programme`."""
+        return solve_programme(gradient, self.array, factor, room)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
@@ -364,83 +304,12 @@ def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals:
     return Spectrum(values, lowest / norm(lowest))
 
 
-def _minimize(hessian: FloatArray, programme: Programme) -> ModelStep:
-    """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
-    gradient, room, _, pressed, floor, box = programme
-    convex, factor = convexify_and_factor(hessian, pressed, floor, None if box is None else box.reach)
-    if box is not None:
-        room = box.narrow(room, convex is hessian)
-    step, pull = newton_step(gradient, convex, factor), None
-    if not room.holds(step):
-        step, pull = solve_programme(gradient, convex, factor, room)
-    return ModelStep(step, convex.dot(step), pull, convex is hessian)
-
-
 def null_space(normals: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
     if normals.size == 0:
         return np.eye(normals.shape[1])
-    Q, R, _ = factorize_rows(unit_rows(normals)[0])
-    rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
-    return Q[:, rank:]
-
-
-def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return the factorization ``rowsᵀ P = Q R`` of rows (k, d), k and d positive: Q (d, d), R (d, k) and P (k,).
-
-    R is the upper triangle of what is returned; the size of its diagonal falls. `scipy.linalg.qr` takes four times
-    longer on a small matrix.
-    """
-    k, d = rows.shape
-    packed, order, tau, _, _ = lapack.dgeqp3(rows.T)
-    full = packed
-    if k != d:
-        full = np.zeros((d, d), order="F")
-        full[:, :k] = packed[:, :d]
-    return lapack.dorgqr(full, tau)[0], packed, order - 1
-
-
-def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
-    """Return a positive definite B that equals H wherever H can be kept.
-
-    A positive definite H is kept. Otherwise directions across the constraints expected to be active are made stiffer,
-    which leaves Newton's step on their face unspoiled. If H is not positive definite on the face either, eigenvalues
-    are replaced by their absolute values. All of this is done in scaled variables.
-
-    Parameters
-    ----------
-    hessian : array, shape (d, d)
-        H, symmetric.
-    normals : array, shape (k, d)
-        Normals of the constraints expected to be active.
-    floor : array, shape (d,), optional
-        See `diagonal_scaling`.
-
-    References
-    ----------
-    .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
-    """
-    return convexify_and_factor(hessian, normals, floor)[0] if hessian.size else hessian
-
-
-def convexify_and_factor(
-    hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None = None
-) -> tuple[FloatArray, CholeskyFactor]:
-    """Return the matrix B of `convexify` and its factorization; d > 0.
-
-    Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
-    """
-    # The usual case: a Cholesky factorization of the scaled H less the floor shows that H is definite, so that B = H.
-    square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
-    if smallest(square) > 0.0:
-        # A positive definite matrix needs no more than Jacobi's scaling.
-        scaling = np.sqrt(square)
-        scaled = hessian / (scaling[:, None] * scaling)
-        factor = CholeskyFactor.of_scaled(scaled, scaling) if _has_curvature(scaled) else None
-        if factor is not None:
-            return hessian, factor
-    convex = _convex(hessian, normals, floor, reach)
-    return convex, CholeskyFactor.of(convex)
+    _, sizes, right = np.linalg.svd(unit_rows(normals)[0])
+    return np.asarray(right[np.count_nonzero(sizes > 1e-11) :].T)
 
 
 def _add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
@@ -467,7 +336,7 @@ def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, 
     scaled = hessian / weight
     if _has_curvature(scaled):
         return hessian
-    return _convex_on_face(scaled, normals / scaling, _absolute) * weight
+    return _convex_on_face(scaled, normals / scaling, make_absolute) * weight
 
 
 def _convex_on_face(
@@ -498,8 +367,8 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
     return _add_to_diagonal(symmetric, margin - RAISED * min(lowest, 0.0)), False
 
 
-def _absolute(matrix: FloatArray) -> FloatArray:
-    """Return the matrix, which is symmetric, with eigenvalues that are not positive replaced by absolute values."""
-    values, vectors = np.linalg.eigh(matrix)
-    convex = (vectors * positive_eigenvalues(values)) @ vectors.T
-    return np.asarray(0.5 * (convex + convex.T))
+def make_absolute(matrices: FloatArray) -> FloatArray:
+    """Return symmetric matrices (..., d, d) with eigenvalues that are not positive replaced by absolute values."""
+    values, vectors = np.linalg.eigh(matrices)
+    convex = (vectors * positive_eigenvalues(values)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(0.5 * (convex + np.swapaxes(convex, -1, -2)))

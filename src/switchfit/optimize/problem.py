@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, is_finite, largest, project_on_row
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, largest, project_on_row
 from switchfit.optimize.qp import LinearConstraints
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
@@ -25,10 +25,6 @@ HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss
 - "gauss-newton": "exact", for a caller whose evaluations return the Gauss-Newton matrix;
 - "none": steepest descent in the metric of theta, as in the paper.
 """
-
-REACH = 0.1
-"""Part of an unknown's size by which it may move in the first step inside a trust region."""
-
 
 Evaluate = Callable[..., Any]
 """``evaluate(theta, side)`` returns ``cost`` J, ``gradient`` (d,), and ``hessian``: (d, d), an `Arrow`, or None.
@@ -54,21 +50,29 @@ class Problem:
     Attributes
     ----------
     evaluate : callable
+        Cost, gradient and Hessian, and equality constraints if there are any.
     constraints : LinearConstraints
+        ``A theta >= b`` and bounds.
     breakpoints : Breakpoints
     hessian : HessianKind
     labels : array, shape (d,), or None
-        Labels of the blocks, where the Hessian is cut into blocks.
-    tolerance, max_iterations : float, int
+        Labels of the blocks, where the Hessian is cut into blocks ("block-diagonal").
+    tolerance : float
+        Bound on the KKT residual. Unless `hessian` is "none", the next step has to be negligible too: at most 1e-10 of
+        the size of each unknown, or a few iterations later.
+    max_iterations : int
     size : array, shape (d,)
-        Typical size of each coordinate; zero if only its values are known.
+        Typical size of each unknown, to which rounding errors are relative; zero if only its values are known. For a
+        time this is the length of the horizon, even if the time itself is small.
     idle : callable or None
+        Finds the coordinates on which J does not depend.
     reach : array, shape (d,)
-        Largest change of each coordinate in the first step inside a trust region.
+        Largest change of each unknown in the first step inside a trust region.
     equalities : tuple of str
-        Names of the equality constraints; empty if there are none.
+        Names of the equality constraints c(theta) = 0; empty if there are none.
     accuracy : callable or None
-        Relative accuracy of J; None where it is that of rounding.
+        Returns the relative accuracy of J, which may be known only after some evaluations: the minimum is found where
+        less is to be gained. None where it is that of rounding.
     """
 
     evaluate: Evaluate
@@ -85,14 +89,9 @@ class Problem:
     accuracy: Callable[[], float] | None
 
     @cached_property
-    def row_size(self) -> FloatArray:
-        """Size of the terms of each row of the constraints, to which rounding errors are relative: (m,)."""
-        return np.asarray(self.constraints.sizes[0] @ self.size)
-
-    @cached_property
     def row_rounding(self) -> FloatArray:
         """Rounding error of the rows: (m,)."""
-        return np.asarray(16 * EPS * self.row_size)
+        return np.asarray(16 * EPS * (self.constraints.sizes[0] @ self.size))
 
     @cached_property
     def largest_size(self) -> float:
@@ -135,22 +134,11 @@ class Breakpoints:
     of_coordinates: tuple[tuple[int, list[float]], ...]
 
     @classmethod
-    def of(cls, given: Sequence[ArrayLike] | None, d: int) -> Breakpoints:
-        """Check one array for each of d coordinates; coordinates may share one, which is read once."""
-        given = [()] * d if given is None else given
-        read: dict[int, list[float]] = {}
-        found = []
-        for i, points in enumerate(given):
-            if id(points) not in read:
-                array = np.asarray(points, dtype=float).reshape(-1)
-                if not (np.isfinite(array).all() and (array[1:] > array[:-1]).all()):
-                    raise ValueError(
-                        f"the breakpoints of coordinate {i} must be finite and strictly increasing; use np.unique"
-                    )
-                read[id(points)] = array.tolist()
-            if read[id(points)]:
-                found.append((i, read[id(points)]))
-        return cls(tuple(found))
+    def of(cls, given: Sequence[ArrayLike]) -> Breakpoints:
+        """Return those of one ascending array for each coordinate; coordinates may share one, which is read once."""
+        each = {id(points): points for points in given}
+        read = {key: np.asarray(points, dtype=float).tolist() for key, points in each.items()}
+        return cls(tuple((i, read[id(points)]) for i, points in enumerate(given) if read[id(points)]))
 
     def find_met(self, theta: FloatArray) -> list[int]:
         """Return the coordinates of theta (d,) that sit exactly on one of their breakpoints."""
@@ -203,12 +191,6 @@ class Breakpoints:
         return min(fractions, default=np.inf)
 
 
-def as_vector(given: ArrayLike, d: int) -> FloatArray:
-    """Return one number for each of d coordinates, (d,), from as many or from one for all."""
-    array = np.asarray(given, dtype=float)
-    return array if array.shape == (d,) else np.broadcast_to(array, (d,))
-
-
 def _nearest(points: list[float], x: float) -> float:
     above = bisect_left(points, x)
     if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
@@ -222,17 +204,9 @@ def _next(points: list[float], x: float, step: float) -> float:
     return (points[k] - x) / step if step != 0.0 and 0 <= k < len(points) else np.inf
 
 
-def typical_reach(theta: FloatArray) -> FloatArray:
-    """Return the default of the largest changes in a first step, a part of the unknowns' sizes: (d,)."""
-    size = np.abs(theta)
-    return REACH * np.where(size > 0.0, size, 1.0)
-
-
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
     """Return the start theta (d,) with violations of the size of rounding removed; ValueError for larger ones."""
     constraints = problem.constraints
-    if not is_finite(theta):
-        raise ValueError(f"theta0 is not finite: {theta}")
     start = move(problem, theta, np.zeros(theta.size), np.abs(theta))
     if start.far:
         return start
@@ -292,18 +266,18 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
         return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True
-    return Trial.at(problem, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
+    return Trial.at(problem, _snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
 
 
-def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: float = 16 * EPS) -> FloatArray:
-    """Return theta (d,) with the slack of rows removed that is at most `reach` of the size of what they join.
+def _snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray) -> FloatArray:
+    """Return theta (d,) with the slack of rows removed that is rounding beside the size of what they join.
 
     Only of rows that can hold exactly: that bound one coordinate, ``+-theta_i >= b``, or keep two in order,
     ``theta_i - theta_j >= 0``. Coordinates that are pinned (d,) stay where they are.
     """
     constraints = problem.constraints
     slack = constraints.A @ theta - constraints.b
-    close = np.abs(slack) <= reach * problem.row_size
+    close = np.abs(slack) <= problem.row_rounding
     if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()

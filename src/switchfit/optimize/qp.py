@@ -19,18 +19,15 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import daqp
 import numpy as np
-from numpy.typing import ArrayLike
 
 from switchfit.optimize import algebra, lapack
 from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, largest, norm, smallest
-from switchfit.optimize.threads import one_thread
 
 NONE = np.zeros(0, dtype=np.intp)
 """No places."""
@@ -50,11 +47,6 @@ class LinearConstraints:
         Bounds; infinite where there is none.
     names : sequence, length m + 2 d
         What to call each row, then each lower bound, then each upper bound: text, or anything that prints as such.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a number is NaN, a lower bound exceeds its upper bound, or names are missing.
     """
 
     A: FloatArray
@@ -62,46 +54,6 @@ class LinearConstraints:
     lower: FloatArray
     upper: FloatArray
     names: tuple[object, ...]
-
-    def __post_init__(self) -> None:
-        lower = np.atleast_1d(np.asarray(self.lower, dtype=float))
-        d = lower.size
-        A = np.asarray(self.A, dtype=float)
-        fields = {
-            "A": A.reshape(0, d) if A.size == 0 else A,
-            "b": np.asarray(self.b, dtype=float).reshape(-1),
-            "lower": lower,
-            "upper": np.atleast_1d(np.asarray(self.upper, dtype=float)),
-            "names": tuple(self.names),
-        }
-        for key, value in fields.items():
-            object.__setattr__(self, key, value)
-        m = self.b.size
-        if self.A.shape != (m, d) or self.lower.shape != (d,) or self.upper.shape != (d,):
-            shapes = f"A {self.A.shape}, b {self.b.shape}, lower {self.lower.shape}, upper {self.upper.shape}"
-            raise ValueError(f"shapes of the constraints disagree: {shapes}; expected (m, d), (m,), (d,), (d,)")
-        if len(self.names) != m + 2 * d:
-            raise ValueError(
-                f"got {len(self.names)} names for {m} rows and 2 x {d} bounds; give one for each of the {m + 2 * d}: "
-                "rows, then lower bounds, then upper bounds"
-            )
-        if not (np.isfinite(self.A).all() and np.isfinite(self.b).all()):
-            raise ValueError("A and b of the constraints must be finite; leave out rows that do not constrain")
-        wrong = np.flatnonzero(~(self.lower <= self.upper))
-        if wrong.size:
-            i = int(wrong[0])
-            raise ValueError(
-                f"lower bound {self.lower[i]} is not below upper bound {self.upper[i]} "
-                f"({self.names[m + i]!r}, {self.names[m + d + i]!r})"
-            )
-
-    @classmethod
-    def box(cls, lower: ArrayLike, upper: ArrayLike, *, unknowns: Sequence[str] | None = None) -> LinearConstraints:
-        """Return the bounds alone, named after the unknowns (``theta[i]`` if these have no names)."""
-        low = np.atleast_1d(np.asarray(lower, dtype=float))
-        labels = [f"theta[{i}]" for i in range(low.size)] if unknowns is None else list(unknowns)
-        names = [f"{label} at lower bound" for label in labels] + [f"{label} at upper bound" for label in labels]
-        return cls(np.zeros((0, low.size)), np.zeros(0), low, np.asarray(upper, dtype=float), tuple(names))
 
     @property
     def size(self) -> int:
@@ -152,15 +104,6 @@ class LinearConstraints:
     def rows(self, index: IntArray) -> FloatArray:
         """Return the normals at the given places, shape (k, d)."""
         return self.normals[index]
-
-    @cached_property
-    def row_norms(self) -> FloatArray:
-        """Lengths of the normals, shape (m + 2 d,)."""
-        return np.concatenate([np.linalg.norm(self.A, axis=1), np.ones(2 * self.size)])
-
-    def slopes(self, step: FloatArray) -> FloatArray:
-        """Return the products of the normals with a step, shape (m + 2 d,)."""
-        return np.concatenate([self.A @ step, step, -step])
 
     def slack(self, theta: FloatArray) -> FloatArray:
         """Return how far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
@@ -260,20 +203,20 @@ def find_least_distance(
     return None
 
 
-def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> FloatArray:
-    """Return the feasible point nearest to theta (d,), up to rounding: ``min ‖s‖²`` subject to ``N s >= -slack``."""
-    slack = constraints.slack(theta)
-    if np.all(slack >= 0.0):
+def nearest_feasible(constraints: LinearConstraints, theta: FloatArray, size: FloatArray | float = 1.0) -> FloatArray:
+    """Return the feasible point nearest to theta (d,), up to rounding, each unknown being measured by its size (d,)."""
+    if np.all(constraints.slack(theta) >= 0.0):
         return theta
-    size = float(np.max(-slack))
-    rows, lengths = algebra.unit_rows(constraints.A)
-    lower = np.concatenate([constraints.lower - theta, -slack[: len(rows)] / lengths]) / size
-    upper = np.concatenate([constraints.upper - theta, np.full(len(rows), np.inf)]) / size
+    # In units of the sizes, and of the largest violation: min ||s||^2 subject to lower <= N s <= upper.
+    rows, lengths = algebra.unit_rows(constraints.A * size)
+    lower = np.concatenate([(constraints.lower - theta) / size, (constraints.b - constraints.A @ theta) / lengths])
+    upper = np.concatenate([(constraints.upper - theta) / size, constraints.open])
+    violation = max(largest(lower), -smallest(upper))
     normals = np.concatenate([np.eye(theta.size), rows])
-    found = find_least_distance(np.zeros(theta.size), normals, lower, upper)
+    found = find_least_distance(np.zeros(theta.size), normals, lower / violation, upper / violation)
     if found is None:
         raise ValueError("no point satisfies all the constraints")
-    return np.asarray(np.clip(theta + size * found[0], constraints.lower, constraints.upper))
+    return np.asarray(np.clip(theta + violation * size * found[0], constraints.lower, constraints.upper))
 
 
 class Room(NamedTuple):
@@ -317,11 +260,12 @@ class Room(NamedTuple):
         np.minimum(upper, reach, out=upper)
         return narrowed
 
-    def of(self, part: IntArray) -> Room:
-        """Return the room of some of the unknowns, the others being held."""
+    def of(self, part: IntArray, free: BoolArray | None = None) -> Room:
+        """Return the room of some of the unknowns, the others being held; what is not free (d,) is too."""
         m = len(self.normals) - self.normals.shape[1]
         kept = np.concatenate([np.arange(m), m + part])
-        return Room(self.normals[kept][:, part], self.lower[kept], self.upper[kept])
+        normals = self.normals[kept][:, part]
+        return Room(normals if free is None else normals * free[part], self.lower[kept], self.upper[kept])
 
     def press(self, step: FloatArray, pull: FloatArray) -> FloatArray:
         """Return a step (d,) exactly on each of its bounds that pulls (m + d,): kinks depend on it."""
@@ -339,57 +283,6 @@ class Room(NamedTuple):
         return np.zeros(step.size) if found is None else np.clip(step + size * found[0], *self.bounds)
 
 
-@dataclass(frozen=True, eq=False)
-class QPSolution:
-    """Step d, shape (d,), and multipliers, shape (k,), of a quadratic programme with ``B d + g = Cᵀ multipliers``."""
-
-    step: FloatArray
-    multipliers: FloatArray
-
-
-@one_thread()
-def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offsets: FloatArray) -> QPSolution:
-    """Minimize ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
-
-    Parameters
-    ----------
-    gradient : array, shape (d,)
-        g.
-    matrix : array, shape (d, d)
-        B, symmetric positive definite.
-    normals : array, shape (k, d)
-        Rows of C.
-    offsets : array, shape (k,)
-        c, not positive; minus infinity where a row does not constrain.
-
-    Returns
-    -------
-    QPSolution
-        The step and its nonnegative multipliers, which satisfy ``B d + g = Cᵀ multipliers``.
-
-    Raises
-    ------
-    ValueError
-        If B is not positive definite or c is positive somewhere.
-    """
-    offsets = np.asarray(offsets, dtype=float)
-    if (offsets > 0.0).any():
-        raise ValueError(f"the zero step violates row {int(np.argmax(offsets))} by {offsets.max()}; c must be <= 0")
-    multipliers = np.zeros(offsets.size)
-    if not np.count_nonzero(gradient):
-        return QPSolution(np.zeros(gradient.size), multipliers)
-    factor = CholeskyFactor.of(matrix)
-    step = newton_step(gradient, matrix, factor)
-    free = np.full(gradient.size, np.inf)
-    upper = np.full(offsets.size + gradient.size, np.inf)
-    room = Room(np.concatenate([normals, np.eye(gradient.size)]), np.concatenate([offsets, -free]), upper)
-    # The unconstrained minimum, if it is feasible, is the solution.
-    if room.holds(step):
-        return QPSolution(step, multipliers)
-    step, pull = solve_programme(gradient, matrix, factor, room)
-    return QPSolution(step, pull[: offsets.size])
-
-
 def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
     """Return −B⁻¹g (d,), refined once: the residual is computed with B itself, not with its factor."""
     step = -factor.solve(gradient)
@@ -400,13 +293,16 @@ def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
 def solve_programme(
     gradient: FloatArray, matrix: FloatArray, factor: CholeskyFactor, room: Room
 ) -> tuple[FloatArray, FloatArray]:
-    """Minimize ``gᵀd + ½ dᵀBd`` inside a room, where that is not Newton's step.
+    """Minimize ``gᵀd + ½ dᵀBd`` inside a room.
 
     Returns
     -------
     step, pull : arrays, shape (d,), (m + d,)
         ``B d + g = Nᵀ pull``, positive where a lower bound presses and negative where an upper one does.
     """
+    newton = newton_step(gradient, matrix, factor)
+    if room.holds(newton):
+        return newton, np.zeros(len(room.lower))
     # In white variables, d = length D⁻¹ L⁻ᵀ e, nothing has a scale any more.
     target = factor.whiten(gradient)
     length = norm(target)

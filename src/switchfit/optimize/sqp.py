@@ -17,8 +17,6 @@ One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next 
 At a stationary point the curvature distinguishes a minimum from a saddle, which is left along negative curvature
 (`escape`). If no step decreases J, `explain_failure` finds the reason.
 
-Stationary points: make rows hold that nearly do, and leave saddles along negative curvature.
-
 References
 ----------
 .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 3, 12, 16 and 18.
@@ -26,7 +24,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import numpy as np
@@ -37,7 +34,6 @@ from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EPS,
     EXTRA_ITERATIONS,
-    NEGLIGIBLE_STEP,
     NOISE,
     FloatArray,
     is_negligible,
@@ -46,20 +42,7 @@ from switchfit.optimize.direction import Direction, find_direction, measure_in_b
 from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.point import MET, Oracle, Point, Sample
-from switchfit.optimize.problem import (
-    Breakpoints,
-    Evaluate,
-    HessianKind,
-    Idle,
-    Problem,
-    Trial,
-    as_vector,
-    feasible_start,
-    move,
-    snap_to_rows,
-    typical_reach,
-)
-from switchfit.optimize.qp import LinearConstraints
+from switchfit.optimize.problem import Problem, Trial, feasible_start, move
 from switchfit.optimize.state import (
     Accepted,
     Callback,
@@ -74,30 +57,6 @@ from switchfit.optimize.threads import one_thread
 
 #: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
 NEGATIVE_CURVATURE = -1e-8
-
-
-def close_gaps(oracle: Oracle, state: State) -> State:
-    """Return the state with the rows that it misses by less than it is accurate to made to hold, if it stays as good.
-
-    A mode that lasts a part of 1e-13 of the horizon has collapsed. Taken for one that has not, its two ends would be
-    free, and the curvature along them, which is that of J in its duration, may be negative. Where the data are met
-    exactly, J is so curved in the duration that the optimality of the closed point exceeds the tolerance: it is as good
-    all the same if a step from there is negligible.
-    """
-    problem, point = oracle.problem, state.point
-    theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
-    if np.array_equal(theta, point.theta):
-        return state
-    closed = oracle.point(Trial.at(problem, theta), state.scale)
-    if closed is None or closed.cost > point.cost + NOISE * state.cost_scale or closed.violation > MET:
-        return state
-    after = state.advance(Accepted(closed, 1.0), problem.tolerance)
-    if closed.optimality <= max(problem.tolerance, point.optimality):
-        return after
-    if closed.idle is None:
-        return state
-    step = find_direction(problem, after).step
-    return after if is_negligible(step, np.maximum(state.scale, problem.size)) else state
 
 
 def escape(oracle: Oracle, state: State) -> Accepted | None:
@@ -131,10 +90,11 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
     # No further than the first inactive constraint that the ray approaches.
-    slope = problem.constraints.slopes(ray)
+    normals = problem.constraints.normals
+    slope = normals @ ray
     slack = np.maximum(point.slack, 0.0)
     slack[point.active] = 0.0
-    approaching = slope < -1e-12 * problem.constraints.row_norms
+    approaching = slope < -1e-12 * np.linalg.norm(normals, axis=1)
     length = min(length, float(np.min(slack[approaching] / -slope[approaching], initial=np.inf)))
     for _ in range(40):
         decrease = -0.5 * bending * length**2
@@ -160,67 +120,23 @@ RESTARTS = 3
 #: Statuses of minimizations that might have gone on.
 UNFINISHED = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED)
 
-#: Relative change of multipliers below which the Hessian of the Lagrangian is not evaluated again.
-SAME_MULTIPLIERS = 1e-9
-
 
 @one_thread()
 def minimize(
-    evaluate: Evaluate,
-    theta0: ArrayLike,
-    *,
-    constraints: LinearConstraints,
-    breakpoints: Breakpoints | Sequence[ArrayLike] | None = None,
-    hessian: HessianKind = "exact",
-    blocks: ArrayLike | None = None,
-    tolerance: float = 1e-7,
-    max_iterations: int = 200,
-    callback: Callback | None = None,
-    size: ArrayLike | None = None,
-    idle: Idle | None = None,
-    reach: ArrayLike | None = None,
-    equalities: Sequence[str] = (),
-    multipliers: ArrayLike | None = None,
-    accuracy: Callable[[], float] | None = None,
+    problem: Problem, start: FloatArray, callback: Callback | None = None, multipliers: ArrayLike | None = None
 ) -> Result:
     """Minimize a piecewise smooth cost under linear constraints, which all iterates satisfy, and equality constraints.
 
     Parameters
     ----------
-    evaluate : Evaluate
-        Cost, gradient and Hessian, and equality constraints if there are any.
-    theta0 : array, shape (d,)
-        Start, feasible up to rounding.
-    constraints : LinearConstraints
-        ``A theta >= b`` and bounds.
-    breakpoints : sequence of d arrays, or Breakpoints, optional
-        Sorted values of each coordinate where the derivatives of J may jump; by default, J is smooth.
-    hessian : HessianKind
-        Matrix of the quadratic program.
-    blocks : array of int, shape (d,), optional
-        Label of each coordinate, for "block-diagonal".
-    tolerance : float
-        Bound on the KKT residual. Unless `hessian` is "none", the next step has to be negligible too: at most 1e-10 of
-        the size of each unknown, or a few iterations later.
-    max_iterations : int
+    problem : Problem
+    start : array, shape (d,)
+        Feasible up to rounding; it need not satisfy the equality constraints.
     callback : callable, optional
         Called with an `IterationRecord` after every iteration; a true return value stops with ``INTERRUPTED``.
-    size : array, shape (d,), optional
-        Typical size of each unknown, to which rounding errors are relative. For a time this is the length of the
-        horizon, even if the time itself is small. By default, the size of the unknown's own values.
-    idle : Idle, optional
-        Finds the coordinates on which J does not depend.
-    reach : array, shape (d,), optional
-        Largest change of each unknown in the first step inside a trust region ("auto"); a tenth of its value by
-        default.
-    equalities : sequence of str, optional
-        Names of the equality constraints c(theta) = 0, which the start need not satisfy.
     multipliers : array, shape (k,), optional
         Of the equality constraints at the start, where they are known. Otherwise they are found there by least squares,
         and where constraints are fewer than unknowns, the start is evaluated once more for the Lagrangian's Hessian.
-    accuracy : callable, optional
-        Returns the relative accuracy of J, which may be known only after some evaluations: the minimum is found where
-        less is to be gained. By default, it is that of rounding.
 
     Returns
     -------
@@ -230,7 +146,7 @@ def minimize(
     Raises
     ------
     ValueError
-        If the start is infeasible or not finite, or breakpoints are not in order.
+        If the start is infeasible.
 
     Notes
     -----
@@ -239,27 +155,11 @@ def minimize(
 
     Linear algebra has one thread, also in the functions that are called, unless these are `with_own_threads`.
     """
-    start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    d = constraints.size
-    problem = Problem(
-        evaluate=evaluate,
-        constraints=constraints,
-        breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
-        hessian=hessian,
-        labels=np.asarray(blocks, dtype=float) if hessian == "block-diagonal" else None,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        size=np.zeros(d) if size is None else as_vector(size, d),
-        idle=idle,
-        reach=typical_reach(start) if reach is None else as_vector(reach, d),
-        equalities=tuple(equalities),
-        accuracy=accuracy,
-    )
     trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
     # The Hessian of the Lagrangian needs multipliers, and these need derivatives: the start is evaluated with zero
     # ones.
     point = oracle.point(trial, np.abs(trial.theta))
-    if point is not None and multipliers is None and 0 < len(equalities) < start.size:
+    if point is not None and multipliers is None and 0 < len(problem.equalities) < start.size:
         # As many constraints as unknowns leave no direction in which curvature counts.
         point = oracle.with_own_multipliers(point)
     if point is None:
@@ -382,11 +282,9 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
     """Leave a saddle at a KKT point if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or state.point.plus.hessian.finite:
-        closed = close_gaps(oracle, state)
-        if closed is state and direction.regular:
+        if direction.regular:
             # The matrix of the programme was H itself: its scaled eigenvalues are above EIGENVALUE_FLOOR.
             return state._replace(status=status)
-        state = closed
         # A KKT point with negative free curvature is no minimum: the iteration goes on from below it.
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
@@ -416,7 +314,6 @@ def _record(oracle: Oracle, state: State) -> IterationRecord:
 def _result(oracle: Oracle, state: State, status: Status, history: tuple[IterationRecord, ...]) -> Result:
     """Return the result at the state's point."""
     problem = oracle.problem
-    state = _with_own_multipliers(oracle, state)
     point = state.point
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = curvature_at(problem, state, point.active)
@@ -442,18 +339,6 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
         equalities=_list_equalities(oracle, point),
     )
-
-
-def _with_own_multipliers(oracle: Oracle, state: State) -> State:
-    """Return the state with the Hessian of the Lagrangian at its own multipliers; itself without equalities."""
-    point = state.point
-    used = point.plus.multipliers
-    if used is None or not oracle.problem.equalities:
-        return state
-    if (np.abs(used - point.forces) <= SAME_MULTIPLIERS * np.abs(point.forces)).all():
-        return state
-    again = oracle.with_own_multipliers(point)
-    return state if again is None else state._replace(point=again)
 
 
 def _list_violated(oracle: Oracle, point: Point) -> tuple[tuple[str, float], ...]:

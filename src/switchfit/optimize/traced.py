@@ -576,60 +576,14 @@ def _compute_scaling(hessian: Array, floor: Array) -> Array:
     return lax.while_loop(go_on, equilibrate, (jnp.zeros((), int), start, find_largest(start)))[1]
 
 
-class _Programme(NamedTuple):
-    """The quadratic programme on some sides of the kinks, and the best step of those that were solved."""
-
-    sides: Array
-    step: Array
-    slope: Array
-    reduction: Array
-    again: Array  # whether other sides may be better
-
-
 def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints) -> tuple[Array, Array]:
-    """Return the step (d,) of the quadratic programme, and its slope gᵀd.
-
-    Where the force that holds a coordinate at its kink is outside [g₋, g₊], the coordinate is released, and the
-    programme is solved again, as long as that helps: as of `switchfit.optimize.direction`.
-    """
-    point = state.point
-    one_sided = point.left.gradient, point.right.gradient
-
-    def improve(best: _Programme) -> _Programme:
-        step, slope, reduction, force = _solve_on_sides(state, best.sides, constraints, breakpoints)
-        # The first programme is always taken: its reduction is compared with minus infinity.
-        better = (reduction > best.reduction) | jnp.isinf(best.reduction)
-        worth, side = algebra.measure_forces(best.sides, point.kink, *one_sided, step, force, state.scale, jnp)
-        # One coordinate at a time: to release one changes the forces on all others.
-        worst = jnp.argmax(worth)
-        return _Programme(
-            sides=best.sides.at[worst].set(side[worst]),
-            step=jnp.where(better, step, best.step),
-            slope=jnp.where(better, slope, best.slope),
-            reduction=jnp.where(better, reduction, best.reduction),
-            again=better & (worth[worst] > 0.0),
-        )
-
-    zero, lowest = jnp.zeros(()), jnp.full((), -jnp.inf)
-    first = _Programme(point.sides, jnp.zeros_like(point.theta), zero, lowest, jnp.ones((), bool))
-    found = lax.while_loop(lambda best: best.again, improve, first)
-    return found.step, found.slope
-
-
-def _solve_on_sides(
-    state: State, sides: Array, constraints: Constraints, breakpoints: Breakpoints
-) -> tuple[Array, Array, Array, Array]:
-    """Solve the programme with kinks held or confined as `sides` say: step (d,), slope, reduction and force (d,).
-
-    The force is that of the other coordinates alone; rows of constraints add theirs in `minimize`.
-    """
-    point, theta = state.point, state.point.theta
+    """Return the step (d,) of the quadratic programme, with kinks held or confined to one side, and its slope gᵀd."""
+    point, theta, sides = state.point, state.point.theta, state.point.sides
     # The Hessian of the piece that the sides lead into; entries between one coordinate on its left and another on its
     # right are those of no piece that was evaluated, and the mean stands for them.
     held = sides == 0
     pair = sides[:, None] + sides[None]
-    mixed = algebra.mix_sides(point.right.hessian, point.left.hessian, pair, jnp)
-    hessian = _without(held, mixed)
+    hessian = _without(held, algebra.mix_sides(point.right.hessian, point.left.hessian, pair, jnp))
     gradient = jnp.where(held, 0.0, jnp.where(sides > 0, point.right.gradient, point.left.gradient))
     # B = D S D, with S of unit diagonal, so that eigenvalues of S are compared with numbers that have no unit.
     narrowed = breakpoints.piece(theta, constraints)
@@ -682,9 +636,7 @@ def _solve_on_sides(
 
     feasible = jnp.all(constraints.normals @ newton >= offsets)
     step = lax.cond(feasible, lambda: newton, solve_constrained)
-    # Reduction of the model -(g'd + d'B d / 2), and the force -H d that the other coordinates exert on each.
-    slope, bent = gradient @ step, scaling * (matrix @ (scaling * step))
-    return step, slope, -(slope + 0.5 * step @ bent), -mixed @ step
+    return step, gradient @ step
 
 
 def _move(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step: Array) -> Array:

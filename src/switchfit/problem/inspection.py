@@ -84,8 +84,9 @@ def name_whole_parameters(entries: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name.partition("[")[0] for name in entries))
 
 
-def find_targets(problem: Problem, structures: Iterable[Structure], *, library: bool) -> set[str]:
-    """Return the problem's parameters that its experiments read: in their own sequences, or in any of a library.
+def find_targets(problem: Problem, structures: Iterable[Structure], *, library: bool) -> dict[str, set[int]]:
+    """Return the entries of the problem's parameters that its experiments read: in their own sequences, or in any of a
+    library.
 
     Parameters
     ----------
@@ -93,12 +94,13 @@ def find_targets(problem: Problem, structures: Iterable[Structure], *, library: 
     structures : iterable of Structure, one for each experiment
     library : bool
     """
-    found: set[str] = set()
+    found: dict[str, set[int]] = {}
     for run, structure in zip(problem.experiments, structures, strict=True):
         functions = structure.library.roles if library else structure.acting
-        read = chain.from_iterable(function.parameters for function in functions.values())
-        named = chain.from_iterable(sensor.named for sensor in structure.measurements)
-        found.update(run.parameter_map.get(name, name) for name in chain(read, named))
+        read = chain.from_iterable(function.read.items() for function in functions.values())
+        named = ((name, (0,)) for sensor in structure.measurements for name in sensor.named)
+        for name, entries in chain(read, named):
+            found.setdefault(run.parameter_map.get(name, name), set()).update(entries)
     return found
 
 

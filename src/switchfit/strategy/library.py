@@ -11,16 +11,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
-from switchfit.problem.experiment import Experiment, drop_jumps
+from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint, TransitionCost
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Structure, select_kind, trace_structure
+from switchfit.problem.structure import Function, Structure, select_kind, trace_structure
 
 
 @dataclass(frozen=True)
@@ -118,53 +118,60 @@ def refuse_unsupported(problem: Problem, e: int) -> None:
         )
 
 
+def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -> tuple[Function | None, ...]:
+    """Return the reset map, the cost and the guard of the transition from one mode to another in a run."""
+    has_cost = any(isinstance(item, TransitionCost) for item in run.data)
+    if not (has_cost or pair in problem.system.reset_maps or pair in problem.system.guards):
+        return None, None, None
+    alone = replace(run, mode_sequence=pair, transition_times=None, jumps=())
+    found = trace_structure(problem.system, alone, problem._functions, problem.solver, 1)
+    return found.reset_maps[0], found.transition_costs[0], found.guards[0]
+
+
 def trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers]:
     """Return the structure of an experiment with the modes and transitions of a library, and the places of the reset
     map, of the cost and of the guard of each of its transitions: (3, K, K), -1 without one.
     """
     modes = tuple(name for name in problem.system.modes if name in library.modes)
-    pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
-    path = list(modes[:1])
-    for before, after in pairs:  # a sequence with all transitions
-        path += [after] if path[-1] == before else [before, after]
-    run = replace(problem.experiments[e], mode_sequence=tuple(path), transition_times=None)
-    places = {pair: (modes.index(pair[0]), modes.index(pair[1])) for pair in pairs}
-    return _trace(problem, run, modes, [places.get(pair) for pair in pairwise(path)], births)
+    places = {pair: (modes.index(pair[0]), modes.index(pair[1])) for pair in product(modes, modes)}
+    steps = [(pair, place) for pair, place in places.items() if pair[0] != pair[1] and library.allows(*pair)]
+    return _trace(problem, e, modes, steps, births)
 
 
 def trace_order(problem: Problem, e: int) -> tuple[Structure, Integers]:
     """Return what `trace_library` does for the given order of modes, whose N + 1 places stand for the modes."""
-    run = problem.experiments[e]
-    births = len(run.transition_times)
-    modes = tuple(name for name in problem.system.modes if name in run.mode_sequence)
-    return _trace(problem, run, modes, [(k, k + 1) for k in range(births)], births)
+    sequence = problem.experiments[e].mode_sequence
+    modes = tuple(name for name in problem.system.modes if name in sequence)
+    steps = [(pair, (k, k + 1)) for k, pair in enumerate(pairwise(sequence))]
+    return _trace(problem, e, modes, steps, len(steps))
 
 
 def _trace(
-    problem: Problem, run: Experiment, modes: tuple[str, ...], steps: Sequence[tuple[int, int] | None], births: int
+    problem: Problem,
+    e: int,
+    modes: tuple[str, ...],
+    steps: Sequence[tuple[tuple[str, str], tuple[int, int]]],
+    births: int,
 ) -> tuple[Structure, Integers]:
-    """Trace a run with its transitions, each of which is a step between two places, or none that is looked for."""
+    """Trace a run and its transitions, each of which is a step between two places."""
+    run = problem.experiments[e]
     structure = trace_structure(problem.system, run, problem._functions, problem.solver, max(births, 1))
-    of_all = structure.reset_maps, structure.transition_costs, structure.guards
-    columns = [drop_jumps(run, kind) for kind in of_all]
-    chosen = [k for k, step in enumerate(steps) if step is not None]
-    resets, costs, guards = ([column[k] for k in chosen] for column in columns)
-    resets_and_jumps = [*resets, *(structure.reset_maps[i] for i in structure.jumps)]
-    libraries = [tuple(dict.fromkeys(filter(None, kind))) for kind in (resets_and_jumps, costs, guards)]
-    size = max(len(modes), *(1 + max(step) for step in steps if step is not None), 1)
+    known: list[list[Any]] = [list(dict.fromkeys(structure.reset_maps[i] for i in structure.jumps)), [], []]
+    size = max(len(modes), *(1 + max(place) for _, place in steps), 1)
     tables = np.full((3, size, size), -1, dtype=np.int64)
-    for table, column, known in zip(tables, columns, libraries, strict=True):
-        for k in chosen:
-            if column[k] is not None:
-                table[steps[k]] = known.index(column[k])
-    reset_maps, transition_costs, found_guards = libraries
+    for pair, place in steps:
+        for table, library, function in zip(tables, known, trace_transition(problem, run, pair), strict=True):
+            if function is not None:
+                library += [] if function in library else [function]
+                table[place] = library.index(function)
+    reset_maps, transition_costs, guards = map(tuple, known)
     structure = replace(
         structure,
         mode_names=modes,
         modes=tuple(structure.modes[structure.mode_names.index(name)] for name in modes),
         reset_library=reset_maps,
         transition_cost_library=transition_costs,
-        guard_library=found_guards,
+        guard_library=guards,
         known=0,  # jumps act at nodes, and are no transitions here
     )
     return structure, tables

@@ -31,7 +31,7 @@ from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import IterationRecord, LinearConstraints, Status
-from switchfit.optimize.qp import solve_qp
+from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
@@ -192,7 +192,10 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
                 continue
             points[:, group] = begin + max(room, 0.0) * ordered + shortest * np.arange(1, len(group) + 1)
     points[0] = unknowns.initial
-    return np.array([find_nearest_feasible(problem, point) for point in points])
+    # Each unknown is measured by its distance from the guess, which is feasible.
+    sizes = np.maximum(np.abs(points - unknowns.initial), 1e-9 * (1 + np.abs(unknowns.initial)))
+    pairs = zip(points, sizes, strict=True)
+    return np.array([nearest_feasible(problem.constraints, point, size) for point, size in pairs])
 
 
 def _compute_ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -216,19 +219,6 @@ def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[floa
     knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.end]])
     fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
     return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
-
-
-def find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
-    """Return the feasible point nearest to `point`, each unknown scaled by its distance from the initial guess."""
-    constraints = problem.constraints
-    inside = problem.initial_theta
-    if np.all(constraints.slack(point) >= 0):
-        return point
-    size = np.maximum(np.abs(point - inside), 1e-9 * (1 + np.abs(inside)))
-    matrix = np.diag(1 / size**2)
-    offsets = -np.maximum(constraints.slack(inside), 0.0)
-    step = solve_qp(-(point - inside) / size**2, matrix, constraints.normals, offsets).step
-    return np.clip(inside + step, constraints.lower, constraints.upper)
 
 
 MOST = 128
