@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, count_from_instant, has_dates, is_dated
+from switchfit.problem.dates import FIRST, LENGTHS, Dates, Origin, as_dates, has_dates, is_dated
 from switchfit.problem.signals import (
     PiecewisePolynomial,
     build_polynomial,
@@ -721,8 +721,8 @@ def _check_samples(
 
 def _count_seconds(dates: Dates) -> FloatArray:
     """Return the seconds since the first of dates."""
-    first = int(dates.instants.min()) if dates.instants.size else 0
-    return np.asarray(count_from_instant(dates.instants, first, NANOSECONDS["s"]))
+    first = dates.instants.min() if dates.instants.size else FIRST
+    return np.asarray((dates.instants - first) / LENGTHS["s"])
 
 
 def _check_observe(observe: Any) -> None:

@@ -104,10 +104,6 @@ class Jump:
         return np.atleast_1d(np.asarray(self.time, dtype=np.float64))
 
 
-TIMED = (Measurements, ReferenceSignal)
-"""The data that have times."""
-
-
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """One run: its data, its sequence of modes, and the first guess of when they switch.
@@ -173,10 +169,9 @@ class Experiment:
 
     Notes
     -----
-    ``p`` holds the names of the map, and all parameters of the problem that no run's map has as its target; a target
-    is there under its own name only if a function reads it by that name, as ``p["beta_run3"]``. A run is differentiated
-    with respect to the parameters on which its functions depend and to no others, so that many runs with parameters of
-    their own cost each what it alone would.
+    ``p`` holds all parameters of the problem, and the names of the map. A run is differentiated with respect to the
+    parameters on which its functions depend and to no others, so that many runs with parameters of their own cost each
+    what it alone would.
 
     A copy with other data, made by `dataclasses.replace`, keeps the horizon, also where it came from the data; with
     ``t0=None, tf=None`` beside the data it is that of the new ones.
@@ -284,12 +279,12 @@ class Experiment:
             of_times, times = "transition_times", as_dates(times, "transition_times") if is_dated(times) else times
         parts = [(f"times of {type(item).__name__}", item) for item in (*data, *jumps, self.inputs)]
         parts += [(of_times, times), ("t0", t0), ("tf", tf)]
-        given = [Given(what, dates, isinstance(part, TIMED)) for what, part in parts for dates in list_dates(part)]
+        given = [Given(what, dates) for what, part in parts for dates in list_dates(part)]
         found: dict[str, Any] = {"data": data, "jumps": jumps}
         if given or self.origin is not None or self.time_zone is not None:
-            kinds = [type(item).__name__ for item in data if isinstance(item, TIMED) and not has_dates(item)]
-            numbers = f"the {kinds[0]}{'' if len(data) == 1 else ' beside it'}" if kinds else ""
-            origin = choose_origin(given, self.origin, self.time_zone, t0, numbers=numbers)
+            timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
+            of_data = given[: len(timed)] if all(map(has_dates, timed)) else []  # they stand first
+            origin = choose_origin(given, of_data, self.origin, self.time_zone, t0)
             unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
             found |= {"inputs": self.inputs, "transition_times": times, "t0": t0, "tf": tf}
             names = {"transition_times": of_times, "t0": "t0", "tf": "tf"}

@@ -290,7 +290,7 @@ class Call(NamedTuple):
     inputs: tuple[str, ...] = ()
 
 
-def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozenset[str] = frozenset()) -> Function:
+def trace_function(call: Call, parameters: Mapping[str, Shape]) -> Function:
     """Trace a function of the user, or return a cached trace that is still valid.
 
     Parameters
@@ -298,8 +298,6 @@ def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozense
     call : Call
     parameters : mapping of str to shape
         Names and shapes of the entries of its dict of parameters.
-    hidden : set of str
-        Those among them that are in the dict only if the function reads them by name.
 
     Raises
     ------
@@ -308,20 +306,14 @@ def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozense
     """
     function = _without_jit(call.function)
     content = read_contents(function)
-    asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()), hidden)
+    asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()))
     key = None if content is None else (content, asked)
     found = None if key is None else _traces.get(key)
     if found is not None:
         return found
     call = call._replace(function=function)
-    shown = {name: size for name, size in parameters.items() if name not in hidden}
     with use_float64(), nullcontext() if key is not None else _retracing(next(_turn)):
-        try:
-            traced = _trace(call, shown)
-        except ValueError:  # the function may read a hidden parameter by its name
-            if not hidden:
-                raise
-            traced = _trace(call, parameters)
+        traced = _trace(call, parameters)
     if key is not None:
         with _lock:
             _traces[key] = traced

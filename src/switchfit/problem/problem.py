@@ -310,8 +310,7 @@ class Problem:
     @cached_property
     def _functions(self) -> Functions:
         """The functions that were traced, which problems with other sequences share."""
-        targets = frozenset(name for e in self.experiments for name in e.parameter_map.values())
-        return Functions(self.parameters, targets)
+        return Functions(self.parameters, {})
 
     def with_sequences(self, sequences: Sequence[Sequence[str]], transition_times: Sequence[ArrayLike]) -> Problem:
         """Return the problem with other mode sequences, which takes a fraction of the time of building it anew.

@@ -71,7 +71,7 @@ def _place_window(log: Log, table: LogTable, run: ExperimentTable) -> tuple[list
         raise ValueError(f"window = [{ends[0]}, {ends[1]}] has dates, and {log.source} has {other}. Give both alike.")
     zone = run.time_zone or log.time_zone
     dates = log.dates.localize(zone, log.source) if zone else log.dates
-    origin = make_origin(int(dates.instants[0]), zone)
+    origin = make_origin(dates.instants[0], zone)
     limits = [float(origin.to_numbers(as_dates(end, "window"), "s", "window")) for end in ends]
     return limits, origin.to_numbers(log.dates, "s", log.source)
 
@@ -121,7 +121,7 @@ def find_origin(table: ExperimentTable, logs: Sequence[Log]) -> Any:
     starts = [
         as_dates(log.start if log.time_zone else log.start.replace(tzinfo=None), "origin") for log in dated if log.start
     ]
-    return make_origin(min(int((start.localize(zone, "origin") if zone else start).instants) for start in starts), zone)
+    return make_origin(min((start.localize(zone, "origin") if zone else start).instants for start in starts), zone)
 
 
 def _keep_dates(item: LogTable, log: Log, run: ExperimentTable) -> bool:
