@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
-from switchfit.problem.dates import Dates, Given, as_date, as_dates, choose_origin, has_dates, is_dated, list_dates
+from switchfit.problem.dates import Given, as_date, as_dates, choose_origin, has_dates, is_dated, list_dates
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, unit_suffix
 from switchfit.problem.signals import PiecewisePolynomial
@@ -95,13 +95,6 @@ class Jump:
             raise ValueError(f"The times of a Jump must increase strictly; got {shorten(self.time)}.")
         listed = times.tolist()
         set_fields(self, time=dates if dates is not None else tuple(listed) if isinstance(listed, list) else listed)
-
-    @property
-    def times(self) -> FloatArray:
-        """All its times: (K,). ValueError for dates, which become numbers in an experiment."""
-        if isinstance(self.time, Dates):
-            raise ValueError(f"the times of this Jump are dates ({self.time!r}): an Experiment makes numbers of them.")
-        return np.atleast_1d(np.asarray(self.time, dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,8 +239,7 @@ class Experiment:
         given = self.transition_times
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
-        several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
-        given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
+        given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter")
         if len(given) != len(sequence) - 1:
             raise ValueError(
                 f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
@@ -328,7 +320,7 @@ class Experiment:
     @cached_property
     def _acts(self) -> list[tuple[float, Callable[..., Any]]]:
         """Time and map of each jump, in the order in which they act."""
-        acts = [(time, jump.map) for jump in self.jumps for time in jump.times.tolist()]  # type: ignore[union-attr]
+        acts = [(time, jump.map) for jump in self.jumps for time in np.atleast_1d(jump.time).tolist()]  # type: ignore[union-attr]
         return sorted(acts, key=lambda act: act[0])
 
     @cached_property

@@ -462,7 +462,9 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
     try:
         value = function(*arguments)
     except KeyError as error:
-        raise ValueError(f"{what} {_describe_missing_name(error.args[0] if error.args else '', arguments)}") from error
+        known = zip("pu", (given for given in arguments if isinstance(given, dict)), strict=False)
+        there = "; ".join(f"{holder} has {join_names(given)}" for holder, given in known)
+        raise ValueError(f"{what} reads {error}, which is not there: {there}.") from error
     except UNTRACEABLE as error:
         raise ValueError(
             f"{what} branches on the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
@@ -478,19 +480,6 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what}: {form} must return an array of numbers; got {value!r}.") from error
-
-
-def _describe_missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
-    """Return the end of the sentence about a name that is neither in p nor, if u is a dict, in u."""
-    parameters, *inputs = [given for given in arguments if isinstance(given, dict)]
-    lacks = f"the parameter {name!r}, which the problem lacks; it has {join_names(parameters)}"
-    if not inputs or name in inputs[0]:
-        return f"reads {lacks}."
-    lacks_input = f"the input {name!r}, which the experiment lacks; it has {join_names(inputs[0])}"
-    if name in parameters:
-        return f"reads {lacks_input}."
-    known = f"a parameter ({join_names(parameters)}) nor an input ({join_names(inputs[0])})"
-    return f"reads {name!r}, which is neither {known}."
 
 
 def call_for_vector(call: Call, arguments: tuple[Any, ...]) -> Array:

@@ -305,28 +305,6 @@ class Parameter:
         """Whether it can take positive values alone."""
         return self.scale == "log" or bool(np.all(self.lower > 0))
 
-    def entries(self) -> tuple[Parameter, ...]:
-        """Return a scalar `Parameter` for each entry, in their order.
-
-        See Also
-        --------
-        Parameter
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> first, second = sf.Parameter([1.0, 2.0], lower=0.0).entries()
-        >>> float(second.value), float(second.lower)
-        (2.0, 0.0)
-        """
-        terms = PriorTerms.of(self.prior, self.shape)
-        priors: list[Prior | None] = []
-        for center, precision, log in zip(*terms, strict=True):
-            kind = LogNormal if log else Normal
-            priors.append(kind(np.exp(center) if log else center, precision**-0.5) if precision > 0 else None)
-        each = zip(self.value.ravel(), self.lower.ravel(), self.upper.ravel(), priors, strict=True)
-        return tuple(Parameter(x, low, high, self.unit, self.fixed, prior, self.scale) for x, low, high, prior in each)
-
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the parameter, () for a scalar."""
