@@ -163,21 +163,14 @@ def test_bad_values(values, error, message):
 @pytest.mark.parametrize(
     ("left", "values", "message"),
     [
-        ("lef", NAMED, r"mode 'pull' reads 'lef', which is neither a parameter \(k\) nor an input \(left, right\)"),
-        ("k", NAMED, "mode 'pull' reads the input 'k', which the experiment lacks; it has left, right"),
-        (0, NAMED, r"reads 0, which is neither a parameter \(k\) nor an input \(left, right\)"),
+        ("k", NAMED, "mode 'pull' reads 'k', which is not there: p has k; u has left, right"),
+        (0, NAMED, "reads 0, which is not there: p has k; u has left, right"),
         ("left", np.ones((7, 2)), r"mode 'pull'.* u has no names: give sf.Input a dict of name -> samples"),
     ],
 )
 def test_modes_that_ask_for_what_is_not_there(left, values, message):
     with pytest.raises(ValueError, match=message):
         problem_of(system_of(left, "right" if isinstance(values, dict) else 1), values)
-
-
-def test_an_input_that_is_asked_for_as_a_parameter():
-    system = sf.HybridSystem(dict.fromkeys(("pull", "slip"), lambda t, x, p, u: p["left"] * x), [1.0, 0.0])
-    with pytest.raises(ValueError, match="reads the parameter 'left', which the problem lacks; it has k"):
-        problem_of(system, NAMED)
 
 
 MODEL = """
@@ -232,7 +225,7 @@ def test_names_in_a_problem_file(folder):
     ("old", "new", "message"),
     [
         ('right = "wheel 2"', 'right = "wheel 3"', "has no column 'wheel 3'; its columns are t, x, wheel 1, wheel 2"),
-        ('right = "wheel 2"', 'rigth = "wheel 2"', r"reads 'right', which is neither .* nor an input \(left, rigth\)"),
+        ('right = "wheel 2"', 'rigth = "wheel 2"', "reads 'right', which is not there: .*; u has left, rigth"),
         ('right = "wheel 2"', "right = 2", "'experiments.1..inputs.columns' must be a string; got 2"),
         (COLUMNS, "{}", "'experiments.1..inputs.columns' must have at least 1 entries"),
     ],

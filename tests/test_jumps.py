@@ -374,7 +374,7 @@ def test_problem_file_with_dates(folder, values):
         ("time = 24", "tim = 24", "tim"),
         ("time = 24", "time = 'noon'", "jumps\\[2\\].time.* must be a number or a date such as 2024-05-01"),
         ("time = 24", "time = [24.0, 2024-05-01]", "jumps\\[2\\]: Jump time must be numbers or dates, not both"),
-        ("time = 24", "time = 2024-05-01", "times of Jump is a date, but the Measurements has numbers for times"),
+        ("time = 24", "time = 2024-05-01", "times of Jump is a date, but not all times of the data are"),
     ],
 )
 def test_problem_file_with_a_wrong_jump(folder, old, new, message):
@@ -430,7 +430,6 @@ def make_jumping(*jumps):
         (lambda: sf.Jump("noon", dose), ValueError, "Jump time must be a number or a date; got 'noon'. Write dates as"),
         (lambda: sf.Jump([at(1), at(1)], dose), ValueError, "times of a Jump must increase strictly"),
         (lambda: sf.Jump([at(0), 1.0], dose), TypeError, "Jump time must be numbers or dates, not both; got 1.0"),
-        (lambda: sf.Jump([at(0), at(1)], dose).times, ValueError, "are dates .*: an Experiment makes numbers of them"),
         (lambda: make_dated(TIMES, sf.Jump([at(8), at(36)], dose)), ValueError, "got \\['2024-05-02 18:00:00"),
         (lambda: make_dated(TIMES, WALL), ValueError, "Measurements has a time zone .*, but times of Jump has none"),
         (
