@@ -120,8 +120,8 @@ def test_dates_are_exact_to_the_microsecond():
     run = sf.Experiment(log(instants), ("on",), (), time_unit="us")
     np.testing.assert_array_equal(run.data[0].times, [0.0, 1.0, 2.0, 500.0])
     finer = instants.astype("datetime64[ns]") + np.array([0, 1, 999, 500])
-    for given in (finer, list(pd.DatetimeIndex(finer)), [f"{text}" for text in finer.astype(str)]):
-        np.testing.assert_array_equal(as_dates(given, "times").instants, instants)
+    for dates in (finer, list(pd.DatetimeIndex(finer)), finer.astype(str)):
+        np.testing.assert_array_equal(as_dates(dates, "times").instants, instants)
     far = log(np.array(["0001-01-01", "1850-01-01", "9999-12-31"], dtype="datetime64[D]"))
     days = [dt.date(1850, 1, 1).toordinal() - 1, dt.date.max.toordinal() - 1]
     np.testing.assert_array_equal(sf.Experiment(far, ("on",), (), time_unit="d").data[0].times, [0, *days])
