@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import compress
 from typing import Any
 
@@ -546,13 +546,12 @@ def prefix_runs(experiments: Sequence[Experiment]) -> list[str]:
 def _check_map(given: Any) -> Mapping[str, str]:
     """Return a map of the model's names to the problem's; empty for None."""
     names = {} if given is None else given
-    strings = isinstance(names, Mapping) and all(isinstance(name, str) for pair in names.items() for name in pair)
-    if not strings:
-        raise TypeError(
-            "parameter_map must be a dict of the model's name -> the problem's name, such as "
-            f"{{'beta': 'beta_run3'}}; got {shorten(given)}."
-        )
-    return {as_name(here, "parameter_map"): as_name(target, "parameter_map") for here, target in names.items()}
+    form = "a dict of the model's name -> the problem's name, such as {'beta': 'beta_run3'}"
+    if not isinstance(names, Mapping):
+        raise TypeError(f"parameter_map must be {form}; got {shorten(given)}.")
+    return {
+        as_name(here, "parameter_map", form): as_name(there, "parameter_map", form) for here, there in names.items()
+    }
 
 
 def _check_data(data: Any) -> tuple[Data, ...]:

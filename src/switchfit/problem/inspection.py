@@ -133,23 +133,6 @@ STATE = ""
 """Stands for the state among the names of parameters."""
 
 
-class Comparison(NamedTuple):
-    """A comparison with a parameter in a traced function.
-
-    Attributes
-    ----------
-    parameter : str
-    verb : str
-        One of `VERBS`.
-    line : str
-        Place in the user's code, "file.py:12"; empty if it is unknown.
-    """
-
-    parameter: str
-    verb: str
-    line: str
-
-
 @keep_with_problem
 def find_comparisons(problem: Problem) -> dict[int, str]:
     """Return by which function and where an unknown is compared, such as "mode 'on' compares with t_on at model.py:12".
@@ -165,16 +148,16 @@ def find_comparisons(problem: Problem) -> dict[int, str]:
     for run, structure in zip(problem.experiments, problem.structures, strict=True):
         for role, function in structure.acting.items():
             # Where a mode compares with its state, rows end, and derivatives have all of it: see `corners`.
-            for parameter, verb, line in list_comparisons(function, with_state=not role.startswith("mode ")):
-                name = run.parameter_map.get(parameter, parameter)
-                found.setdefault(name, f"{role} {verb} {parameter}{f' at {line}' if line else ''}")
+            for parameter, what in list_comparisons(function, with_state=not role.startswith("mode ")):
+                found.setdefault(run.parameter_map.get(parameter, parameter), f"{role} {what}")
     spans = problem.unknowns.parameters.items()
     return {i: found[name] for name, span in spans if name in found for i in range(span.start, span.stop)}
 
 
 @lru_cache(maxsize=1024)
-def list_comparisons(function: Function, with_state: bool = True) -> tuple[Comparison, ...]:
-    """Return the comparisons of a function with its parameters, in the order of its operations.
+def list_comparisons(function: Function, with_state: bool = True) -> tuple[tuple[str, str], ...]:
+    """Return the parameters with which a function compares, in the order of its operations, and what it does, such as
+    "compares with k at model.py:12".
 
     Parameters
     ----------
@@ -194,7 +177,7 @@ class _Comparing(Walk):
     """Finds the comparisons of a function; what it follows are the parameters on which values depend."""
 
     def __init__(self) -> None:
-        self.found: list[Comparison] = []
+        self.found: list[tuple[str, str]] = []
 
     def constant(self, value: Any) -> Names:
         return NONE
@@ -203,7 +186,7 @@ class _Comparing(Walk):
         names = NONE.union(*given)
         if _jumps(equation) and STATE not in names:
             verb, line = VERBS[equation.primitive.name], find_line(origin)
-            self.found += [Comparison(name, verb, line) for name in sorted(names)]
+            self.found += [(name, f"{verb} {name}{line and f' at {line}'}") for name in sorted(names)]
         results = [names] * len(equation.outvars)
         for inner, own in _list_calls(equation, given):
             if find_public_name(inner) not in SMOOTH:
