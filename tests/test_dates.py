@@ -26,7 +26,7 @@ from switchfit.cli import app
 from switchfit.io.command_line import summarize_estimate
 from switchfit.io.problem_file import load_problem
 from switchfit.io.result_tables import write_runs, write_unknowns
-from switchfit.problem.dates import SECONDS, Dates, Origin, as_dates, from_epoch, make_origin
+from switchfit.problem.dates import SECONDS, Dates, Origin, from_epoch, make_origin, read_dates
 from switchfit.report.axes import DateLocator
 from switchfit.report.formats import add_dates, format_date, format_time
 from switchfit.runtime.errors import InputError
@@ -121,7 +121,7 @@ def test_dates_are_exact_to_the_microsecond():
     np.testing.assert_array_equal(run.data[0].times, [0.0, 1.0, 2.0, 500.0])
     finer = instants.astype("datetime64[ns]") + np.array([0, 1, 999, 500])
     for dates in (finer, list(pd.DatetimeIndex(finer)), finer.astype(str)):
-        np.testing.assert_array_equal(as_dates(dates, "times").instants, instants)
+        np.testing.assert_array_equal(read_dates(dates, "times").instants, instants)
     far = log(np.array(["0001-01-01", "1850-01-01", "9999-12-31"], dtype="datetime64[D]"))
     days = [dt.date(1850, 1, 1).toordinal() - 1, dt.date.max.toordinal() - 1]
     np.testing.assert_array_equal(sf.Experiment(far, ("on",), (), time_unit="d").data[0].times, [0, *days])
@@ -155,7 +155,7 @@ def test_dates_come_back(start, seconds, zone):
     moment = dt.datetime(1970, 1, 1, tzinfo=dt.UTC) + dt.timedelta(microseconds=start + 10**6 * seconds)
     assert date == moment
     assert date.utcoffset() == moment.astimezone(origin.zone).utcoffset()
-    assert origin.to_numbers(as_dates(date, "date"), "s") == seconds
+    assert origin.to_numbers(read_dates(date, "date"), "s") == seconds
 
 
 @given(
@@ -163,7 +163,7 @@ def test_dates_come_back(start, seconds, zone):
     st.sampled_from(["Europe/Berlin", "America/New_York"]),
 )
 def test_wall_clocks_agree_with_pandas(reading, zone):
-    given = as_dates(reading, "times")
+    given = read_dates(reading, "times")
     try:
         expected = pd.Timestamp(reading).tz_localize(zone)
     except ValueError:
@@ -294,7 +294,7 @@ def test_signals_and_inputs():
             "nan s since 1970-01-01T00:00:00.00:00 is",
         ),
         (
-            lambda: BARE.to_numbers(as_dates("2020-01-01T00Z", "t"), "s"),
+            lambda: BARE.to_numbers(read_dates("2020-01-01T00Z", "t"), "s"),
             ValueError,
             "has a time",
         ),
@@ -470,7 +470,7 @@ def test_profiles_residuals_and_many_fits_show_dates(fits):
     assert study.plot().axes[0].get_xlabel() == "tau_1 (Europe/Berlin)"
 
 
-def test_many_logs_with_origins_of_their_own_are_not_shown_as_dates():
+def test_many_logs_with_origins_of_their_own_are_not_shown_read_dates():
     same = sf.estimate_many([room(dated=True), room(dated=True)])
     assert same.date_origins[0].time_zone == "Europe/Berlin"
     other = sf.estimate_many([room(dated=True), room(dated=True, origin="2020-03-19")])

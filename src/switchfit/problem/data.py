@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.dates import FIRST, LENGTHS, Dates, Origin, as_dates, has_dates, is_dated
+from switchfit.problem.dates import FIRST, LENGTHS, Dates, Origin, has_dates, read_dates
 from switchfit.problem.signals import (
     PiecewisePolynomial,
     build_polynomial,
@@ -688,7 +688,7 @@ def _check_samples(
     With `breaks`, a time may occur twice; with `missing`, values may be NaN, and masked ones become NaN; without
     `columns`, the shape of the values must be (K,).
     """
-    dates = as_dates(times, f"{what} times") if is_dated(times) else None
+    dates = read_dates(times, f"{what} times")
     times = as_array(times, f"{what} times", form="an array of numbers") if dates is None else _count_seconds(dates)
     values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
     if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):

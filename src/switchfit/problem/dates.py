@@ -140,19 +140,6 @@ def _refuse_missing(what: str, place: str) -> NoReturn:
     raise ValueError(f"{what} must not be missing; the date{place} is. Leave such samples out.")
 
 
-def _read_column(value: Any, what: str) -> Dates | None:
-    """Return an array or a column of datetime64 as dates; None for text and objects."""
-    dtype = getattr(value, "dtype", None)
-    tz = getattr(dtype, "tz", None) or getattr(dtype, "time_zone", None)  # of pandas, of polars
-    if is_of_library(value, "polars") and str(dtype).startswith("Date"):
-        value = (value.dt.convert_time_zone("UTC") if tz else value).to_numpy()
-    if getattr(getattr(value, "dtype", None), "kind", "") != "M":
-        return None
-    array = np.asarray(value, dtype="datetime64[us]" if tz else None)  # in UTC if it has a zone
-    zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
-    return Dates(_as_instants(array, what), zone)
-
-
 def _find_offset(wall: datetime.datetime, zone: str, what: str) -> datetime.timedelta:
     """Return the offset of a zone from UTC at a minute of its wall clock."""
     tz = find_zone(zone)
@@ -233,27 +220,13 @@ def format_instant(instant: Any, zone: str) -> str:
     return date.isoformat()
 
 
-def is_dated(value: Any) -> bool:
-    """Return whether a value is to be read as dates: dates, text, and arrays, tables' columns and lists of these."""
-    if type(value) is float:  # as are most times
-        return False
-    if isinstance(value, (Dates, *_DATE_TYPES)):
-        return True
-    dtype = getattr(value, "dtype", None)
-    kind = getattr(dtype, "kind", "")
-    if kind in ("f", "i"):
-        return False
-    if isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1):
-        return any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))
-    return kind in ("M", "U") or (is_of_library(value, "polars") and str(dtype).startswith(("Date", "String")))
-
-
-def as_dates(value: Any, what: str) -> Dates:
-    """Return what `is_dated` is true of as dates.
+def read_dates(value: Any, what: str) -> Dates | None:
+    """Return dates, text, and arrays, columns of tables and lists of these as dates; None for anything else.
 
     Parameters
     ----------
-    value : date, text in ISO 8601, or an array, a column or a list of these
+    value : object
+        Text is in ISO 8601.
     what : str
         Name of the argument, for messages.
 
@@ -265,15 +238,36 @@ def as_dates(value: Any, what: str) -> Dates:
     TypeError
         For something that is no date among dates.
     """
+    if type(value) is float:  # as are most times
+        return None
     if isinstance(value, Dates):
         return value
     if isinstance(value, _DATE_TYPES):
         instant, zone = _read_date(value, what)
         return Dates(np.array(instant), zone)
-    column = _read_column(value, what)
-    if column is not None:
-        return column
-    entries = value.to_list() if is_of_library(value, "polars") else list(value)
+    dtype = getattr(value, "dtype", None)
+    kind, is_polars = getattr(dtype, "kind", ""), is_of_library(value, "polars")
+    if kind == "M" or (is_polars and str(dtype).startswith("Date")):
+        return _read_column(value, what)
+    has_types = isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1)
+    has_dates = has_types and any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))
+    if has_dates or kind == "U" or (is_polars and str(dtype) == "String"):
+        return _read_entries(value.to_list() if is_polars else list(value), what)
+    return None
+
+
+def _read_column(value: Any, what: str) -> Dates:
+    """Return an array or a column of datetime64 as dates."""
+    tz = getattr(value.dtype, "tz", None) or getattr(value.dtype, "time_zone", None)  # of pandas, of polars
+    if is_of_library(value, "polars"):
+        value = (value.dt.convert_time_zone("UTC") if tz else value).to_numpy()
+    array = np.asarray(value, dtype="datetime64[us]" if tz else None)  # in UTC if it has a zone
+    zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
+    return Dates(_as_instants(array, what), zone)
+
+
+def _read_entries(entries: list[Any], what: str) -> Dates:
+    """Return entries, each a date or text, as dates."""
     pairs = [_read_date(entry, what, f" at index {index}") for index, entry in enumerate(entries)]
     zones = {zone for _, zone in pairs}
     if "" in zones and len(zones) > 1:
@@ -286,11 +280,19 @@ def as_dates(value: Any, what: str) -> Dates:
     return Dates(np.array([instant for instant, _ in pairs], dtype="datetime64[us]"), zone)
 
 
-def as_date(value: Any, what: str) -> Dates:
-    """Return a single date, as `as_dates` reads it; ValueError for several."""
-    date = as_dates(value, what)
-    if date.shape != ():
+def read_date(value: Any, what: str) -> Any:
+    """Return a single date as `Dates`, ValueError for several; anything else as it is."""
+    date = read_dates(value, what)
+    if date is not None and date.shape != ():
         raise ValueError(f"{what} must be one date; got {date!r}.")
+    return value if date is None else date
+
+
+def as_date(value: Any, what: str) -> Dates:
+    """Return a single date; TypeError for anything else."""
+    date = read_date(value, what)
+    if not isinstance(date, Dates):
+        raise TypeError(f"{what} must be a date, such as '2024-05-01T12:00+02:00'; got {shorten(value)}.")
     return date
 
 
@@ -475,10 +477,7 @@ def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, ti
     TypeError
         For an origin that is no date, and a `time_zone` that is no string.
     """
-    stated = origin.date if isinstance(origin, Origin) else origin
-    if not (stated is None or is_dated(stated)):
-        raise TypeError(f"origin must be a date, such as '2024-05-01T12:00+02:00'; got {shorten(origin)}.")
-    start = None if stated is None else as_date(stated, "origin")
+    start = None if origin is None else as_date(origin.date if isinstance(origin, Origin) else origin, "origin")
     form = "the name of a time zone, such as 'Europe/Berlin', or an offset such as '+02:00'"
     asked = None if time_zone is None else as_name(time_zone, "time_zone", form)
     if asked is not None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
-from switchfit.problem.dates import Given, as_date, as_dates, choose_origin, has_dates, is_dated, list_dates
+from switchfit.problem.dates import Given, choose_origin, has_dates, list_dates, read_date, read_dates
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, unit_suffix
 from switchfit.problem.signals import PiecewisePolynomial
@@ -86,7 +86,7 @@ class Jump:
 
     def __post_init__(self) -> None:
         as_callable(self.map, "Jump map", "a function map(t, x, p)", arguments=3)
-        dates = as_dates(self.time, "Jump time") if is_dated(self.time) else None
+        dates = read_dates(self.time, "Jump time")
         form = "a number or a sequence of numbers"
         times = as_array(self.time, "Jump time", form=form) if dates is None else dates.instants
         if times.ndim > 1 or not times.size or not np.isfinite(times).all():
@@ -264,11 +264,12 @@ class Experiment:
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
         data, jumps, times = _check_data(self.data), _check_jumps(self.jumps), self.transition_times
-        t0, tf = _read_date(self.t0, "t0"), _read_date(self.tf, "tf")
+        t0, tf = read_date(self.t0, "t0"), read_date(self.tf, "tf")
         if isinstance(times, (list, tuple)):
-            of_times, times = "a transition time", tuple(_read_date(time, "a transition time") for time in times)
+            of_times, times = "a transition time", tuple(read_date(time, "a transition time") for time in times)
         else:
-            of_times, times = "transition_times", as_dates(times, "transition_times") if is_dated(times) else times
+            of_times, dates = "transition_times", read_dates(times, "transition_times")
+            times = times if dates is None else dates
         parts = [(f"times of {type(item).__name__}", item) for item in (*data, *jumps, self.inputs)]
         parts += [(of_times, times), ("t0", t0), ("tf", tf)]
         given = [Given(what, dates) for what, part in parts for dates in list_dates(part)]
@@ -521,11 +522,12 @@ def count_times(experiment: Experiment, times: Any) -> Any:
     ValueError
         For dates if the times of the experiment are numbers.
     """
-    if not is_dated(times):
+    dates = read_dates(times, "times")
+    if dates is None:
         return times
     if experiment.origin is None:
-        raise ValueError(f"times are dates ({shorten(times)}), but the times of the experiment are numbers.")
-    return experiment.origin.to_numbers(as_dates(times, "times"), experiment.time_unit)
+        raise ValueError(f"times are dates ({dates!r}), but the times of the experiment are numbers.")
+    return experiment.origin.to_numbers(dates, experiment.time_unit)
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
@@ -609,8 +611,3 @@ def _check_final_time(given: Any) -> float | Parameter:
             f"model may be integrated; got the upper bound {given.upper}."
         )
     return given
-
-
-def _read_date(value: Any, what: str) -> Any:
-    """Return a single date as `Dates`; anything else as it is."""
-    return as_date(value, what) if is_dated(value) else value

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.dates import as_date, is_dated, list_dates
+from switchfit.problem.dates import Dates, list_dates, read_date
 from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, require_deviation, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
@@ -55,11 +55,8 @@ class Normal:
     sd: Any
 
     def __post_init__(self) -> None:
-        if is_dated(self.mean):
-            set_fields(self, mean=as_date(self.mean, "Normal mean"))
-            _check(self, "sd", "sd")
-        else:
-            _check(self, "mean", "sd")
+        set_fields(self, mean=read_date(self.mean, "Normal mean"))
+        _check(self, "sd" if isinstance(self.mean, Dates) else "mean", "sd")
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,9 +236,9 @@ class Parameter:
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
         set_fields(self, unit=as_text(self.unit, "Parameter unit"), fixed=as_flag(self.fixed, "Parameter fixed"))
         set_fields(self, scale=scale)
-        dated = [name for name in ("value", *BOUNDS) if is_dated(getattr(self, name))]
-        if dated or is_dated(getattr(self.prior, "mean", 0.0)):  # an experiment makes numbers of them, and checks these
-            set_fields(self, **{name: as_date(getattr(self, name), f"Parameter {name}") for name in dated})
+        given = {name: read_date(getattr(self, name), f"Parameter {name}") for name in ("value", *BOUNDS)}
+        if any(isinstance(each, Dates) for each in (*given.values(), getattr(self.prior, "mean", None))):
+            set_fields(self, **given)  # an experiment makes numbers of them, and checks these
             return
         set_fields(self, **self._read_numbers(scale))
         self._check_prior()
