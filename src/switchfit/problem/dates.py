@@ -297,10 +297,10 @@ def as_date(value: Any, what: str) -> Dates:
 
 
 def list_dates(value: Any) -> Iterator[Dates]:
-    """Yield all dates in a value: in the fields of dataclasses, in lists and in tuples."""
+    """Yield all dates in a value: in the fields of dataclasses, and in tuples."""
     if isinstance(value, Dates):
         yield value
-    elif isinstance(value, (list, tuple)):
+    elif isinstance(value, tuple):
         for entry in value:
             yield from list_dates(entry)
     elif is_dataclass(value):

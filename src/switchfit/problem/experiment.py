@@ -239,7 +239,6 @@ class Experiment:
         given = self.transition_times
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
-        given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter")
         if len(given) != len(sequence) - 1:
             raise ValueError(
                 f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
@@ -264,26 +263,25 @@ class Experiment:
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
         data, jumps, times = _check_data(self.data), _check_jumps(self.jumps), self.transition_times
-        t0, tf = read_date(self.t0, "t0"), read_date(self.tf, "tf")
-        if isinstance(times, (list, tuple)):
-            of_times, times = "a transition time", tuple(read_date(time, "a transition time") for time in times)
-        else:
-            of_times, dates = "transition_times", read_dates(times, "transition_times")
-            times = times if dates is None else dates
-        parts = [(f"times of {type(item).__name__}", item) for item in (*data, *jumps, self.inputs)]
-        parts += [(of_times, times), ("t0", t0), ("tf", tf)]
-        given = [Given(what, dates) for what, part in parts for dates in list_dates(part)]
-        found: dict[str, Any] = {"data": data, "jumps": jumps}
+        if times is not None:
+            times = as_sequence(times, "transition_times", "a sequence of numbers or sf.Parameter")
+            times = tuple(read_date(time, "a transition time") for time in times)
+        parts: dict[str, Any] = {"data": data, "jumps": jumps, "inputs": self.inputs, "transition_times": times}
+        parts |= {name: read_date(getattr(self, name), name) for name in ("t0", "tf")}
+        names = {"transition_times": "a transition time", "t0": "t0", "tf": "tf"}
+        given = []
+        for name, part in parts.items():
+            for item in part if isinstance(part, tuple) else (part,):
+                what = names.get(name, f"times of {type(item).__name__}")
+                given += [Given(what, dates) for dates in list_dates(item)]
         if given or self.origin is not None or self.time_zone is not None:
             timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
             of_data = given[: len(timed)] if all(map(has_dates, timed)) else []  # they stand first
-            origin = choose_origin(given, of_data, self.origin, self.time_zone, t0)
+            origin = choose_origin(given, of_data, self.origin, self.time_zone, parts["t0"])
             unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-            found |= {"inputs": self.inputs, "transition_times": times, "t0": t0, "tf": tf}
-            names = {"transition_times": of_times, "t0": "t0", "tf": "tf"}
-            found = {name: count_from(value, origin, unit, names.get(name, "")) for name, value in found.items()}
-            found |= {"origin": origin, "time_zone": origin.time_zone or None}
-        set_fields(self, **found)
+            parts = {name: count_from(part, origin, unit, names.get(name, "")) for name, part in parts.items()}
+            parts |= {"origin": origin, "time_zone": origin.time_zone or None}
+        set_fields(self, **parts)
 
     @property
     def measurements(self) -> tuple[Measurements, ...]:
