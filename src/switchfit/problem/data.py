@@ -655,9 +655,8 @@ def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any
     what = what or f"times of {type(item).__name__}"
     if isinstance(item, ReferenceSignal) and item.samples is not None:
         return replace_samples(item, origin.to_numbers(item.samples[0], time_unit, what), item.samples[1])
-    own = {each.name: getattr(item, each.name) for each in fields(item)}
-    dated = {name: count_from(value, origin, time_unit, what) for name, value in own.items() if has_dates(value)}
-    return replace(item, **dated)
+    own = {each.name: count_from(getattr(item, each.name), origin, time_unit, what) for each in fields(item)}
+    return replace(item, **own)
 
 
 def replace_samples(item: ReferenceSignal, times: FloatArray, values: FloatArray) -> ReferenceSignal:
