@@ -61,9 +61,6 @@ JITTED = type(jax.jit(lambda: None))
 FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, JITTED, type(jnp.add), jax.custom_jvp, jax.custom_vjp)
 """Types of a library's functions; instances of its classes may have state."""
 
-DEPTH = 60
-"""Depth of nesting above which a structure is not compared."""
-
 
 class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
     """A function reads something that cannot be compared by content."""
@@ -72,29 +69,27 @@ class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
 def read_contents(function: Any) -> Hashable | None:
     """Return everything that a function reads, by content; None if it is unknown and the function has to be traced."""
     try:
-        return _read(function, DEPTH)
-    except NotPlain:
+        return _read(function)
+    except (NotPlain, RecursionError):  # of what contains itself
         return None
 
 
-def _read(value: Any, depth: int) -> Hashable:
-    if depth == 0:
-        raise NotPlain
+def _read(value: Any) -> Hashable:
     kind = type(value)
     if kind in NUMBERS:
         return kind, repr(value) if kind in (float, complex) else value  # -0.0 is not 0.0, nan is nan
     if kind is np.ndarray or isinstance(value, (np.generic, jax.Array)):
         return _read_array(value)
     if kind in (tuple, list):
-        return kind, tuple([_read(entry, depth - 1) for entry in value])
+        return kind, tuple(map(_read, value))
     if kind in (dict, types.MappingProxyType):
-        return dict, _read(list(value.items()), depth - 1)
+        return dict, _read(list(value.items()))
     if kind is functools.partial:
-        return kind, _read((value.func, value.args, value.keywords), depth - 1)
+        return kind, _read((value.func, value.args, value.keywords))
     if _is_trusted(value):
         return kind, id(value), value  # which is kept alive
     if kind is types.FunctionType and not vars(value):
-        return _read_function(value, depth)
+        return _read_function(value)
     raise NotPlain  # also a jitted function: JAX caches a trace of its own, which the caller has to invalidate
 
 
@@ -107,7 +102,7 @@ def _read_array(value: Any) -> Hashable:
     return "array", isinstance(value, jax.Array), weak, str(array.dtype), array.shape, digest
 
 
-def _read_function(function: types.FunctionType, depth: int) -> Hashable:
+def _read_function(function: types.FunctionType) -> Hashable:
     names, scope = _list_globals(function.__code__), function.__globals__
     if names is None:
         raise NotPlain
@@ -121,7 +116,7 @@ def _read_function(function: types.FunctionType, depth: int) -> Hashable:
             found[name] = scope[name]
         elif name in OPAQUE_BUILTINS or not hasattr(builtins, name):
             raise NotPlain
-    return function.__code__, _read((function.__defaults__, function.__kwdefaults__, cells, found), depth - 1)
+    return function.__code__, _read((function.__defaults__, function.__kwdefaults__, cells, found))
 
 
 def _is_trusted(value: Any) -> bool:
