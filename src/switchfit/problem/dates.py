@@ -1,6 +1,6 @@
 """Dates at the way in: what is given as dates becomes numbers of a time unit since an origin.
 
-Everything inside the library computes with float64 numbers. Dates are read here (`as_dates`), kept to the microsecond
+Everything inside the library computes with float64 numbers. Dates are read here (`read_dates`), kept to the microsecond
 until the experiment knows its origin and its unit, and then converted (`Origin.to_numbers`): the difference to the
 origin is exact before it is rounded once to float64, so that no digits go to the years since 1970. `Origin.to_dates` is
 the way back, for reports, figures and files.
@@ -355,7 +355,7 @@ def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     key = TIME_UNITS.get(as_name(unit, "unit"), "")
     if not key:
         raise ValueError(f"unit must be one of {', '.join(SECONDS)}; got {shorten(unit)}.")
-    micros = as_array(numbers, "numbers since 1970") * (SECONDS[key] / SECONDS["us"])
+    micros = as_array(numbers, "numbers since 1970") * (1e6 * SECONDS[key])
     first, last = (day.astype("datetime64[us]").astype(np.int64) for day in (FIRST, LAST))
     if not ((micros >= first) & (micros <= last)).all():
         raise ValueError(
@@ -440,7 +440,7 @@ class Origin:
 
     def find_date(self, time: float, time_unit: str) -> datetime.datetime | None:
         """Return a time as a date in the experiment's zone; None if it is not finite or beyond the years 1 to 9999."""
-        length = SECONDS[normalize_time_unit(time_unit)] / SECONDS["us"]
+        length = 1e6 * SECONDS[normalize_time_unit(time_unit)]
         try:
             moment: datetime.datetime = self.instant.item() + datetime.timedelta(microseconds=round(time * length))
             return moment if self.zone is None else moment.replace(tzinfo=datetime.UTC).astimezone(self.zone)

@@ -219,7 +219,7 @@ class Log:
         """
         if not self.offset:
             return None
-        length = SECONDS[self.time_unit or "s"] / SECONDS["us"]
+        length = 1e6 * SECONDS[self.time_unit or "s"]
         micros = round(self.offset * length) + np.rint(self.times * length).astype(np.int64)
         return Dates(micros.astype("datetime64[us]"), self.time_zone)
 
