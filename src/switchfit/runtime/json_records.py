@@ -18,7 +18,7 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -174,6 +174,8 @@ def _read(kind: Any, content: Any) -> Any:
 
 def _read_either(kinds: tuple[Any, ...], content: Any) -> Any:
     """Return the content as the first of several types that it can be."""
+    if content is None and NoneType in kinds:
+        return None
     for kind in kinds:
         with suppress(Exception):
             return _read(kind, content)
