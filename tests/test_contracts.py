@@ -272,27 +272,6 @@ def test_the_flags_for_xla_are_added_to_those_of_the_user(given, expected, monke
     assert os.environ["XLA_FLAGS"] == expected
 
 
-# Sums over experiments
-
-
-def test_experiments_with_shared_parameters_add_up(compiled):
-    """J and the derivatives in the parameters are sums, those in transition times each run's own."""
-    singles = [oscillator(tau=1.1), oscillator(tau=0.8, samples=11, seed=3)]
-    runs = [single.experiments[0] for single in singles]
-    both = sf.Problem(OSCILLATOR, runs, {"k": 2.0, "damping": 0.3}, **TOLERANCES)
-    assert both.theta_names == ("run1.tau_1", "run2.tau_1", "k", "damping")
-    together, parts = sf.evaluate(both), [sf.evaluate(single) for single in singles]
-    g, H = np.zeros(4), np.zeros((4, 4))
-    for e, part in enumerate(parts):
-        place = [e, 2, 3]
-        g[place] += part.gradient
-        H[np.ix_(place, place)] += part.hessian
-    assert together.cost == pytest.approx(parts[0].cost + parts[1].cost, rel=1e-14)
-    np.testing.assert_allclose(together.gradient, g, rtol=1e-13)
-    np.testing.assert_allclose(together.hessian, H, rtol=1e-13)
-    assert H[0, 1] == 0.0
-
-
 # Documentation
 
 
