@@ -1,15 +1,12 @@
-"""What holds whatever the problem: what compiles when, float64 throughout, no traces in JAX's configuration, docs."""
+"""What holds whatever the problem: what compiles when, float64 throughout, no traces in JAX's configuration."""
 
 import gc
-import inspect
 import json
 import os
-import re
 import subprocess
 import sys
 import weakref
 from collections import OrderedDict
-from enum import EnumType
 
 import jax
 import jax.numpy as jnp
@@ -270,21 +267,6 @@ def test_the_flags_for_xla_are_added_to_those_of_the_user(given, expected, monke
     monkeypatch.setenv("XLA_FLAGS", given)
     compile_small_loops_whole()
     assert os.environ["XLA_FLAGS"] == expected
-
-
-# Documentation
-
-
-@pytest.mark.parametrize("name", [name for name in sf.__all__ if not isinstance(getattr(sf, name), EnumType)])
-def test_docstrings_name_only_what_is_there(name):
-    """What is missing in them, `test_repo.py` finds."""
-    thing = getattr(sf, name)
-    title = r"^(?:Parameters|Attributes)\n-+\n"
-    sections = re.findall(title + r"(.*?)(?=\n\n\S[^\n]*\n---|\Z)", inspect.getdoc(thing), re.MULTILINE | re.DOTALL)
-    lines = re.findall(r"^(\w+(?:, \w+)*)(?: :|$)", "\n".join(sections), re.MULTILINE)
-    documented = {each for line in lines for each in line.split(", ")}
-    assert documented
-    assert documented <= {*inspect.signature(thing).parameters, *dir(thing)}
 
 
 def test_a_problem_that_is_no_longer_used_is_freed(compiled):
