@@ -34,7 +34,6 @@ import reprlib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
 from dataclasses import is_dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -323,8 +322,12 @@ def _read_exactly(value: Any, what: str, missing: bool, depth: int = 0) -> Any:
             return _read_array_exactly(np.array(value), what, missing, depth)
         return [_read_exactly(entry, what, missing, depth + 1) for entry in value]
     if isinstance(value, (numbers.Real, Decimal)) and not isinstance(value, bool):
-        with suppress(Exception):
+        try:
             return float(value)
+        except OverflowError:
+            raise _WrongEntryError(value, ValueError, ", which is beyond the largest double, 1.8e308") from None
+        except Exception:
+            raise _WrongEntryError(value, TypeError, "") from None
     if isinstance(value, _DATES):
         raise _WrongEntryError(value, TypeError, NO_DATES)
     why = ": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else ""
