@@ -241,13 +241,8 @@ class Function:
 
 def _as_float64(value: Any) -> Any:
     """Return a value as a float64 array without weak type, which Python's numbers have, as the jaxpr requires."""
-    if (
-        isinstance(value, (np.ndarray, jax.Array))
-        and value.dtype == np.float64
-        and not getattr(value, "weak_type", False)
-    ):
-        return value
-    return jnp.asarray(value, jnp.float64)
+    is_double = getattr(value, "dtype", None) == np.float64 and not getattr(value, "weak_type", False)
+    return value if is_double else jnp.asarray(value, jnp.float64)
 
 
 _traces: dict[Any, Function] = {}
