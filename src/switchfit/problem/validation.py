@@ -42,6 +42,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.runtime.presentation import join_first
+
 LIBRARIES = frozenset({"pandas", "polars", "xarray", "switchfit"})
 
 
@@ -175,9 +177,7 @@ def shorten(value: Any) -> str:
 
 def join_names(names: Iterable[Any]) -> str:
     """Return names with commas between them, the first ten if there are more; 'none' for no names."""
-    every = list(names)
-    texts = ", ".join(f"{name!s:.40}" for name in every[:MOST_LISTED]) or "none"
-    return f"{texts}, ... ({len(every)} in all)" if len(every) > MOST_LISTED else texts
+    return join_first((f"{name!s:.40}" for name in names), MOST_LISTED) or "none"
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------
