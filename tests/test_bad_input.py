@@ -284,7 +284,7 @@ def test_wrong_types(build, said):
         (lambda: starting_at(lambda p: [p["k"] if p["k"] > 0 else 1.0]), ["initial_state branches on the value of t"]),
         (lambda: starting_at(lambda: [1.0]), ["is called as initial_state(p), but takes the arguments ()"]),
         (lambda: with_data(samples(observe=two)), ["observe: h(t, x, p)", "shape (1,); got shape (2,)"]),
-        (lambda: with_data(reference(observe=lambda t, x, p: [p["q"]])), ["observe reads the parameter 'q'"]),
+        (lambda: with_data(reference(observe=lambda t, x, p: [p["q"]])), ["observe reads 'q'"]),
         (lambda: with_data(sf.RunningCost(two)), ["RunningCost: ell(t, x, p)", "shape (); got shape (2,)"]),
         (lambda: with_data(sf.TerminalCost(grow)), ["TerminalCost is called as phi(x, p), but takes the arguments (t"]),
         # Where the guess cannot be integrated
@@ -318,7 +318,7 @@ def test_wrong_values(build, said):
         (lambda t, x, p: math.sin(x[0]) * x, ["branches on the value of t, x or p", "Write it with jax.numpy"]),
         (lambda t, x, p: np.array([x[0]]), ["branches on the value of t, x or p", "numpy function"]),
         (lambda t, x, p: np.arange(3.0)[t] * x, ["branches on the value of t, x or p"]),
-        (lambda t, x, p: p["q"] * x, ["reads the parameter 'q', which the problem lacks; it has k"]),
+        (lambda t, x, p: p["q"] * x, ["reads 'q', which is not there: p has k"]),
         (lambda t, x: x, ["is called as f(t, x, p), but takes the arguments (t, x)"]),
         (lambda t, x, p: x.velocity, ["f(t, x, p) raised AttributeError", "velocity"]),
         (lambda t, x, p: np.ones(3) + np.ones(2), ["f(t, x, p) raised ValueError: operands could not be broadcast"]),

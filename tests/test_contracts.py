@@ -1,15 +1,12 @@
-"""What holds whatever the problem: what compiles when, float64 throughout, no traces in JAX's configuration, docs."""
+"""What holds whatever the problem: what compiles when, float64 throughout, no traces in JAX's configuration."""
 
 import gc
-import inspect
 import json
 import os
-import re
 import subprocess
 import sys
 import weakref
 from collections import OrderedDict
-from enum import EnumType
 
 import jax
 import jax.numpy as jnp
@@ -270,80 +267,6 @@ def test_the_flags_for_xla_are_added_to_those_of_the_user(given, expected, monke
     monkeypatch.setenv("XLA_FLAGS", given)
     compile_small_loops_whole()
     assert os.environ["XLA_FLAGS"] == expected
-
-
-# Names, and sums over experiments
-
-
-def test_theta_in_its_order():
-    """Free transition times of the first experiment, of the second, then the parameters as given, entry by entry."""
-    system = sf.HybridSystem({"a": lambda t, x, p: x, "b": lambda t, x, p: -x}, [1.0])
-    cost = sf.TerminalCost(lambda x, p: x[0])
-
-    def run(times, **name):
-        return sf.Experiment(cost, ("a", "b", "a"), times, 0.0, 1.0, **name)
-
-    fixed, bounded = sf.Parameter(0.3, fixed=True), sf.Parameter(0.6, lower=0.5, upper=0.7, unit="ms")
-    problem = sf.Problem(
-        system,
-        [run((fixed, bounded), name="city", time_unit="ms"), run((0.2, 0.8))],
-        {
-            "z": 7.0,
-            "held": sf.Parameter([1.0, 2.0], fixed=True),
-            "A": sf.Parameter([[1.0, 2.0], [3.0, 4.0]], lower=[[0.0], [3.0]], unit="N"),
-            "b": [5.0, 6.0],
-        },
-    )
-    assert problem.theta_names == (
-        "city.tau_2", "run2.tau_1", "run2.tau_2", "z", "A[0,0]", "A[0,1]", "A[1,0]", "A[1,1]", "b[0]", "b[1]",
-    )  # fmt: skip
-    np.testing.assert_array_equal(problem.initial_theta, [0.6, 0.2, 0.8, 7.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    assert problem.unknowns.units == ("ms", "s", "s", "", "N", "N", "N", "N", "", "")
-    inf = np.inf
-    np.testing.assert_array_equal(problem.unknowns.lower, [0.5, -inf, -inf, -inf, 0.0, 0.0, 3.0, 3.0, -inf, -inf])
-    np.testing.assert_array_equal(problem.unknowns.upper, [0.7, *[inf] * 9])
-    theta = np.array([0.65, 0.1, 0.9, *range(7)])
-    times, parameters = problem.split(theta)
-    assert [tau.tolist() for tau in times] == [[0.3, 0.65], [0.1, 0.9]]
-    assert {name: value.tolist() for name, value in parameters.items()} == {
-        "z": 0.0, "held": [1.0, 2.0], "A": [[1.0, 2.0], [3.0, 4.0]], "b": [5.0, 6.0],
-    }  # fmt: skip
-    # Writing into what is handed out changes nothing.
-    problem.initial_theta[0] = -1.0
-    assert problem.initial_theta[0] == 0.6
-
-
-def test_experiments_with_shared_parameters_add_up(compiled):
-    """J and the derivatives in the parameters are sums, those in transition times each run's own."""
-    singles = [oscillator(tau=1.1), oscillator(tau=0.8, samples=11, seed=3)]
-    runs = [single.experiments[0] for single in singles]
-    both = sf.Problem(OSCILLATOR, runs, {"k": 2.0, "damping": 0.3}, **TOLERANCES)
-    assert both.theta_names == ("run1.tau_1", "run2.tau_1", "k", "damping")
-    together, parts = sf.evaluate(both), [sf.evaluate(single) for single in singles]
-    g, H = np.zeros(4), np.zeros((4, 4))
-    for e, part in enumerate(parts):
-        place = [e, 2, 3]
-        g[place] += part.gradient
-        H[np.ix_(place, place)] += part.hessian
-    assert together.cost == pytest.approx(parts[0].cost + parts[1].cost, rel=1e-14)
-    np.testing.assert_allclose(together.gradient, g, rtol=1e-13)
-    np.testing.assert_allclose(together.hessian, H, rtol=1e-13)
-    assert H[0, 1] == 0.0
-
-
-# Documentation
-
-
-@pytest.mark.parametrize("name", [name for name in sf.__all__ if not isinstance(getattr(sf, name), EnumType)])
-def test_docstrings_name_only_what_is_there(name):
-    """What is missing in them, `test_repo.py` finds."""
-    thing = getattr(sf, name)
-    title = r"^(?:Parameters|Attributes)\n-+\n"
-    sections = re.findall(title + r"(.*?)(?=\n\n\S[^\n]*\n---|\Z)", inspect.getdoc(thing), re.MULTILINE | re.DOTALL)
-    lines = re.findall(r"^(\w+(?:, \w+)*)(?: :|$)", "\n".join(sections), re.MULTILINE)
-    documented = {each for line in lines for each in line.split(", ")}
-    assert documented
-    assert documented <= {*inspect.signature(thing).parameters, *dir(thing)}
 
 
 def test_a_problem_that_is_no_longer_used_is_freed(compiled):

@@ -26,7 +26,7 @@ from switchfit.cli import app
 from switchfit.io.command_line import summarize_estimate
 from switchfit.io.problem_file import load_problem
 from switchfit.io.result_tables import write_runs, write_unknowns
-from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, from_epoch, make_origin
+from switchfit.problem.dates import SECONDS, Dates, Origin, from_epoch, make_origin, read_dates
 from switchfit.report.axes import DateLocator
 from switchfit.report.formats import add_dates, format_date, format_time
 from switchfit.runtime.errors import InputError
@@ -41,6 +41,7 @@ DAYS = ["2020-03-28", "2020-03-29", "2020-03-30", "2020-03-31"]
 VALUES = [1.0, 2.0, 1.5, 1.0]
 ROOM = sf.HybridSystem({"on": charge, "off": decay}, [0.0])
 DATED = sf.Parameter("2020-03-29")
+EPOCH, BARE = (make_origin(np.datetime64(0, "us"), zone) for zone in ("UTC", ""))
 
 
 def log(times, **more):
@@ -113,16 +114,17 @@ def test_numbers_are_numbers_as_ever():
     assert run_of([1.7e12, 1.8e12, 1.9e12]).origin is None, "never told by their size"
 
 
-def test_nanoseconds_are_kept():
-    """As numbers since 1970, all of these would be one float64."""
-    instants = np.datetime64("2024-05-01T12:00:00", "ns") + np.array([0, 1, 2, 500])
-    run = sf.Experiment(log(instants), ("on",), (), time_unit="ns")
+def test_dates_are_exact_to_the_microsecond():
+    """As seconds since 1970, some of these would be one float64; what is finer is cut off, and no year overflows."""
+    instants = np.datetime64("2024-05-01T12:00:00", "us") + np.array([0, 1, 2, 500])
+    run = sf.Experiment(log(instants), ("on",), (), time_unit="us")
     np.testing.assert_array_equal(run.data[0].times, [0.0, 1.0, 2.0, 500.0])
-    text = ["2024-05-01T12:00:00.000000001", "2024-05-01T12:00:00.0000005"]
-    np.testing.assert_array_equal(as_dates(text, "times").instants, instants.astype(np.int64)[[1, 3]])
-    np.testing.assert_array_equal(
-        as_dates(list(pd.DatetimeIndex(instants)), "times").instants, instants.astype(np.int64)
-    )
+    finer = instants.astype("datetime64[ns]") + np.array([0, 1, 999, 500])
+    for dates in (finer, list(pd.DatetimeIndex(finer)), finer.astype(str)):
+        np.testing.assert_array_equal(read_dates(dates, "times").instants, instants)
+    far = log(np.array(["0001-01-01", "1850-01-01", "9999-12-31"], dtype="datetime64[D]"))
+    days = [dt.date(1850, 1, 1).toordinal() - 1, dt.date.max.toordinal() - 1]
+    np.testing.assert_array_equal(sf.Experiment(far, ("on",), (), time_unit="d").data[0].times, [0, *days])
 
 
 # --- round trips ------------------------------------------------------------------------------------------------------
@@ -131,25 +133,29 @@ MICROSECONDS = st.integers(-6 * 10**15, 8 * 10**15)
 ZONES = st.sampled_from(["UTC", "Europe/Berlin", "Asia/Kathmandu", "America/St_Johns", "Australia/Lord_Howe", "-03:30"])
 
 
+def make_instant(micros):
+    return np.datetime64(micros, "us")
+
+
 @settings(max_examples=30)
-@given(MICROSECONDS, MICROSECONDS, ZONES, st.sampled_from(list(NANOSECONDS)))
+@given(MICROSECONDS, MICROSECONDS, ZONES, st.sampled_from(list(SECONDS)))
 def test_a_number_is_the_exact_difference_rounded_once(start, instant, zone, unit):
-    origin = make_origin(1000 * start, zone)
-    assert origin.instant == 1000 * start
+    origin = make_origin(make_instant(start), zone)
+    assert origin.instant == make_instant(start)
     assert Origin(origin.date, origin.time_zone) == origin
-    number = origin.to_numbers(Dates(np.array(1000 * instant), "UTC"), unit)
-    exact = Fraction(1000 * (instant - start), NANOSECONDS[unit])
+    number = origin.to_numbers(Dates(np.array(make_instant(instant)), "UTC"), unit)
+    exact = Fraction(instant - start) / Fraction(round(1e9 * SECONDS[unit]), 1000)
     assert abs(Fraction(float(number)) - exact) <= abs(exact) * Fraction(2, 2**53)
 
 
 @given(st.integers(-4 * 10**15, 4 * 10**15), st.integers(-(10**9), 10**9), ZONES)
 def test_dates_come_back(start, seconds, zone):
-    origin = make_origin(1000 * start, zone)
+    origin = make_origin(make_instant(start), zone)
     (date,) = origin.to_dates([seconds], "s")
     moment = dt.datetime(1970, 1, 1, tzinfo=dt.UTC) + dt.timedelta(microseconds=start + 10**6 * seconds)
     assert date == moment
     assert date.utcoffset() == moment.astimezone(origin.zone).utcoffset()
-    assert origin.to_numbers(as_dates(date, "date"), "s") == seconds
+    assert origin.to_numbers(read_dates(date, "date"), "s") == seconds
 
 
 @given(
@@ -157,7 +163,7 @@ def test_dates_come_back(start, seconds, zone):
     st.sampled_from(["Europe/Berlin", "America/New_York"]),
 )
 def test_wall_clocks_agree_with_pandas(reading, zone):
-    given = as_dates(reading, "times")
+    given = read_dates(reading, "times")
     try:
         expected = pd.Timestamp(reading).tz_localize(zone)
     except ValueError:
@@ -165,16 +171,16 @@ def test_wall_clocks_agree_with_pandas(reading, zone):
             given.localize(zone, "times")
     else:
         found = given.localize(zone, "times")
-        assert int(found.instants) == expected.as_unit("ns").value
-        assert make_origin(int(found.instants), zone).zone == ZoneInfo(zone)
+        assert found.instants == expected.tz_convert("UTC").tz_localize(None)
+        assert make_origin(found.instants, zone).zone == ZoneInfo(zone)
 
 
-@given(st.lists(st.integers(0, 4 * 10**12), min_size=1, max_size=20), st.sampled_from(["ms", "us", "ns"]))
+@given(st.lists(st.integers(0, 4 * 10**12), min_size=1, max_size=20), st.sampled_from(["ms", "us"]))
 def test_numbers_since_1970_agree_with_pandas(numbers, unit):
-    expected = pd.to_datetime(numbers, unit=unit, utc=True).as_unit("ns").asi8
-    np.testing.assert_array_equal(from_epoch(numbers, unit).instants, expected)
-    np.testing.assert_array_equal(from_epoch(np.array(numbers, dtype=float), unit).instants, expected)
-    assert int(from_epoch(1585000800.25).instants) == 1585000800250000000
+    expected = pd.to_datetime(numbers, unit=unit, utc=True).as_unit("us").asi8
+    np.testing.assert_array_equal(from_epoch(numbers, unit).instants.astype(np.int64), expected)
+    np.testing.assert_array_equal(from_epoch(np.array(numbers, dtype=float), unit).instants.astype(np.int64), expected)
+    assert from_epoch(1585000800.25).instants == from_epoch(1585000800250000000, "ns").instants
 
 
 # --- zones ------------------------------------------------------------------------------------------------------------
@@ -210,9 +216,7 @@ def test_the_origin_is_the_first_sample_or_t0_or_what_is_stated():
 
 
 def test_guesses_bounds_and_priors_are_dates():
-    tau = sf.Parameter(
-        "2020-03-29T12:00Z", lower="2020-03-29", upper="2020-03-30", prior=sf.Normal("2020-03-29 10:00Z", 2.0)
-    )
+    tau = sf.Parameter("2020-03-29T12:00Z", lower="2020-03-29", upper=47.0, prior=sf.Normal("2020-03-29 10:00Z", 2.0))
     end = sf.Parameter("2020-03-31", lower="2020-03-31", upper="2020-04-02")
     run = sf.Experiment(log(DAYS), ("on", "off"), [tau], tf=end, time_unit="h", time_zone="Europe/Berlin")
     (found, tf) = run.times
@@ -249,8 +253,11 @@ def test_signals_and_inputs():
         (lambda: log(pd.DatetimeIndex(["2020", None])), ValueError, "must not be missing; the date at index 1"),
         (lambda: log(["2020-03-28", "2020-03-29T00:00Z"]), ValueError, "has dates with a time zone and dates"),
         (lambda: log(DAYS[::-1]), ValueError, "must increase strictly; got 2020-03-31T00:00:00 followed by 2020-03-30"),
-        (lambda: log(["1500-01-01", "1500-01-02"]), ValueError, "must lie between 1678-01-01 and 2262-01-01; got"),
-        (lambda: log(np.array(["1500-01-01"], dtype="datetime64[D]")), ValueError, "must lie between 1678-01-01 and"),
+        (
+            lambda: log(np.array(["12000-01-01"], dtype="datetime64[D]")),
+            ValueError,
+            "must lie in the years 1 to 9999; got",
+        ),
         (lambda: log(pd.to_timedelta([0, 1], "h")), TypeError, "dates and time differences are not supported"),
         (lambda: run_of(DAYS, t0="2020-03-28T00Z"), ValueError, "t0 has a time zone .*, but times of .*time_zone="),
         (lambda: in_berlin("2020-03-29 02:30"), ValueError, "times of Measurements: 2020-03-29 02:30 is skipped as"),
@@ -261,22 +268,36 @@ def test_signals_and_inputs():
         (lambda: run_of(DAYS, origin=3.0), TypeError, "origin must be a date, such as .*; got 3.0"),
         (lambda: run_of(DAYS, origin=DAYS), ValueError, "origin must be one date; got 4 dates from"),
         (lambda: run_of([0.0, 1.0], time_zone="UTC"), ValueError, "time_zone is 'UTC', but no time is a date: give"),
-        (lambda: run_of([0.0, 9.0], ["2020-03-29"]), ValueError, "a transition time is a date, but the Measurements"),
+        (
+            lambda: run_of([0.0, 9.0], ["2020-03-29"]),
+            ValueError,
+            "a transition time is a date, but not all times of the",
+        ),
         (lambda: sf.Experiment([log(DAYS), log([0.0, 1.0])], ("on",), ()), ValueError, "times of Measurements is a"),
         (lambda: run_of(DAYS, ["2020-04-02"]), ValueError, r"inside .t0, tf. = .2020-03-28 00:00:00, 2020-03-31"),
         (lambda: run_of(DAYS, tf="2020-03-30"), ValueError, "= .2020-03-28 .*; 1 of 4 do not, the first is 2020-03-31"),
         (lambda: sf.Parameter("soon"), ValueError, "Parameter value must be a number or a date; got 'soon'"),
         (lambda: sf.Parameter(DAYS), ValueError, "Parameter value must be one date"),
-        (lambda: sf.Parameter("2020-03-29", lower=3.0), ValueError, "Parameter lower is a number, and its value a"),
-        (lambda: sf.Parameter("2020-03-29", prior=sf.Normal(3.0, 1.0)), ValueError, "prior: its mean is a number, and"),
-        (lambda: sf.Parameter("2020-03-29", lower="2020-03-30"), ValueError, "outside its bounds .'2020-03-30', inf"),
+        (
+            lambda: run_of(DAYS, [sf.Parameter("2020-03-29", lower="2020-03-30")]),
+            ValueError,
+            "24.0.* outside its bounds",
+        ),
         (lambda: run_of(DAYS, initial_state=[DATED]), ValueError, "must be a number; got the"),
         (lambda: sf.Problem(ROOM, run_of(DAYS), {"k": DATED}), ValueError, "'k' must be a number; got the date 20"),
-        (lambda: from_epoch([1e30]), ValueError, "numbers since 1970 in s must be finite, and lie between"),
+        (lambda: from_epoch([1e30]), ValueError, "numbers since 1970 in s must be finite, and lie in the"),
         (lambda: from_epoch([1.0], "weeks"), ValueError, "unit must be one of ns, us"),
         (lambda: from_epoch(["2020"]), ValueError, "numbers since 1970 must be"),
-        (lambda: make_origin(0, "UTC").to_dates([np.nan], "s"), ValueError, "nan s since 1970-01-01T00:00:00.00:00 is"),
-        (lambda: make_origin(0, "").to_numbers(as_dates("2020-01-01T00Z", "t"), "s"), ValueError, "has a time"),
+        (
+            lambda: EPOCH.to_dates([np.nan], "s"),
+            ValueError,
+            "nan s since 1970-01-01T00:00:00.00:00 is",
+        ),
+        (
+            lambda: BARE.to_numbers(read_dates("2020-01-01T00Z", "t"), "s"),
+            ValueError,
+            "has a time",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(call, error, message):
@@ -449,21 +470,12 @@ def test_profiles_residuals_and_many_fits_show_dates(fits):
     assert study.plot().axes[0].get_xlabel() == "tau_1 (Europe/Berlin)"
 
 
-def test_many_logs_with_origins_of_their_own_are_not_shown_as_dates():
+def test_many_logs_with_origins_of_their_own_are_not_shown_read_dates():
     same = sf.estimate_many([room(dated=True), room(dated=True)])
     assert same.date_origins[0].time_zone == "Europe/Berlin"
     other = sf.estimate_many([room(dated=True), room(dated=True, origin="2020-03-19")])
     assert other.date_origins == (None, None)
     np.testing.assert_allclose(other.theta[1, 0] - other.theta[0, 0], 1.0, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_the_page_shows_dates(fits, tmp_path):
-    dated, _ = fits
-    dated.save_report(tmp_path / "report.html")
-    text = (tmp_path / "report.html").read_text()
-    assert "2020-03-20 to 2020-03-29" in text
-    assert "CustomJSTicker" in text
 
 
 @pytest.mark.slow
@@ -478,7 +490,7 @@ def test_the_browser_agrees_with_zoneinfo(fits, tmp_path):
             "[...document.querySelectorAll('[data-slider=\"0\"] output')].map((o) => o.textContent)"
         )
         assert shown == format_date(dated.transition_dates[0][0], 600)
-        start = dated.trajectory.origin.instant / 1e6
+        start = dated.trajectory.origin.instant.astype(int) / 1e3
         for low, high in ((0, 19), (8.5, 10), (9, 9.01), (0, 900), (-3000, 3000)):
             ticks = browser.evaluate(f"switchfitDates.findTicks({low}, {high}, {start}, 864e5, 'Europe/Berlin')")
             assert 3 <= len(ticks) <= 10
@@ -548,7 +560,7 @@ def test_a_log_hands_over_its_dates(cells, zone, first, tmp_path):
     found = sf.read_log(tmp_path / "a.csv", time_unit="h")
     assert found.dates.time_zone == found.time_zone == zone
     assert repr(found.dates[0]) == first
-    assert (found.dates.instants[1] - found.dates.instants[0]) / NANOSECONDS["h"] == pytest.approx(12.0)
+    assert (found.dates.instants[1] - found.dates.instants[0]) / np.timedelta64(1, "h") == pytest.approx(12.0)
     run = sf.Experiment(sf.Measurements(found.dates, found[["x"]]), ("on",), (), time_unit="h")
     np.testing.assert_allclose(run.data[0].times, found.times, atol=1e-9)
 
@@ -671,16 +683,3 @@ def test_the_command_line(tmp_path):
     assert row["tau_1 (date)"].startswith("2020-03-2")
     off = dt.datetime.fromisoformat(row["tau_1 (date)"]) - dt.datetime(2020, 3, 22, 6, tzinfo=dt.UTC)
     assert abs(off) < 3 * dt.timedelta(days=float(row["tau_1 (d) std. error"]))
-
-
-def test_dates_of_more_than_292_years_are_counted_exactly():
-    """Their difference in nanoseconds is beyond 64 bits."""
-    years = np.array(["1700-01-01", "1850-01-01", "2020-01-01"], dtype="datetime64[D]")
-    days = (years - years[0]) / np.timedelta64(1, "D")
-    run = sf.Experiment(sf.Measurements(years, [5.0, 66.0, 9.0], sigma=1.0), ("on",), (), time_unit="d")
-    np.testing.assert_array_equal(run.data[0].times, days)
-    assert (run.t0, run.tf) == (0.0, days[-1])
-    late = sf.Measurements(years[2:], [9.0], sigma=1.0)
-    late = sf.Experiment(late, ("on",), (), t0="1700-01-01", time_unit="d")
-    np.testing.assert_array_equal(late.data[0].times, days[2:])
-    assert late.origin.to_dates(late.data[0].times, "d") == [dt.datetime(2020, 1, 1)]

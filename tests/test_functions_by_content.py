@@ -143,47 +143,6 @@ def test_constants_are_copied_when_a_problem_is_built(shape):
     assert sf.evaluate(built).cost == pytest.approx(expected, rel=1e-12)
 
 
-OTHER = {"g": 1.0}
-
-
-@pytest.mark.parametrize(
-    "place",
-    ["observe", "reset", "guard", "running", "terminal", "constraint", "initial state", "reference"],
-)
-def test_every_kind_of_function_is_seen_anew(place):
-    def scaled(value):
-        return OTHER["g"] * value
-
-    system = sf.HybridSystem(
-        {"a": lambda t, x, p: -p["a"] * x, "b": lambda t, x, p: -0.5 * x},
-        (lambda p: scaled(jnp.ones(1))) if place == "initial state" else [1.0],
-        reset_maps={("a", "b"): lambda t, x, p: scaled(x)} if place == "reset" else {},
-        guards={("a", "b"): lambda t, x, p: scaled(x[0]) - 0.7} if place == "guard" else {},
-    )
-    times = np.linspace(0.0, 1.0, 9)
-    seen = (lambda t, x, p: scaled(x)) if place in ("observe", "reference") else None
-    values, square = np.exp(-times), lambda x: scaled(x[0] ** 2)
-    data = [
-        sf.Measurements(times, values, observe=seen if place == "observe" else None, sigma=0.1),
-        *([sf.RunningCost(lambda t, x, p: square(x))] if place == "running" else []),
-        *([sf.ReferenceSignal.from_samples(times, values, observe=seen)] if place == "reference" else []),
-        *([sf.TerminalCost(lambda x, p: square(x))] if place == "terminal" else []),
-        *([sf.TerminalConstraint(lambda x, p: scaled(x[0]) - 0.5)] if place == "constraint" else []),
-    ]
-
-    def structures():
-        run = sf.Experiment(data, ("a", "b"), (0.4,), 0.0, 1.0)
-        return sf.Problem(system, run, {"a": 0.8}).structures
-
-    OTHER["g"] = 1.0
-    before = structures()
-    OTHER["g"] = 1.1
-    after = structures()
-    OTHER["g"] = 1.0
-    assert before != after
-    assert before == structures()
-
-
 def test_a_rule_for_derivatives_that_has_changed_is_another_function():
     slope = [1.0]
 

@@ -17,15 +17,14 @@ EXACT = jnp.array([0.5, 2.0])
 TIMES = np.linspace(0.0, 1.0, 9)
 
 
-def problem_of(mode=None, initial_state=(1.0,), data=None, reset=None, guard=None, inputs=None):
+def problem_of(mode=None, initial_state=(1.0,), data=None, reset=None):
     system = sf.HybridSystem(
         {"on": mode or (lambda t, x, p: -p["a"] * x), "off": lambda t, x, p: -0.5 * x},
         initial_state,
         reset_maps={} if reset is None else {("on", "off"): reset},
-        guards={} if guard is None else {("on", "off"): guard},
     )
     data = data or sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
-    return sf.Problem(system, sf.Experiment(data, ("on", "off"), (0.4,), 0.0, 1.0, inputs=inputs), {"a": 0.8})
+    return sf.Problem(system, sf.Experiment(data, ("on", "off"), (0.4,), 0.0, 1.0), {"a": 0.8})
 
 
 class Body:
@@ -61,12 +60,8 @@ WITH_LINE = r"a constant of mode 'on' \(test_precision.py:\d+\) must be in doubl
         ({"mode": by_default}, "a constant of mode 'on'"),
         ({"mode": lambda t, x, p: -jnp.float32(0.3) * x}, "a constant of mode 'on'.*0.3 became"),
         ({"reset": scaled}, r"a constant of reset map \('on', 'off'\)"),
-        ({"guard": lambda t, x, p: x[0] - K}, r"a constant of guard \('on', 'off'\)"),
         ({"initial_state": lambda p: jnp.ones(1) * K}, "a constant of initial_state"),
-        ({"data": sf.RunningCost(lambda t, x, p: K * x[0])}, "a constant of RunningCost"),
-        ({"data": sf.TerminalCost(lambda x, p: K * x[0])}, "a constant of TerminalCost"),
         ({"data": ENDING}, "a constant of TerminalConstraint"),
-        ({"data": sf.Measurements(TIMES, TIMES, observe=scaled, sigma=1.0)}, "a constant of observe"),
         ({"data": sf.ReferenceSignal.from_samples(TIMES, TIMES, observe=scaled)}, "a constant of observe"),
     ],
 )

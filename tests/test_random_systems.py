@@ -395,14 +395,12 @@ class System:
 
         def take(parameter: sf.Parameter) -> int:
             nonlocal count
-            entries = parameter.entries()
-            for k, entry in enumerate(entries):
-                if isinstance(entry.prior, sf.LogNormal):
-                    priors.append((count + k, "log-normal", float(entry.prior.median), float(entry.prior.log_sd)))
-                elif entry.prior is not None:
-                    priors.append((count + k, "normal", float(entry.prior.mean), float(entry.prior.sd)))
-            count += len(entries)
-            return count - len(entries)
+            if parameter.prior is not None:
+                kind = "log-normal" if isinstance(parameter.prior, sf.LogNormal) else "normal"
+                each = [np.broadcast_to(given, parameter.shape).ravel() for given in vars(parameter.prior).values()]
+                priors.extend((count + k, kind, *map(float, own)) for k, own in enumerate(zip(*each, strict=True)))
+            count += parameter.value.size
+            return count - parameter.value.size
 
         times = [[float(tau.value) if tau.fixed else take(tau) for tau in run.times] for run in self.runs]
         parameters = {

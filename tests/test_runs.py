@@ -73,26 +73,50 @@ def mixed(**settings):
 
 
 def test_theta_in_its_order():
-    problem = mixed()
-    assert problem.theta_names == (
-        "run1.tau_1", "second.tau_1", "run3.tau_1", "run3.tau_2",
-        "k[0]", "k[1]", "b", "k_2[0]", "k_2[1]", "b_2",
-        "run1.q(t0)", "second.q(t0)", "second.v(t0)",
-    )  # fmt: skip
-    assert problem.unknowns.units == ("s",) * 4 + ("",) * 6 + ("m", "m", "mm/s")
-    np.testing.assert_array_equal(
-        problem.initial_theta, [0.63, 0.63, 0.57, 1.31, 0.8, 0.5, 1.2, 0.7, 0.6, 1.1, 0.75, 0.75, 0.85]
+    """Free times of the first experiment, of the second, parameters as given, entry by entry, states of each run."""
+    system = sf.HybridSystem({"a": lambda t, x, p: x, "b": lambda t, x, p: -x}, [1.0, 2.0], state_units=("m", "m/s"))
+    cost = sf.TerminalCost(lambda x, p: x[0])
+
+    def start(times, **given):
+        return sf.Experiment(cost, ("a", "b", "a"), times, 0.0, 1.0, **given)
+
+    fixed, bounded = sf.Parameter(0.3, fixed=True), sf.Parameter(0.6, lower=0.5, upper=0.7, unit="ms")
+    unknown = [sf.Parameter(0.75, lower=0.0), sf.Parameter(0.85, upper=4.0, unit="mm/s")]
+    problem = sf.Problem(
+        system,
+        [
+            start((fixed, bounded), name="city", time_unit="ms", initial_state=unknown),
+            start((0.2, 0.8), initial_state=[unknown[0], 2.0]),
+        ],
+        {
+            "z": 7.0,
+            "held": sf.Parameter([1.0, 2.0], fixed=True),
+            "A": sf.Parameter([[1.0, 2.0], [3.0, 4.0]], lower=[[0.0], [3.0]], unit="N"),
+        },
     )
-    np.testing.assert_array_equal(problem.unknowns.lower[10:], [0.0, 0.0, -2.0])
-    np.testing.assert_array_equal(problem.unknowns.upper[10:], [3.0, 3.0, 4.0])
+    assert problem.theta_names == (
+        "city.tau_2", "run2.tau_1", "run2.tau_2", "z", "A[0,0]", "A[0,1]", "A[1,0]", "A[1,1]",
+        "city.x1(t0)", "city.x2(t0)", "run2.x1(t0)",
+    )  # fmt: skip
+    initial = [0.6, 0.2, 0.8, 7.0, 1.0, 2.0, 3.0, 4.0, 0.75, 0.85, 0.75]
+    np.testing.assert_array_equal(problem.initial_theta, initial)
+    assert problem.unknowns.units == ("ms", "s", "s", "", "N", "N", "N", "N", "m", "mm/s", "m")
+    inf = np.inf
+    lower, upper = [0.5, -inf, -inf, -inf, 0.0, 0.0, 3.0, 3.0, 0.0, -inf, 0.0], [0.7, *[inf] * 8, 4.0, inf]
+    np.testing.assert_array_equal([problem.unknowns.lower, problem.unknowns.upper], [lower, upper])
+    times, parameters = problem.split(np.array([0.65, 0.1, 0.9, *range(8)]))
+    assert [tau.tolist() for tau in times] == [[0.3, 0.65], [0.1, 0.9]]
+    found = {name: value.tolist() for name, value in parameters.items()}
+    assert found == {"z": 0.0, "held": [1.0, 2.0], "A": [[1.0, 2.0], [3.0, 4.0]]}
+    problem.initial_theta[0] = -1.0  # what is handed out is a copy
+    assert problem.initial_theta[0] == 0.6
 
 
-def test_one_experiment_needs_no_prefix_and_states_need_no_names():
+def test_one_experiment_needs_no_prefix_and_an_unknown_state_of_the_system_is_each_runs_own():
     system = sf.HybridSystem({"m": lambda t, x, p: -x}, [1.0, sf.Parameter(2.0), sf.Parameter(3.0, fixed=True)])
     one = sf.Experiment(sf.TerminalCost(lambda x, p: x @ x), ("m",), (), 0.0, 1.0)
     assert sf.Problem(system, one).theta_names == ("x2(t0)",)
-    both = sf.Problem(system, [one, one])
-    assert both.theta_names == ("run1.x2(t0)", "run2.x2(t0)")  # those of the system too are each run's own
+    assert sf.Problem(system, [one, one]).theta_names == ("run1.x2(t0)", "run2.x2(t0)")
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -126,11 +150,9 @@ def test_a_run_is_differentiated_in_what_its_functions_ask_for():
     assert sf.evaluate(unused).gradient[-1] == 0.0
 
 
-@pytest.mark.parametrize(
-    "whole", [lambda p: sum(p.values()), lambda p: jax.jit(lambda q: q["a"] + q["b"])(p), lambda p: {**p}["a"] + p["b"]]
-)
-def test_a_function_that_takes_p_as_a_whole_sees_what_is_its_own(whole):
-    """Not the parameters of other runs, which their maps name."""
+@pytest.mark.parametrize("whole", [lambda p: jax.jit(lambda q: q["a"] + q["b"])(p), lambda p: {**p}["a"] + p["b"]])
+def test_a_function_may_take_p_as_a_whole(whole):
+    """What it does not read is not a parameter of the run."""
     system = sf.HybridSystem({"m": lambda t, x, p: -whole(p) * x}, [1.0])
     runs = [
         sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("m",), (), 0.0, 1.0, parameter_map={"b": name})
@@ -154,11 +176,11 @@ WRONG = {
     "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'": lambda: pose(
         run(), run(parameter_map={"k": "k_3"})
     ),
-    "the parameter 'b', which the problem lacks; it has k": lambda: pose(run(parameter_map={"k": "k_2"}), **UNEQUAL),
+    "reads 'b', which is not there: p has k": lambda: pose(run(parameter_map={"k": "k_2"}), **UNEQUAL),
     "mode 'swing': .* raised IndexError": lambda: pose(run(parameter_map={"k": "b"})),
     "must be a number or an sf.Parameter; got 'v'": lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
     r"got an entry of shape \(2,\)": lambda: run(initial_state=[sf.Parameter([1.0, 2.0]), 0.0]),
-    r"must have shape \(n,\), one entry for each": lambda: sf.HybridSystem({"swing": swing}, sf.Parameter(1.0)),
+    "must be an array of numbers, one for each state; got <Parameter>": lambda: run(initial_state=sf.Parameter([1.0])),
     "experiment 2 must have 2 entries, as the system's": lambda: pose(run(), run(initial_state=THREE)),
     "one entry for each of the 3 states": lambda: sf.HybridSystem({"swing": swing}, THREE, state_names=("q", "v")),
     r"share a name: q\(t0\)": lambda: pose(run(initial_state=[UNKNOWN[0], 0.9]), **GUESS | {"q(t0)": 1.0}),

@@ -320,8 +320,5 @@ def test_a_delay_is_a_time():
     sf.Problem(room(), run(30.0, late, time_unit="min"), RATES | {"late": sf.Parameter(0.5, **between, unit="min")})
     with pytest.raises(ValueError, match="the delay 'late' has the unit 's', but time_unit of its experiment is 'min'"):
         sf.Problem(room(), run(30.0, late, time_unit="min"), RATES | {"late": sf.Parameter(0.5, **between, unit="s")})
-    runs = [run(30.0, late, time_unit="min"), run(time_unit="s"), run(30.0, late, time_unit="h")]
-    with pytest.raises(ValueError, match=r"the delay 'late' is one number .* \(run1 in min, run3 in h\)"):
-        sf.Problem(room(), runs, RATES | {"late": sf.Parameter(0.5, **between)})
     own = [run(30.0, late, time_unit=u, parameter_map={"late": f"late_{u}"}) for u in ("min", "h")]
     sf.Problem(room(), own, RATES | {f"late_{u}": sf.Parameter(0.5, **between, unit=u) for u in ("min", "h")})

@@ -87,7 +87,6 @@ def test_no_number_of_single_precision_changes_in_silence(door, precision):
 
 @given(arrays(np.float32, st.integers(1, 20), elements=st.floats(width=32)))
 def test_single_precision_is_refused_if_and_only_if_a_shortest_text_is_another_double(values):
-    """The first, fast test of exactness may pass no number that the texts refuse."""
     finite = values[np.isfinite(values)]
     changes = any(float(str(value)) != float(value) for value in finite)
     if not changes:
@@ -102,7 +101,7 @@ def test_halves_pass_and_tenths_do_not(kind):
     exact = jnp.array([0.5, -3.0, 0.0, np.nan, np.inf], dtype=kind)
     np.testing.assert_array_equal(as_array(exact, "x"), [0.5, -3.0, 0.0, np.nan, np.inf])
     assert as_array(exact, "x").dtype == np.float64
-    with pytest.raises(ValueError, match=r"x must be in double precision: 0\.1 became 0\.\d+ \(\w*float\d+\)"):
+    with pytest.raises(ValueError, match=r"x must be in double precision: 0\.1\d* became 0\.\d+ \(\w*float\d+\)"):
         as_array(jnp.array([0.5, 0.1], dtype=kind), "x")
 
 
@@ -297,7 +296,7 @@ def test_what_messages_show_is_short(value):
 def test_lists_of_names_are_short():
     assert join_names(["a", "b"]) == "a, b"
     assert join_names([]) == "none"
-    assert join_names(str(k) for k in range(1000)).endswith("9, ... (1000 in all)")
+    assert join_names(str(k) for k in range(1000)).endswith("9 and 990 more")
     assert len(join_names(["x" * 1000])) == 40
 
 

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, count_from_instant, has_dates, is_dated
+from switchfit.problem.dates import FIRST, LENGTHS, Dates, Origin, has_dates, read_dates
 from switchfit.problem.signals import (
     PiecewisePolynomial,
     build_polynomial,
@@ -655,9 +655,8 @@ def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any
     what = what or f"times of {type(item).__name__}"
     if isinstance(item, ReferenceSignal) and item.samples is not None:
         return replace_samples(item, origin.to_numbers(item.samples[0], time_unit, what), item.samples[1])
-    own = {each.name: getattr(item, each.name) for each in fields(item)}
-    dated = {name: count_from(value, origin, time_unit, what) for name, value in own.items() if has_dates(value)}
-    return replace(item, **dated)
+    own = {each.name: count_from(getattr(item, each.name), origin, time_unit, what) for each in fields(item)}
+    return replace(item, **own)
 
 
 def replace_samples(item: ReferenceSignal, times: FloatArray, values: FloatArray) -> ReferenceSignal:
@@ -688,7 +687,7 @@ def _check_samples(
     With `breaks`, a time may occur twice; with `missing`, values may be NaN, and masked ones become NaN; without
     `columns`, the shape of the values must be (K,).
     """
-    dates = as_dates(times, f"{what} times") if is_dated(times) else None
+    dates = read_dates(times, f"{what} times")
     times = as_array(times, f"{what} times", form="an array of numbers") if dates is None else _count_seconds(dates)
     values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
     if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):
@@ -721,8 +720,8 @@ def _check_samples(
 
 def _count_seconds(dates: Dates) -> FloatArray:
     """Return the seconds since the first of dates."""
-    first = int(dates.instants.min()) if dates.instants.size else 0
-    return np.asarray(count_from_instant(dates.instants, first, NANOSECONDS["s"]))
+    first = dates.instants.min() if dates.instants.size else FIRST
+    return np.asarray((dates.instants - first) / LENGTHS["s"])
 
 
 def _check_observe(observe: Any) -> None:

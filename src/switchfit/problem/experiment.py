@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
-from switchfit.problem.dates import Dates, Given, as_date, as_dates, choose_origin, has_dates, is_dated, list_dates
+from switchfit.problem.dates import Given, choose_origin, has_dates, list_dates, read_date, read_dates
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, unit_suffix
 from switchfit.problem.signals import PiecewisePolynomial
@@ -86,7 +86,7 @@ class Jump:
 
     def __post_init__(self) -> None:
         as_callable(self.map, "Jump map", "a function map(t, x, p)", arguments=3)
-        dates = as_dates(self.time, "Jump time") if is_dated(self.time) else None
+        dates = read_dates(self.time, "Jump time")
         form = "a number or a sequence of numbers"
         times = as_array(self.time, "Jump time", form=form) if dates is None else dates.instants
         if times.ndim > 1 or not times.size or not np.isfinite(times).all():
@@ -95,17 +95,6 @@ class Jump:
             raise ValueError(f"The times of a Jump must increase strictly; got {shorten(self.time)}.")
         listed = times.tolist()
         set_fields(self, time=dates if dates is not None else tuple(listed) if isinstance(listed, list) else listed)
-
-    @property
-    def times(self) -> FloatArray:
-        """All its times: (K,). ValueError for dates, which become numbers in an experiment."""
-        if isinstance(self.time, Dates):
-            raise ValueError(f"the times of this Jump are dates ({self.time!r}): an Experiment makes numbers of them.")
-        return np.atleast_1d(np.asarray(self.time, dtype=np.float64))
-
-
-TIMED = (Measurements, ReferenceSignal)
-"""The data that have times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +162,9 @@ class Experiment:
 
     Notes
     -----
-    ``p`` holds the names of the map, and all parameters of the problem that no run's map has as its target; a target
-    is there under its own name only if a function reads it by that name, as ``p["beta_run3"]``. A run is differentiated
-    with respect to the parameters on which its functions depend and to no others, so that many runs with parameters of
-    their own cost each what it alone would.
+    ``p`` holds all parameters of the problem, and the names of the map. A run is differentiated with respect to the
+    parameters on which its functions depend and to no others, so that many runs with parameters of their own cost each
+    what it alone would.
 
     A copy with other data, made by `dataclasses.replace`, keeps the horizon, also where it came from the data; with
     ``t0=None, tf=None`` beside the data it is that of the new ones.
@@ -251,8 +239,6 @@ class Experiment:
         given = self.transition_times
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
-        several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
-        given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
         if len(given) != len(sequence) - 1:
             raise ValueError(
                 f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
@@ -277,25 +263,25 @@ class Experiment:
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
         data, jumps, times = _check_data(self.data), _check_jumps(self.jumps), self.transition_times
-        t0, tf = _read_date(self.t0, "t0"), _read_date(self.tf, "tf")
-        if isinstance(times, (list, tuple)):
-            of_times, times = "a transition time", tuple(_read_date(time, "a transition time") for time in times)
-        else:
-            of_times, times = "transition_times", as_dates(times, "transition_times") if is_dated(times) else times
-        parts = [(f"times of {type(item).__name__}", item) for item in (*data, *jumps, self.inputs)]
-        parts += [(of_times, times), ("t0", t0), ("tf", tf)]
-        given = [Given(what, dates, isinstance(part, TIMED)) for what, part in parts for dates in list_dates(part)]
-        found: dict[str, Any] = {"data": data, "jumps": jumps}
+        if times is not None:
+            times = as_sequence(times, "transition_times", "a sequence of numbers or sf.Parameter")
+            times = tuple(read_date(time, "a transition time") for time in times)
+        parts: dict[str, Any] = {"data": data, "jumps": jumps, "inputs": self.inputs, "transition_times": times}
+        parts |= {name: read_date(getattr(self, name), name) for name in ("t0", "tf")}
+        names = {"transition_times": "a transition time", "t0": "t0", "tf": "tf"}
+        given = []
+        for name, part in parts.items():
+            for item in part if isinstance(part, tuple) else (part,):
+                what = names.get(name, f"times of {type(item).__name__}")
+                given += [Given(what, dates) for dates in list_dates(item)]
         if given or self.origin is not None or self.time_zone is not None:
-            kinds = [type(item).__name__ for item in data if isinstance(item, TIMED) and not has_dates(item)]
-            numbers = f"the {kinds[0]}{'' if len(data) == 1 else ' beside it'}" if kinds else ""
-            origin = choose_origin(given, self.origin, self.time_zone, t0, numbers=numbers)
+            timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
+            of_data = given[: len(timed)] if all(map(has_dates, timed)) else []  # they stand first
+            origin = choose_origin(given, of_data, self.origin, self.time_zone, parts["t0"])
             unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-            found |= {"inputs": self.inputs, "transition_times": times, "t0": t0, "tf": tf}
-            names = {"transition_times": of_times, "t0": "t0", "tf": "tf"}
-            found = {name: count_from(value, origin, unit, names.get(name, "")) for name, value in found.items()}
-            found |= {"origin": origin, "time_zone": origin.time_zone or None}
-        set_fields(self, **found)
+            parts = {name: count_from(part, origin, unit, names.get(name, "")) for name, part in parts.items()}
+            parts |= {"origin": origin, "time_zone": origin.time_zone or None}
+        set_fields(self, **parts)
 
     @property
     def measurements(self) -> tuple[Measurements, ...]:
@@ -333,7 +319,7 @@ class Experiment:
     @cached_property
     def _acts(self) -> list[tuple[float, Callable[..., Any]]]:
         """Time and map of each jump, in the order in which they act."""
-        acts = [(time, jump.map) for jump in self.jumps for time in jump.times.tolist()]  # type: ignore[union-attr]
+        acts = [(time, jump.map) for jump in self.jumps for time in np.atleast_1d(jump.time).tolist()]  # type: ignore[union-attr]
         return sorted(acts, key=lambda act: act[0])
 
     @cached_property
@@ -534,11 +520,12 @@ def count_times(experiment: Experiment, times: Any) -> Any:
     ValueError
         For dates if the times of the experiment are numbers.
     """
-    if not is_dated(times):
+    dates = read_dates(times, "times")
+    if dates is None:
         return times
     if experiment.origin is None:
-        raise ValueError(f"times are dates ({shorten(times)}), but the times of the experiment are numbers.")
-    return experiment.origin.to_numbers(as_dates(times, "times"), experiment.time_unit)
+        raise ValueError(f"times are dates ({dates!r}), but the times of the experiment are numbers.")
+    return experiment.origin.to_numbers(dates, experiment.time_unit)
 
 
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
@@ -559,13 +546,12 @@ def prefix_runs(experiments: Sequence[Experiment]) -> list[str]:
 def _check_map(given: Any) -> Mapping[str, str]:
     """Return a map of the model's names to the problem's; empty for None."""
     names = {} if given is None else given
-    strings = isinstance(names, Mapping) and all(isinstance(name, str) for pair in names.items() for name in pair)
-    if not strings:
-        raise TypeError(
-            "parameter_map must be a dict of the model's name -> the problem's name, such as "
-            f"{{'beta': 'beta_run3'}}; got {shorten(given)}."
-        )
-    return {as_name(here, "parameter_map"): as_name(target, "parameter_map") for here, target in names.items()}
+    form = "a dict of the model's name -> the problem's name, such as {'beta': 'beta_run3'}"
+    if not isinstance(names, Mapping):
+        raise TypeError(f"parameter_map must be {form}; got {shorten(given)}.")
+    return {
+        as_name(here, "parameter_map", form): as_name(there, "parameter_map", form) for here, there in names.items()
+    }
 
 
 def _check_data(data: Any) -> tuple[Data, ...]:
@@ -623,8 +609,3 @@ def _check_final_time(given: Any) -> float | Parameter:
             f"model may be integrated; got the upper bound {given.upper}."
         )
     return given
-
-
-def _read_date(value: Any, what: str) -> Any:
-    """Return a single date as `Dates`; anything else as it is."""
-    return as_date(value, what) if is_dated(value) else value

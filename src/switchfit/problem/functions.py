@@ -61,9 +61,6 @@ JITTED = type(jax.jit(lambda: None))
 FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, JITTED, type(jnp.add), jax.custom_jvp, jax.custom_vjp)
 """Types of a library's functions; instances of its classes may have state."""
 
-DEPTH = 60
-"""Depth of nesting above which a structure is not compared."""
-
 
 class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
     """A function reads something that cannot be compared by content."""
@@ -72,29 +69,27 @@ class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
 def read_contents(function: Any) -> Hashable | None:
     """Return everything that a function reads, by content; None if it is unknown and the function has to be traced."""
     try:
-        return _read(function, DEPTH)
-    except NotPlain:
+        return _read(function)
+    except (NotPlain, RecursionError):  # of what contains itself
         return None
 
 
-def _read(value: Any, depth: int) -> Hashable:
-    if depth == 0:
-        raise NotPlain
+def _read(value: Any) -> Hashable:
     kind = type(value)
     if kind in NUMBERS:
         return kind, repr(value) if kind in (float, complex) else value  # -0.0 is not 0.0, nan is nan
     if kind is np.ndarray or isinstance(value, (np.generic, jax.Array)):
         return _read_array(value)
     if kind in (tuple, list):
-        return kind, tuple([_read(entry, depth - 1) for entry in value])
+        return kind, tuple(map(_read, value))
     if kind in (dict, types.MappingProxyType):
-        return dict, _read(list(value.items()), depth - 1)
+        return dict, _read(list(value.items()))
     if kind is functools.partial:
-        return kind, _read((value.func, value.args, value.keywords), depth - 1)
+        return kind, _read((value.func, value.args, value.keywords))
     if _is_trusted(value):
         return kind, id(value), value  # which is kept alive
     if kind is types.FunctionType and not vars(value):
-        return _read_function(value, depth)
+        return _read_function(value)
     raise NotPlain  # also a jitted function: JAX caches a trace of its own, which the caller has to invalidate
 
 
@@ -107,7 +102,7 @@ def _read_array(value: Any) -> Hashable:
     return "array", isinstance(value, jax.Array), weak, str(array.dtype), array.shape, digest
 
 
-def _read_function(function: types.FunctionType, depth: int) -> Hashable:
+def _read_function(function: types.FunctionType) -> Hashable:
     names, scope = _list_globals(function.__code__), function.__globals__
     if names is None:
         raise NotPlain
@@ -121,7 +116,7 @@ def _read_function(function: types.FunctionType, depth: int) -> Hashable:
             found[name] = scope[name]
         elif name in OPAQUE_BUILTINS or not hasattr(builtins, name):
             raise NotPlain
-    return function.__code__, _read((function.__defaults__, function.__kwdefaults__, cells, found), depth - 1)
+    return function.__code__, _read((function.__defaults__, function.__kwdefaults__, cells, found))
 
 
 def _is_trusted(value: Any) -> bool:
@@ -246,13 +241,8 @@ class Function:
 
 def _as_float64(value: Any) -> Any:
     """Return a value as a float64 array without weak type, which Python's numbers have, as the jaxpr requires."""
-    if (
-        isinstance(value, (np.ndarray, jax.Array))
-        and value.dtype == np.float64
-        and not getattr(value, "weak_type", False)
-    ):
-        return value
-    return jnp.asarray(value, jnp.float64)
+    is_double = getattr(value, "dtype", None) == np.float64 and not getattr(value, "weak_type", False)
+    return value if is_double else jnp.asarray(value, jnp.float64)
 
 
 _traces: dict[Any, Function] = {}
@@ -290,7 +280,7 @@ class Call(NamedTuple):
     inputs: tuple[str, ...] = ()
 
 
-def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozenset[str] = frozenset()) -> Function:
+def trace_function(call: Call, parameters: Mapping[str, Shape]) -> Function:
     """Trace a function of the user, or return a cached trace that is still valid.
 
     Parameters
@@ -298,8 +288,6 @@ def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozense
     call : Call
     parameters : mapping of str to shape
         Names and shapes of the entries of its dict of parameters.
-    hidden : set of str
-        Those among them that are in the dict only if the function reads them by name.
 
     Raises
     ------
@@ -308,20 +296,14 @@ def trace_function(call: Call, parameters: Mapping[str, Shape], hidden: frozense
     """
     function = _without_jit(call.function)
     content = read_contents(function)
-    asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()), hidden)
+    asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()))
     key = None if content is None else (content, asked)
     found = None if key is None else _traces.get(key)
     if found is not None:
         return found
     call = call._replace(function=function)
-    shown = {name: size for name, size in parameters.items() if name not in hidden}
     with use_float64(), nullcontext() if key is not None else _retracing(next(_turn)):
-        try:
-            traced = _trace(call, shown)
-        except ValueError:  # the function may read a hidden parameter by its name
-            if not hidden:
-                raise
-            traced = _trace(call, parameters)
+        traced = _trace(call, parameters)
     if key is not None:
         with _lock:
             _traces[key] = traced
@@ -470,7 +452,9 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
     try:
         value = function(*arguments)
     except KeyError as error:
-        raise ValueError(f"{what} {_describe_missing_name(error.args[0] if error.args else '', arguments)}") from error
+        known = zip("pu", (given for given in arguments if isinstance(given, dict)), strict=False)
+        there = "; ".join(f"{holder} has {join_names(given)}" for holder, given in known)
+        raise ValueError(f"{what} reads {error}, which is not there: {there}.") from error
     except UNTRACEABLE as error:
         raise ValueError(
             f"{what} branches on the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
@@ -486,19 +470,6 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what}: {form} must return an array of numbers; got {value!r}.") from error
-
-
-def _describe_missing_name(name: Any, arguments: tuple[Any, ...]) -> str:
-    """Return the end of the sentence about a name that is neither in p nor, if u is a dict, in u."""
-    parameters, *inputs = [given for given in arguments if isinstance(given, dict)]
-    lacks = f"the parameter {name!r}, which the problem lacks; it has {join_names(parameters)}"
-    if not inputs or name in inputs[0]:
-        return f"reads {lacks}."
-    lacks_input = f"the input {name!r}, which the experiment lacks; it has {join_names(inputs[0])}"
-    if name in parameters:
-        return f"reads {lacks_input}."
-    known = f"a parameter ({join_names(parameters)}) nor an input ({join_names(inputs[0])})"
-    return f"reads {name!r}, which is neither {known}."
 
 
 def call_for_vector(call: Call, arguments: tuple[Any, ...]) -> Array:

@@ -135,23 +135,6 @@ STATE = ""
 """Stands for the state among the names of parameters."""
 
 
-class Comparison(NamedTuple):
-    """A comparison with a parameter in a traced function.
-
-    Attributes
-    ----------
-    parameter : str
-    verb : str
-        One of `VERBS`.
-    line : str
-        Place in the user's code, "file.py:12"; empty if it is unknown.
-    """
-
-    parameter: str
-    verb: str
-    line: str
-
-
 @keep_with_problem
 def find_comparisons(problem: Problem) -> dict[int, str]:
     """Return by which function and where an unknown is compared, such as "mode 'on' compares with t_on at model.py:12".
@@ -167,16 +150,16 @@ def find_comparisons(problem: Problem) -> dict[int, str]:
     for run, structure in zip(problem.experiments, problem.structures, strict=True):
         for role, function in structure.acting.items():
             # Where a mode compares with its state, rows end, and derivatives have all of it: see `corners`.
-            for parameter, verb, line in list_comparisons(function, with_state=not role.startswith("mode ")):
-                name = run.parameter_map.get(parameter, parameter)
-                found.setdefault(name, f"{role} {verb} {parameter}{f' at {line}' if line else ''}")
+            for parameter, what in list_comparisons(function, with_state=not role.startswith("mode ")):
+                found.setdefault(run.parameter_map.get(parameter, parameter), f"{role} {what}")
     spans = problem.unknowns.parameters.items()
     return {i: found[name] for name, span in spans if name in found for i in range(span.start, span.stop)}
 
 
 @lru_cache(maxsize=1024)
-def list_comparisons(function: Function, with_state: bool = True) -> tuple[Comparison, ...]:
-    """Return the comparisons of a function with its parameters, in the order of its operations.
+def list_comparisons(function: Function, with_state: bool = True) -> tuple[tuple[str, str], ...]:
+    """Return the parameters with which a function compares, in the order of its operations, and what it does, such as
+    "compares with k at model.py:12".
 
     Parameters
     ----------
@@ -196,7 +179,7 @@ class _Comparing(Walk):
     """Finds the comparisons of a function; what it follows are the parameters on which values depend."""
 
     def __init__(self) -> None:
-        self.found: list[Comparison] = []
+        self.found: list[tuple[str, str]] = []
 
     def constant(self, value: Any) -> Names:
         return NONE
@@ -205,7 +188,7 @@ class _Comparing(Walk):
         names = NONE.union(*given)
         if _jumps(equation) and STATE not in names:
             verb, line = VERBS[equation.primitive.name], find_line(origin)
-            self.found += [Comparison(name, verb, line) for name in sorted(names)]
+            self.found += [(name, f"{verb} {name}{line and f' at {line}'}") for name in sorted(names)]
         results = [names] * len(equation.outvars)
         for inner, own in _list_calls(equation, given):
             if find_public_name(inner) not in SMOOTH:
@@ -244,6 +227,10 @@ GROWING = frozenset(
     | {"add_any", "reduce_prod", "cumsum", "cumprod"}
 )
 """Operations that are defined everywhere, and overflow for large operands."""
+
+
+MOST_POINTS = 20
+"""Largest number of points at which the operations of a function are checked one by one."""
 
 
 class Undefined(NamedTuple):
@@ -285,68 +272,51 @@ def find_undefined(
     derivatives : bool
         Whether derivatives in the state, the input and the parameters have to be finite too.
     """
-    check, steps = _compile(function, derivatives)
     with use_float64():
-        named = [np.asarray(parameters[name], dtype=np.float64) for name in function.parameters]
-        results = check([np.asarray(argument, dtype=np.float64) for argument in arguments], named)
-    whole = np.asarray(results[0]).reshape(-1, 2)  # the value, and the derivatives
-    finite = np.asarray(results[1]).reshape(len(whole), -1, 3)
-    for point in np.flatnonzero(~whole.all(1)).tolist():
-        wrong = np.argwhere(~finite[point])
-        if wrong.size:
-            k, order = wrong[0].tolist()
-            operation, line = steps[k]
-            return Undefined(point, operation, line, order, bool(whole[point, 0]))
+        given = [jnp.asarray(argument, dtype=jnp.float64) for argument in arguments]
+        named = [jnp.asarray(parameters[name], dtype=jnp.float64) for name in function.parameters]
+        is_timed = bool(given) and given[0].ndim == 1
+        moves = [derivatives and not (is_timed and k == 0) for k in range(len(given) + len(named))]
+        check = _compile(function, tuple(moves), len(given))
+        finite = np.asarray(check(given, named)).reshape(-1, 2)  # the value, and the derivatives
+        for point in np.flatnonzero(~finite.all(1))[:MOST_POINTS].tolist():
+            walk = _Checking()
+            values = [*(argument[point] for argument in given), *named]
+            walk.run(function.jaxpr, function.consts, list(zip(values, moves, strict=True)))
+            if walk.found is not None:
+                return Undefined(point, *walk.found, valued=bool(finite[point, 0]))
     return None
 
 
 @lru_cache(maxsize=64)
-def _compile(function: Function, derivatives: bool) -> tuple[Callable[..., Any], list[tuple[str, str]]]:
-    """Return a compiled check of a function at several points, and the operations that it checks, with their lines.
+def _compile(function: Function, moves: tuple[bool, ...], varying: int) -> Callable[..., Any]:
+    """Return a compiled check whether the value of a function is finite, and its derivatives, at each point: (N, 2)."""
 
-    The check returns whether the value of the function is finite, and its derivatives (N, 2), and those of each
-    operation (N, K, 3).
-    """
-    checked: list[tuple[str, str]] = []
+    def check(given: list[Any], named: list[Any]) -> Any:
+        every = [*given, *named]
 
-    def check(flat: list[Any], named: list[Any]) -> tuple[Any, Any]:
-        given, walk = [*flat, *named], _Checking()
-        depends = [derivatives and not (k == 0 and a.ndim == 0 and flat) for k, a in enumerate(given)]
-        walk.run(function.jaxpr, function.consts, list(zip(given, depends, strict=True)))
-        checked[:] = walk.operations
-        finite = jnp.stack(walk.finite) if walk.finite else jnp.ones((0, 3), bool)
-        return _is_finite(function, given, depends), finite
+        def call(moving: list[Any]) -> Any:
+            each = iter(moving)
+            return function.evaluate([next(each) if m else a for a, m in zip(every, moves, strict=True)])
 
-    points = len(function.jaxpr.invars) > len(function.parameters)
-    return jax.jit(jax.vmap(check, in_axes=(0, None)) if points else check), checked
+        moving = [a for a, m in zip(every, moves, strict=True) if m]
+        derivatives = [jax.jacrev(call)(moving), jax.jacfwd(jax.jacrev(call))(moving)] if moving else []
+        return jnp.stack([_are_finite([call(moving)]), _are_finite(jax.tree.leaves(derivatives))])
 
-
-def _is_finite(function: Function, given: list[Any], depends: list[bool]) -> Any:
-    """Return whether the value of a function is finite, and its first two derivatives in some arguments: (2,)."""
-
-    def call(moving: list[Any]) -> Any:
-        each = iter(moving)
-        return function.evaluate([next(each) if moves else a for a, moves in zip(given, depends, strict=True)])
-
-    moving = [a for a, moves in zip(given, depends, strict=True) if moves]
-    derivatives = [jax.jacrev(call)(moving), jax.jacfwd(jax.jacrev(call))(moving)] if moving else []
-    return jnp.stack([_are_finite([call(moving)]), _are_finite(jax.tree.leaves(derivatives))])
+    return jax.jit(jax.vmap(check, in_axes=(0, None)) if varying else check)
 
 
 class _Checking(Walk):
-    """Evaluates a function, and checks its operations; what it follows are values, and whether they move.
+    """Evaluates a function at a point, and checks its operations; what it follows are values, and whether they move.
 
     Attributes
     ----------
-    operations : list of (name, line)
-    finite : list of (3,)
-        Whether the value, the first and the second derivative of each operation are finite at finite operands.
+    found : tuple (operation, line, order) or None
+        The first operation that is not finite at finite operands.
     """
 
     def __init__(self) -> None:
-        self.operations: list[tuple[str, str]] = []
-        self.finite: list[Any] = []
-        self._runs: Any = jnp.array(True)  # whether this branch does
+        self.found: tuple[str, str, int] | None = None
 
     def constant(self, value: Any) -> tuple[Any, bool]:
         return value, False
@@ -356,38 +326,35 @@ class _Checking(Walk):
         operands, which = [value for value, _ in given], [moves for _, moves in given]
         if name in ("jit", "pjit"):
             return self.enter(equation, equation.params["jaxpr"], given, origin)
-        results = evaluate(equation, operands)
         if name == "cond":
-            outside = self._runs
-            for k, branch in enumerate(equation.params["branches"]):
-                self._runs = outside & (operands[0] == k)
-                self.enter(equation, branch, given[1:], origin)
-            self._runs = outside
-        elif name not in GROWING and not (name == "integer_pow" and equation.params["y"] > 0):
-            caller = None if origin is equation else find_public_name(origin.params.get("jaxpr"))
-            self.operations.append((caller or name, find_line(origin)))
-            self.finite.append(~self._runs | ~_are_finite(operands) | _check_orders(equation, operands, which, results))
+            branches = equation.params["branches"]
+            return self.enter(equation, branches[int(np.clip(operands[0], 0, len(branches) - 1))], given[1:], origin)
+        results = evaluate(equation, operands)
+        is_growing = name in GROWING or (name == "integer_pow" and equation.params["y"] > 0)
+        if self.found is None and not is_growing and _are_finite(operands):
+            order = _find_order(equation, operands, which, results)
+            if order is not None:
+                caller = None if origin is equation else find_public_name(origin.params.get("jaxpr"))
+                self.found = caller or name, find_line(origin), order
         return [(result, any(which)) for result in results]
 
 
-def _check_orders(equation: Any, operands: list[Any], which: list[bool], results: list[Any]) -> Any:
-    """Return whether the value and the first two derivatives of an operation in some operands are finite: (3,)."""
+def _find_order(equation: Any, operands: list[Any], which: list[bool], results: list[Any]) -> int | None:
+    """Return the order of the first derivative of an operation in some operands that is not finite, 0 for its value."""
     floats = [k for k, moves in enumerate(which) if moves and _is_float(operands[k])]
 
     def call(*moved: Any) -> list[Any]:
         made = evaluate(equation, [moved[floats.index(k)] if k in floats else a for k, a in enumerate(operands)])
         return list(filter(_is_float, made))
 
-    value = _are_finite(results)
-    if not floats:
-        return jnp.stack([value, jnp.array(True), jnp.array(True)])
     at = tuple(operands[k] for k in floats)
     ones = tuple(map(jnp.ones_like, at))
 
     def slope(*moved: Any) -> list[Any]:
         return jax.jvp(call, moved, ones)[1]
 
-    return jnp.stack([value, _are_finite(slope(*at)), _are_finite(jax.jvp(slope, at, ones)[1])])
+    orders = (lambda: results, lambda: slope(*at), lambda: jax.jvp(slope, at, ones)[1])
+    return next((order for order, find in enumerate(orders if floats else orders[:1]) if not _are_finite(find())), None)
 
 
 def _are_finite(values: Sequence[Any]) -> Any:

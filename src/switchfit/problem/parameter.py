@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.dates import Dates, as_dates, is_dated
+from switchfit.problem.dates import Dates, list_dates, read_date
 from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, require_deviation, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
@@ -55,11 +55,8 @@ class Normal:
     sd: Any
 
     def __post_init__(self) -> None:
-        if is_dated(self.mean):
-            set_fields(self, mean=as_dates(self.mean, "Normal mean"))
-            _check(self, "sd", "sd")
-        else:
-            _check(self, "mean", "sd")
+        set_fields(self, mean=read_date(self.mean, "Normal mean"))
+        _check(self, "sd" if isinstance(self.mean, Dates) else "mean", "sd")
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,26 +234,14 @@ class Parameter:
 
     def __post_init__(self) -> None:
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
-        checked = {"unit": as_text(self.unit, "Parameter unit"), "fixed": as_flag(self.fixed, "Parameter fixed")}
-        checked |= {"scale": scale, **(self._read_dates() if self._has_dates() else self._read_numbers(scale))}
-        set_fields(self, **checked)
-        if not isinstance(self.value, Dates):
-            self._check_prior()
-
-    def _has_dates(self) -> bool:
-        """Return whether the value is a date; then its bounds and the mean of its prior have to be dates too."""
-        is_date = is_dated(self.value)
-        mean = np.inf if self.prior is None else getattr(self.prior, "mean", None)
-        others = {"lower": self.lower, "upper": self.upper, "prior: its mean": mean}
-        for name, other in others.items():
-            is_open = isinstance(other, float) and np.isinf(other)
-            if not is_open and is_dated(other) != is_date:
-                kinds = ("number", "date") if is_date else ("date", "number")
-                raise ValueError(
-                    f"Parameter {name} is a {kinds[0]}, and its value a {kinds[1]}: give dates for both, or numbers; "
-                    f"got {shorten(other)} and {shorten(self.value)}."
-                )
-        return is_date
+        set_fields(self, unit=as_text(self.unit, "Parameter unit"), fixed=as_flag(self.fixed, "Parameter fixed"))
+        set_fields(self, scale=scale)
+        given = {name: read_date(getattr(self, name), f"Parameter {name}") for name in ("value", *BOUNDS)}
+        if any(isinstance(each, Dates) for each in (*given.values(), getattr(self.prior, "mean", None))):
+            set_fields(self, **given)  # an experiment makes numbers of them, and checks these
+            return
+        set_fields(self, **self._read_numbers(scale))
+        self._check_prior()
 
     def _read_numbers(self, scale: str) -> dict[str, FloatArray]:
         """Return the value and the bounds, checked against one another."""
@@ -279,19 +264,6 @@ class Parameter:
                     f"{shorten(self.value)} and the lower bound {shorten(self.lower)}."
                 )
         return {"value": value, "lower": lower, "upper": upper}
-
-    def _read_dates(self) -> dict[str, Any]:
-        """Return the value and the bounds as dates: an experiment makes numbers of them."""
-        names = [name for name in ("value", *BOUNDS) if is_dated(getattr(self, name))]
-        found = {name: as_dates(getattr(self, name), f"Parameter {name}") for name in names}
-        value = found["value"]
-        if value.shape != ():
-            raise ValueError(f"Parameter value must be one date, that of a transition or of tf; got {value!r}.")
-        low, high = (found.get(name, value) for name in BOUNDS)
-        are_comparable = len({bool(dates.time_zone) for dates in found.values()}) == 1
-        if are_comparable and not low.instants <= value.instants <= high.instants:
-            raise ValueError(f"Parameter value {value!r} lies outside its bounds [{self.lower!r}, {self.upper!r}].")
-        return found
 
     def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
         """Return a bound with one entry for each of the value."""
@@ -330,28 +302,6 @@ class Parameter:
         """Whether it can take positive values alone."""
         return self.scale == "log" or bool(np.all(self.lower > 0))
 
-    def entries(self) -> tuple[Parameter, ...]:
-        """Return a scalar `Parameter` for each entry, in their order.
-
-        See Also
-        --------
-        Parameter
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> first, second = sf.Parameter([1.0, 2.0], lower=0.0).entries()
-        >>> float(second.value), float(second.lower)
-        (2.0, 0.0)
-        """
-        terms = PriorTerms.of(self.prior, self.shape)
-        priors: list[Prior | None] = []
-        for center, precision, log in zip(*terms, strict=True):
-            kind = LogNormal if log else Normal
-            priors.append(kind(np.exp(center) if log else center, precision**-0.5) if precision > 0 else None)
-        each = zip(self.value.ravel(), self.lower.ravel(), self.upper.ravel(), priors, strict=True)
-        return tuple(Parameter(x, low, high, self.unit, self.fixed, prior, self.scale) for x, low, high, prior in each)
-
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the parameter, () for a scalar."""
@@ -382,6 +332,5 @@ def as_parameter(
 
 def refuse_dates(parameter: Parameter, what: str) -> None:
     """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
-    date = parameter.value  # its bounds are dates if it is one
-    if isinstance(date, Dates):
+    for date in list_dates(parameter):
         raise ValueError(f"{what} must be a number; got the date {date!r}. Only transition times and tf may be dates.")

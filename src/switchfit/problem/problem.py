@@ -20,7 +20,7 @@ from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_o
 from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.problem.structure import Functions, Structure, choose_common_lengths, trace_structure
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.unknowns import Constraint, Unknowns, list_unknowns, require_one_time_unit
+from switchfit.problem.unknowns import Constraint, Unknowns, list_unknowns
 from switchfit.problem.validation import (
     as_array,
     as_choice,
@@ -136,7 +136,11 @@ def check_delays(experiments: tuple[Experiment, ...], parameters: Mapping[str, P
                     f"delay names {shorten(item.delay)}, which must be a parameter of one number; the problem has "
                     f"{join_names(parameters)}."
                 )
-            _check_delay_unit(experiments, parameters, experiment, item.delay)
+            if parameter.unit not in ("", experiment.time_unit):
+                raise ValueError(
+                    f"the delay {item.delay!r} has the unit {parameter.unit!r}, but time_unit of its experiment is "
+                    f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
+                )
             unit = unit_suffix(experiment.time_unit)
             low, high = item.times[-1] - experiment.earliest_end, item.times[0] - experiment.t0
             least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
@@ -146,28 +150,6 @@ def check_delays(experiments: tuple[Experiment, ...], parameters: Mapping[str, P
                     f"{high:.6g}{unit} are all samples inside (t0, tf) = ({experiment.t0}, {experiment.earliest_end}): "
                     "give it narrower bounds, move t0 or tf, or leave out samples at the ends."
                 )
-
-
-def _check_delay_unit(
-    experiments: tuple[Experiment, ...], parameters: Mapping[str, Parameter], experiment: Experiment, delay: str
-) -> None:
-    """Check that a delay is in the unit of its experiment, and shared only by experiments of one time unit."""
-    name = experiment.parameter_map.get(delay, delay)
-    unit = parameters[name].unit
-    if unit not in ("", experiment.time_unit):
-        raise ValueError(
-            f"the delay {name!r} has the unit {unit!r}, but time_unit of its experiment is "
-            f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
-        )
-    runs = zip(name_runs(experiments), experiments, strict=True)
-    units = {run: e.time_unit for run, e in runs if name in _find_delay_targets(e)}
-    require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
-
-
-def _find_delay_targets(experiment: Experiment) -> set[str]:
-    """Return names of the problem's parameters that are delays in an experiment."""
-    delays = (item.delay for item in experiment.measurements)
-    return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
 
 
 T = TypeVar("T")
@@ -310,8 +292,7 @@ class Problem:
     @cached_property
     def _functions(self) -> Functions:
         """The functions that were traced, which problems with other sequences share."""
-        targets = frozenset(name for e in self.experiments for name in e.parameter_map.values())
-        return Functions(self.parameters, targets)
+        return Functions(self.parameters, {})
 
     def with_sequences(self, sequences: Sequence[Sequence[str]], transition_times: Sequence[ArrayLike]) -> Problem:
         """Return the problem with other mode sequences, which takes a fraction of the time of building it anew.

@@ -231,30 +231,11 @@ class Structure:
         return bool(self.guarded or self.terminal_constraints)
 
 
-class Functions:
-    """Traces the functions of a problem's experiments, each of them once.
+class Functions(NamedTuple):
+    """The parameters of a problem, and the functions of its experiments that were traced, each of them once."""
 
-    Parameters
-    ----------
-    parameters : mapping of str to Parameter
-        Parameters of the problem.
-    targets : set of str
-        Parameters to which the parameter map of an experiment refers. An experiment has such a parameter only if its
-        own map refers to it, or if its functions read it by its own name.
-    """
-
-    def __init__(self, parameters: Mapping[str, Parameter], targets: frozenset[str]) -> None:
-        self.parameters, self.targets = parameters, targets
-        self._traced: dict[Any, Function] = {}
-
-    def of(self, experiment: Experiment) -> _Tracer:
-        """Return a tracer of the functions of one experiment."""
-        mapped = experiment.parameter_map
-        order = {name: k for k, name in enumerate(self.parameters)}
-        # The same order for every map, so that runs share a program.
-        named = sorted({*self.parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
-        hidden = frozenset(name for name in self.targets if name not in mapped)
-        return _Tracer({name: self.parameters[mapped.get(name, name)] for name in named}, hidden, self._traced)
+    parameters: Mapping[str, Parameter]
+    traced: dict[Any, Function]
 
 
 class _Tracer:
@@ -263,16 +244,18 @@ class _Tracer:
     Attributes
     ----------
     named : dict of str to Parameter, by the model's names
-    hidden : set of str
-        Parameters that a function gets only if it reads them by name.
     read : dict of str to the positions of the entries that are read
     """
 
-    def __init__(self, named: dict[str, Parameter], hidden: frozenset[str], traced: dict[Any, Function]) -> None:
-        self.named, self.hidden, self._traced = named, hidden, traced
-        self.shapes = {name: q.shape for name, q in named.items()}
+    def __init__(self, functions: Functions, experiment: Experiment) -> None:
+        parameters, mapped = functions.parameters, experiment.parameter_map
+        order = {name: k for k, name in enumerate(parameters)}
+        # The same order for every map, so that runs share a program.
+        names = sorted({*parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
+        self.named = {name: parameters[mapped.get(name, name)] for name in names}
+        self.shapes = {name: q.shape for name, q in self.named.items()}
         self.read: dict[str, set[int]] = {}
-        self._key = tuple(self.shapes.items()), hidden
+        self._traced, self._key = functions.traced, tuple(self.shapes.items())
 
     def __call__(self, *given: Any) -> Function:
         """Trace a function, given what a `Call` consists of."""
@@ -280,7 +263,7 @@ class _Tracer:
         key = (id(call.function), call[1:], self._key)
         traced = self._traced.get(key)
         if traced is None:
-            traced = self._traced[key] = trace_function(call, self.shapes, self.hidden)
+            traced = self._traced[key] = trace_function(call, self.shapes)
         for name, entries in traced.read.items():
             self.read.setdefault(name, set()).update(entries)
         return traced
@@ -304,7 +287,7 @@ def trace_structure(
     ValueError
         With the name of the mode or function, what it should return and what it returned.
     """
-    trace = functions.of(experiment)
+    trace = _Tracer(functions, experiment)
     used = system.modes if transitions is not None else set(experiment.mode_sequence)
     names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
     x0, n, unknown = _trace_initial_state(trace, initial_state_of(system, experiment))
@@ -403,15 +386,10 @@ def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int)
 
 
 def _select_parameters(trace: _Tracer, structure: Structure) -> tuple[tuple[str, Shape, tuple[int, ...]], ...]:
-    """Return `Structure.parameters`: all that the functions read, and all fixed ones.
-
-    Fixed parameters that are not read do no harm: they are not differentiated.
-    """
+    """Return `Structure.parameters`: all that the functions read."""
     read = trace.read | {name: {0} for sensor in structure.measurements for name in sensor.named}
     return tuple(
-        (name, q.shape, () if q.fixed else tuple(sorted(read[name])))
-        for name, q in trace.named.items()
-        if name in read or (q.fixed and name not in trace.hidden)
+        (name, q.shape, () if q.fixed else tuple(sorted(read[name]))) for name, q in trace.named.items() if name in read
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.parameter import Parameter, as_parameter, refuse_dates
+from switchfit.problem.parameter import Parameter, as_parameter
 from switchfit.problem.validation import as_array, as_callable, as_labels, as_name, require_known, set_fields, shorten
 from switchfit.runtime.presentation import format_line, join_first
 
@@ -174,11 +174,6 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
     ValueError
         With `name` in the message.
     """
-    if isinstance(value, Parameter):
-        refuse_dates(value, name)
-        if len(value.shape) != 1:
-            raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {value.shape}.")
-        return value.entries()
     if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
         form = "a number or an sf.Parameter"
         entries = tuple(as_parameter(entry, f"each entry of {name}", form, fixed=True) for entry in value)

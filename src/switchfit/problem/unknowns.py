@@ -328,9 +328,12 @@ def _build_ordering(
             f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
             f"them is then not linear in what is estimated; got {durations}. Leave out min_duration, or scale='log'."
         )
-    if longest > 0:
-        units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
-        require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
+    if longest > 0 and len({experiment.time_unit for experiment in experiments}) > 1:
+        units = ", ".join(f"{name} in {run.time_unit}" for name, run in zip(labels, experiments, strict=True))
+        raise ValueError(
+            f"min_duration is one number for experiments whose times are in different units ({units}), and times are "
+            "not converted. Give all times in one unit, or leave it out and bound the transition times of each."
+        )
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else labels[e]
         knots = experiment.ends_of_modes(experiment.initial_times)
@@ -356,23 +359,3 @@ def _build_ordering(
             kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
             constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))
     return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(constraints)
-
-
-def require_one_time_unit(units: Mapping[str, str], what: str, otherwise: str) -> None:
-    """Raise ValueError if one time for several experiments would have several units.
-
-    Parameters
-    ----------
-    units : mapping of str to str
-        Unit of each run, by its name.
-    what : str
-        What that time is, for the message.
-    otherwise : str
-        What to do about it, for the message.
-    """
-    if len(set(units.values())) > 1:
-        listed = ", ".join(f"{name} in {unit}" for name, unit in units.items())
-        raise ValueError(
-            f"{what} is one number for experiments whose times are in different units ({listed}), and times are not "
-            f"converted. Give all times in one unit, as time_unit of each experiment, or {otherwise}."
-        )

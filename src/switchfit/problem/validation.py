@@ -37,10 +37,12 @@ from collections.abc import Set as AbstractSet
 from dataclasses import is_dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from switchfit.runtime.presentation import join_first
 
 LIBRARIES = frozenset({"pandas", "polars", "xarray", "switchfit"})
 
@@ -175,34 +177,14 @@ def shorten(value: Any) -> str:
 
 def join_names(names: Iterable[Any]) -> str:
     """Return names with commas between them, the first ten if there are more; 'none' for no names."""
-    every = list(names)
-    texts = ", ".join(f"{name!s:.40}" for name in every[:MOST_LISTED]) or "none"
-    return f"{texts}, ... ({len(every)} in all)" if len(every) > MOST_LISTED else texts
+    return join_first((f"{name!s:.40}" for name in names), MOST_LISTED) or "none"
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-class _Argument(NamedTuple):
-    """An argument, with what messages about it need.
-
-    Attributes
-    ----------
-    what : name of the argument
-    form : its required form
-    given : its whole value
-    missing : whether masked entries are missing samples
-    """
-
-    what: str
-    form: str
-    given: Any
-    missing: bool
-
-    def refuse(self, entry: Any, error: type[Exception] = TypeError, why: str = "") -> NoReturn:
-        """Raise `error` about one entry of the argument."""
-        inside = "" if entry is self.given else f", in which {shorten(entry)} is not a number"
-        raise error(f"{self.what} must be {self.form}; got {shorten(self.given)}{inside}{why}.")
+class _WrongEntryError(Exception):
+    """An entry of an argument is not a number: the entry, the type of the error to raise, and why."""
 
 
 def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False) -> FloatArray:
@@ -228,8 +210,12 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False)
     """
     if type(value) is float or (type(value) is np.ndarray and value.dtype == np.float64):
         return np.array(value, dtype=np.float64)
-    argument = _Argument(what, form, value, missing)
-    exact = _read_exactly(value, argument, 0)
+    try:
+        exact = _read_exactly(value, what, missing)
+    except _WrongEntryError as wrong:
+        entry, error, why = wrong.args
+        inside = "" if entry is value else f", in which {shorten(entry)} is not a number"
+        raise error(f"{what} must be {form}; got {shorten(value)}{inside}{why}.") from None
     try:
         with np.errstate(all="ignore"):
             return np.array(exact, dtype=np.float64)
@@ -316,61 +302,58 @@ def as_index(value: Any, what: str, size: int) -> int:
         raise ValueError(f"{what} must lie in 0..{size - 1}; got {shorten(value)}.") from None
 
 
-def _read_exactly(value: Any, argument: _Argument, depth: int) -> Any:
+def _read_exactly(value: Any, what: str, missing: bool, depth: int = 0) -> Any:
     """Return a number, an array or nested lists that `numpy.array` converts to float64 without changing a number."""
     if type(value) in _EXACT:
         return value
     if depth > MOST_DIMENSIONS:
-        argument.refuse(argument.given, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
+        raise _WrongEntryError(value, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
     table = list_columns(value)
     if table is not None:  # its columns may differ in type
-        columns = [_read_exactly(column, argument, depth + 1) for _, column in table]
+        columns = [_read_exactly(column, what, missing, depth + 1) for _, column in table]
         return np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
     if hasattr(value, "__array__") and not isinstance(value, type):
-        return _read_array_exactly(value, argument, depth)
+        return _read_array_exactly(value, what, missing, depth)
     if isinstance(value, Sequence) and not isinstance(value, (*_TEXT, memoryview)):
         kinds = set(map(type, value))
         if kinds <= _EXACT:
             return list(value)
         if len(kinds) == 1 and issubclass(next(iter(kinds)), np.number):
-            return _read_array_exactly(np.array(value), argument, depth)
-        return [_read_exactly(entry, argument, depth + 1) for entry in value]
+            return _read_array_exactly(np.array(value), what, missing, depth)
+        return [_read_exactly(entry, what, missing, depth + 1) for entry in value]
     if isinstance(value, (numbers.Real, Decimal)) and not isinstance(value, bool):
         try:
             return float(value)
         except OverflowError:
-            argument.refuse(value, ValueError, ", which is beyond the largest double, 1.8e308")
+            raise _WrongEntryError(value, ValueError, ", which is beyond the largest double, 1.8e308") from None
         except Exception:
-            argument.refuse(value)
+            raise _WrongEntryError(value, TypeError, "") from None
     if isinstance(value, _DATES):
-        argument.refuse(value, why=NO_DATES)
-    is_wrong_value = isinstance(value, _TEXT)
+        raise _WrongEntryError(value, TypeError, NO_DATES)
     why = ": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else ""
-    argument.refuse(value, ValueError if is_wrong_value else TypeError, why)
+    raise _WrongEntryError(value, ValueError if isinstance(value, _TEXT) else TypeError, why)
 
 
-def _read_array_exactly(value: Any, argument: _Argument, depth: int) -> Any:
+def _read_array_exactly(value: Any, what: str, missing: bool, depth: int) -> Any:
     """Return an array, or another object with a dtype, as an array of integers or doubles."""
     try:
         is_pandas = is_of_library(value, "pandas")
         array = _read_pandas(value) if is_pandas else np.asarray(np.ma.getdata(np.asanyarray(value)))
     except Exception as error:
-        argument.refuse(value, why=f", which NumPy cannot read ({type(error).__name__})")
+        raise _WrongEntryError(value, TypeError, f", which NumPy cannot read ({type(error).__name__})") from None
     if array.dtype.kind in "Mm":
-        argument.refuse(value, why=NO_DATES)
+        raise _WrongEntryError(value, TypeError, NO_DATES)
     if array.dtype.kind == "O":
-        array = _read_exactly(array.tolist(), argument, depth + 1)
+        array = _read_exactly(array.tolist(), what, missing, depth + 1)
     elif is_low_precision(array.dtype):
-        refuse_single_precision(value if _is_of_jax(value) else array, argument.what)
+        refuse_single_precision(value if _is_of_jax(value) else array, what)
         array = array.astype(np.float64)
     elif array.dtype.kind not in "iuf":
-        argument.refuse(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
+        raise _WrongEntryError(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
     mask = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else np.False_
-    if np.any(mask) and not argument.missing:
-        raise ValueError(
-            f"{argument.what} must be {argument.form}; got a masked array with {int(np.sum(mask))} masked entries. "
-            "Leave them out, or fill them in."
-        )
+    if np.any(mask) and not missing:
+        why = f", a masked array with {np.sum(mask)} masked entries. Leave them out, or fill them in"
+        raise _WrongEntryError(value, ValueError, why)
     return np.where(mask, np.nan, array) if np.any(mask) else array
 
 
@@ -391,11 +374,8 @@ def _read_pandas(value: Any) -> NDArray[Any]:
 
 def is_low_precision(dtype: Any) -> bool:
     """Return whether this is the dtype of floating-point numbers of less than double precision."""
-    if np.dtype(dtype).itemsize >= 8:
-        return False
-    import jax  # here, since a mistake in a problem file is to be named before JAX is imported; it knows bfloat16
-
-    return bool(jax.dtypes.issubdtype(dtype, np.floating))
+    dtype = np.dtype(dtype)
+    return dtype.itemsize < 8 and dtype.name.startswith(("float", "bfloat"))
 
 
 def _is_of_jax(value: Any) -> bool:
@@ -427,17 +407,8 @@ def refuse_single_precision(value: Any, what: str) -> None:
         return
     given = np.asarray(value).ravel()
     wide = given.astype(np.float64)
-    doubtful = np.isfinite(wide)
-    if given.dtype == np.float32:
-        # Decimals of at most 6 digits, and integers up to 2**24, are their own shortest text: they need no conversion.
-        with np.errstate(over="ignore", invalid="ignore"):
-            thousands = 1e3 * wide
-            short = (thousands == np.rint(thousands)) & (np.abs(thousands) <= 1e6)
-            whole = (wide == np.rint(wide)) & (np.abs(wide) <= 2**24)
-        doubtful &= ~(short | whole)
-    places = np.flatnonzero(doubtful)
-    meant = np.array([_find_shortest_decimal(number) for number in given[places]])
-    changed = np.flatnonzero(meant != wide[places])
+    meant = np.array([float(str(number)) for number in given])
+    changed = np.flatnonzero(np.isfinite(wide) & (meant != wide))
     if not changed.size:
         return
     advice = "Give doubles (float64); if the numbers really have that precision, as those of a log may, "
@@ -446,17 +417,9 @@ def refuse_single_precision(value: Any, what: str) -> None:
         advice = "By default JAX makes arrays of 32 bits: write a list or a NumPy array in place of the jnp array."
     first = changed[0]
     raise ValueError(
-        f"{what} must be in double precision: {float(meant[first])!r} became {float(wide[places[first]])!r} "
+        f"{what} must be in double precision: {float(meant[first])!r} became {float(wide[first])!r} "
         f"({given.dtype.name}). {advice}"
     )
-
-
-def _find_shortest_decimal(number: Any) -> float:
-    """Return the double with the shortest decimal text of a finite low-precision number."""
-    # NumPy has no shortest texts of bfloat16 and similar types.
-    digits = (f"{float(number):.{count}e}" for count in range(17))
-    texts = [str(number)] if isinstance(number, np.floating) else digits
-    return next(float(text) for text in texts if type(number)(float(text)) == number)
 
 
 # --- everything else --------------------------------------------------------------------------------------------------

@@ -110,7 +110,7 @@ class Scale:
 
     def __init__(self, origin: Origin, time_unit: str) -> None:
         self.zone: datetime.tzinfo = origin.zone or datetime.UTC
-        self.start = float(date2num(np.datetime64(origin.instant, "ns")))
+        self.start = float(date2num(origin.instant))
         self.length = SECONDS[normalize_time_unit(time_unit)] / SECONDS["d"]
 
     def to_days(self, times: Sequence[float]) -> FloatArray:

@@ -264,7 +264,7 @@ def describe_clock(run: Timed) -> dict[str, Any] | None:
     shift = 0.0 if offset is None else 1e3 * offset.total_seconds()
     length = 1e3 * SECONDS[normalize_time_unit(run.time_unit)]
     known = "UTC" if offset is not None else named or "UTC"
-    return {"start": run.origin.instant / 1e6 + shift, "length": length, "zone": known, "named": named}
+    return {"start": run.origin.instant.astype(np.int64) / 1e3 + shift, "length": length, "zone": known, "named": named}
 
 
 def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str, str]:

@@ -156,22 +156,14 @@ def build_pandas(frame: Frame) -> pandas.DataFrame:
         If pandas is not installed.
     """
     pandas = _import_library("pandas", "a DataFrame")
+    units = {variable.name: variable.unit for variable in frame.index if variable.unit}
+    index = {variable.name: np.asarray(variable.values) for variable in frame.index}
     columns: dict[str, Any] = {}
-    units: dict[str, str] = {}
-    for variable in frame.index:
-        if variable.unit:
-            units[variable.name] = variable.unit
-    taken = {variable.name for variable in frame.index}
-    for name, values, unit in _list_columns(frame, taken):
+    for name, values, unit in _list_columns(frame, set(index)):
         columns[name] = np.asarray(values)
         if unit:
             units[name] = unit
-    if len(frame.index) == 1:
-        index = pandas.Index(np.asarray(frame.index[0].values), name=frame.index[0].name)
-    else:
-        levels = [np.asarray(variable.values) for variable in frame.index]
-        index = pandas.MultiIndex.from_arrays(levels, names=[variable.name for variable in frame.index])
-    table = pandas.DataFrame(columns, index=index)
+    table = pandas.DataFrame({**index, **columns}).set_index(list(index))
     table.attrs = {**frame.attributes, "units": units}
     return table
 

@@ -6,8 +6,7 @@
   ``{"dtype": ..., "shape": ..., "values": [...]}``;
 - a status is its name; other dataclasses are objects with their fields.
 
-`from_json` checks what is read against the types of the dataclass's fields. What is wrong with a number or an array it
-does not say: files with numbers have a seal.
+`from_json` checks what is read against the types of the dataclass's fields.
 """
 
 from __future__ import annotations
@@ -125,54 +124,62 @@ def _encode_array(value: Any) -> Any:
 
 
 def from_json(kind: Any, content: Any, where: str) -> Any:
-    """Return what a type stands for from JSON: a dataclass, or one of the types of its fields.
+    """Return a dataclass from JSON.
 
     Parameters
     ----------
     kind : type
     content : object
     where : str
-        Path of the content, for messages.
+        Name of the content, for the message.
 
     Raises
     ------
     ValueError
-        With the path of an entry that is missing, unknown or of another type.
+        If an entry is missing, unknown or of another type.
     """
+    try:
+        return _read(kind, content)
+    except Exception as error:  # whatever is wrong with it
+        raise ValueError(f"{where} is not what was written") from error
+
+
+def _read(kind: Any, content: Any) -> Any:
+    """Return what a type stands for: a dataclass, or one of the types of its fields; an error of any kind if wrong."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (UnionType, Union):
-        return _read_either(inner, content, where)
-    if is_dataclass(kind) and isinstance(content, dict):
-        return _read_record(kind, content, where)
+        return _read_either(inner, content)
+    if is_dataclass(kind):
+        hints = _get_hints(kind)
+        if hints.keys() != content.keys():
+            raise KeyError
+        return kind(**{name: _read(hint, content[name]) for name, hint in hints.items()})
     if origin is tuple and isinstance(content, list):
         kinds = inner[:1] * len(content) if inner[-1] is Ellipsis else inner
-        if len(content) == len(kinds):
-            return tuple(from_json(kinds[k], entry, f"{where}[{k}]") for k, entry in enumerate(content))
-    if isinstance(origin, type) and issubclass(origin, Mapping) and isinstance(content, dict):
-        return {name: from_json(inner[1], entry, f"{where}.{name}") for name, entry in content.items()}
-    with suppress(Exception):  # whatever is wrong with it
-        return _read_plain(kind, content)
-    raise ValueError(f"{where} is not what was written; got {shorten_json(content)}")
+        return tuple(_read(*pair) for pair in zip(kinds, content, strict=True))
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return {name: _read(inner[1], entry) for name, entry in content.items()}
+    if (dtype := find_dtype(kind)) is not None:
+        return _read_array(dtype, content)
+    if origin is Literal:
+        return inner[inner.index(content)]
+    if issubclass(kind, Enum):
+        return kind[content]
+    if kind is float and (type(content) is int or content in NUMBERS):
+        return float(content)
+    if type(content) is not kind:
+        raise TypeError
+    return content
 
 
-def _read_record(kind: Any, content: dict[str, Any], where: str) -> Any:
-    """Return a dataclass from the fields of an object."""
-    hints = _get_hints(kind)
-    for name in (*hints, *content):
-        if name not in content or name not in hints:
-            raise ValueError(f"{where}.{name} is {'unknown' if name in content else 'missing'}")
-    return kind(**{name: from_json(hint, content[name], f"{where}.{name}") for name, hint in hints.items()})
-
-
-def _read_either(kinds: tuple[Any, ...], content: Any, where: str) -> Any:
+def _read_either(kinds: tuple[Any, ...], content: Any) -> Any:
     """Return the content as the first of several types that it can be."""
     if content is None and NoneType in kinds:
         return None
-    *others, last = (kind for kind in kinds if kind is not NoneType)
-    for kind in others:
-        with suppress(ValueError):
-            return from_json(kind, content, where)
-    return from_json(last, content, where)
+    for kind in kinds:
+        with suppress(Exception):
+            return _read(kind, content)
+    raise TypeError
 
 
 @cache
@@ -180,24 +187,6 @@ def _get_hints(kind: Any) -> dict[str, Any]:
     """Return the types of the fields of a dataclass by their names."""
     hints = get_type_hints(kind)
     return {f.name: hints[f.name] for f in fields(kind)}
-
-
-def _read_plain(kind: Any, value: Any) -> Any:
-    """Return a number, a text, an array or a member of an enumeration; an error of any kind for anything else."""
-    dtype = find_dtype(kind)
-    if dtype is not None:
-        return _read_array(dtype, value)
-    if get_origin(kind) is Literal:
-        return get_args(kind)[get_args(kind).index(value)]
-    if issubclass(kind, Enum):
-        return kind[value]
-    if kind is float and (type(value) is int or value in NUMBERS):
-        return float(value)
-    if type(value) is not kind:
-        raise TypeError
-    if kind is str:
-        value.encode()  # JSON can hold half of a surrogate pair, UTF-8 cannot
-    return value
 
 
 def find_dtype(kind: Any) -> np.dtype[Any] | None:
@@ -223,9 +212,3 @@ def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
     if array.dtype.kind != declared.kind:
         raise TypeError
     return array
-
-
-def shorten_json(value: Any) -> str:
-    """Return the JSON of a value for a message, cut off after 40 characters."""
-    text = json.dumps(value)
-    return text if len(text) <= 40 else f"{text[:40]}..."

@@ -37,33 +37,12 @@ def is_notebook() -> bool:
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
-class NotebookOutput:
-    """HTML below the cell of a notebook, replaced as a whole; it needs nothing but what a notebook has."""
-
-    def __init__(self) -> None:
-        self._handle: Any = None
-
-    def show(self, html: str) -> None:
-        """Show HTML in the place of what was shown before."""
-        shown = importlib.import_module("IPython.display")  # is there in a notebook alone
-
-        if self._handle is None:
-            self._handle = shown.display(shown.HTML(html), display_id=True)
-        else:
-            self._handle.update(shown.HTML(html))
-
-    def clear(self) -> None:
-        """Remove what was shown."""
-        if self._handle is not None:
-            self.show("")
-
-
 class Line:
-    """One line about what a long call is doing, with the seconds since it began, and a bar where it is known how much
-    there is to do; removed at the end of the call.
+    """One line about what a long call is doing, with the seconds since it began, and how much is done where that is
+    known; removed at the end of the call.
 
     Threads of its own draw it, so that it is updated while machine code runs or a program is compiled. In a notebook it
-    stands below the cell.
+    stands below the cell, with a bar.
     """
 
     def __init__(self, text: str) -> None:
@@ -84,8 +63,7 @@ class Line:
 
     def start(self) -> None:
         """Show the line after `DELAY` seconds."""
-        self._below = NotebookOutput()
-        self._ended, self._lock = threading.Event(), threading.Lock()
+        self._ended = threading.Event()
         show = self._show_below if is_notebook() else self._show
         # ipykernel finds the cell of an output by a context variable.
         self._timer = threading.Timer(DELAY, copy_context().run, args=(show,))
@@ -97,11 +75,10 @@ class Line:
         if self._timer is None:
             return
         self._timer.cancel()
-        with self._lock:
-            self._ended.set()
-            self._below.clear()
-            if self._live is not None:
-                self._live.stop()
+        self._ended.set()
+        self._timer.join()
+        if self._live is not None:
+            self._live.stop()
 
     def _show(self) -> None:
         from rich.console import Console
@@ -109,18 +86,22 @@ class Line:
 
         console, redirect = Console(stderr=True), is_terminal(sys.stdout)
         settings: dict[str, Any] = {"redirect_stdout": redirect, "redirect_stderr": redirect}
-        with self._lock:
-            if not self._ended.is_set():
-                self._live = Live(self, console=console, transient=True, refresh_per_second=5, **settings)
-                self._live.start()
+        self._live = Live(self, console=console, transient=True, refresh_per_second=5, **settings)
+        self._live.start()
 
     def _show_below(self) -> None:
         """Draw the line below the cell until the call ends."""
+        shown = importlib.import_module("IPython.display")  # is there in a notebook alone
+        output = None
         while not self._ended.wait(REDRAW):
-            with self._lock:
-                if not self._ended.is_set():
-                    bar = f' value="{self.done}" max="{self.total}"' if self.total else ""
-                    self._below.show(f"<progress{bar}></progress> {escape(self._describe())}")
+            bar = f' value="{self.done}" max="{self.total}"' if self.total else ""
+            html = shown.HTML(f"<progress{bar}></progress> {escape(self._describe())}")
+            if output is None:
+                output = shown.display(html, display_id=True)
+            else:
+                output.update(html)
+        if output is not None:
+            output.update(shown.HTML(""))
 
     def _describe(self) -> str:
         """Return what is shown."""
@@ -133,16 +114,9 @@ class Line:
         return f"{', '.join(filter(None, parts))}   {seconds:.0f} s"
 
     def __rich__(self) -> Any:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
         from rich.text import Text
 
-        text = Text(self._describe(), no_wrap=True, overflow="ellipsis")
-        if not self.total:
-            return text
-        row = Table.grid(padding=(0, 1))
-        row.add_row(text, ProgressBar(self.total, self.done, width=40))
-        return row
+        return Text(self._describe(), no_wrap=True, overflow="ellipsis")
 
 
 _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.dates import NANOSECONDS, TIME_UNITS, Dates
 from switchfit.problem.dates import SECONDS as SECONDS
+from switchfit.problem.dates import TIME_UNITS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
 from switchfit.runtime.frames import Frame, Variable, build_pandas
@@ -219,9 +219,9 @@ class Log:
         """
         if not self.offset:
             return None
-        length = NANOSECONDS[self.time_unit or "s"]
-        start = round(self.offset * length / 1000) * 1000  # microseconds are what a float64 since 1970 holds
-        return Dates(start + np.rint(self.times * length).astype(np.int64), self.time_zone)
+        length = 1e6 * SECONDS[self.time_unit or "s"]
+        micros = round(self.offset * length) + np.rint(self.times * length).astype(np.int64)
+        return Dates(micros.astype("datetime64[us]"), self.time_zone)
 
     def __repr__(self) -> str:
         return format_line(self, self.source, join_first(self.values), f"{len(self.times)} times")

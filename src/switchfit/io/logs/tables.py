@@ -26,7 +26,6 @@ from switchfit.io.logs.log import (
     normalize_time_unit,
     split_unit,
 )
-from switchfit.problem.dates import NANOSECONDS
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -177,8 +176,12 @@ def build_log(
 
 def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
     if column.dtype.kind == "M":
-        times, first = subtract_first(column.astype("datetime64[ns]").astype(object).tolist(), NANOSECONDS["s"])
-        return times, "s", first
+        first = column[~np.isnat(column)][0]
+        return (
+            (column - first) / np.timedelta64(1, "s"),
+            "s",
+            float(first.astype("datetime64[us]").astype(np.int64)) / 1e6,
+        )
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.int64) * SECONDS["ns"], "s", 0.0
     times, unit, offset = interpret_times(np.asarray(column, dtype=np.float64), name, unit, keep_epoch=keep_epoch)

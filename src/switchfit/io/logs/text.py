@@ -215,7 +215,7 @@ def parse_dates(cells: Sequence[str], places: Sequence[str]) -> tuple[NDArray[np
     """
     found = [None if is_missing(cell) else _read_date(cell, place) for cell, place in zip(cells, places, strict=True)]
     zones = {entry[1] for entry in found if entry is not None}
-    dates = np.array([None if entry is None else entry[0] for entry in found], dtype="datetime64[ns]")
+    dates = np.array([None if entry is None else entry[0] for entry in found], dtype="datetime64[us]")
     return dates, zones.pop() if len(zones) == 1 else "UTC"
 
 
@@ -231,8 +231,8 @@ def parse_clock(cells: Sequence[str], places: Sequence[str]) -> FloatArray:
     return seconds
 
 
-def _read_date(cell: str, place: str) -> tuple[int, str]:
-    """Return the nanoseconds since 1970 of a date, and its zone, "" if it states none."""
+def _read_date(cell: str, place: str) -> tuple[np.datetime64, str]:
+    """Return the instant of a date, and its zone, "" if it states none."""
     text = cell.strip()
     if match := _GERMAN.fullmatch(text):
         text = f"{match[3]}-{int(match[2]):02d}-{int(match[1]):02d}{match[4]}"

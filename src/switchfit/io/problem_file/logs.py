@@ -18,7 +18,7 @@ from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable, LogTable, is_date
 from switchfit.io.user_files import build_at
 from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Dates, as_dates, make_origin
+from switchfit.problem.dates import Dates, as_date, make_origin
 from switchfit.runtime.errors import InputError
 
 
@@ -71,8 +71,8 @@ def _place_window(log: Log, table: LogTable, run: ExperimentTable) -> tuple[list
         raise ValueError(f"window = [{ends[0]}, {ends[1]}] has dates, and {log.source} has {other}. Give both alike.")
     zone = run.time_zone or log.time_zone
     dates = log.dates.localize(zone, log.source) if zone else log.dates
-    origin = make_origin(int(dates.instants[0]), zone)
-    limits = [float(origin.to_numbers(as_dates(end, "window"), "s", "window")) for end in ends]
+    origin = make_origin(dates.instants[0], zone)
+    limits = [float(origin.to_numbers(as_date(end, "window"), "s", "window")) for end in ends]
     return limits, origin.to_numbers(log.dates, "s", log.source)
 
 
@@ -119,9 +119,9 @@ def find_origin(table: ExperimentTable, logs: Sequence[Log]) -> Any:
         return None  # the experiment says which dates have zones and which have none
     zone = table.time_zone or (zones.pop() if len(zones) == 1 else "UTC")
     starts = [
-        as_dates(log.start if log.time_zone else log.start.replace(tzinfo=None), "origin") for log in dated if log.start
+        as_date(log.start if log.time_zone else log.start.replace(tzinfo=None), "origin") for log in dated if log.start
     ]
-    return make_origin(min(int((start.localize(zone, "origin") if zone else start).instants) for start in starts), zone)
+    return make_origin(min((start.localize(zone, "origin") if zone else start).instants for start in starts), zone)
 
 
 def _keep_dates(item: LogTable, log: Log, run: ExperimentTable) -> bool:
