@@ -1,7 +1,8 @@
 """Every experiment and figure of Section V of the paper, with its numbers compared to ours.
 
-One module per part. Each has ``compute(quick, folder, say)``, which returns results as plain numbers and lists,
-``draw(found)``, which draws figures from these alone, and ``rows(found)``, lines of the table. `run` runs all parts.
+One module per part. Each has a TITLE, ``compute(quick, folder, say)``, which returns results as plain numbers and lists
+and keeps what its long studies have done in a folder, ``draw(found)``, which returns figures drawn from these alone by
+the names of their files, and ``rows(found)``, lines of the table. `run` runs all parts.
 
 Run all parts: figures, ``results.json``, and the table that compares the paper's numbers with ours.
 """
@@ -15,16 +16,17 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from switchfit.paper import convergence, drawing, horizon, lti, magic, noise, starts, trials
-from switchfit.paper.vehicle import Found, Part, Row, Say
+from switchfit.paper import convergence, horizon, lti, magic, noise, starts, trials, vehicle
+from switchfit.paper.vehicle import Found, Say
 from switchfit.runtime.errors import InputError, get_first_line
 from switchfit.runtime.files import write_atomically
 
 #: Name -> part, in the order of the paper.
-PARTS: Mapping[str, Part] = {
-    "vehicle": drawing,
+PARTS: Mapping[str, ModuleType] = {
+    "vehicle": vehicle,
     "lti": lti,
     "magic-formula": magic,
     "convergence": convergence,
@@ -100,7 +102,8 @@ def table(results: Mapping[str, Found]) -> str:
     """Return a Markdown table of the paper's numbers and ours, from the content of ``results.json``."""
     lines = ["| claim | paper | switchfit | remark |", "|---|---|---|---|"]
     for name, entry in results.items():
-        lines += [_line(row) for row in PARTS[name].rows(entry["found"])]
+        for row in PARTS[name].rows(entry["found"]):
+            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |")
     seconds = sum(entry["seconds"] for entry in results.values())
     fewer = [name for name, entry in results.items() if entry["quick"]]
     note = f"switchfit {version('switchfit')}, {seconds:.0f} s in all."
@@ -112,10 +115,6 @@ def table(results: Mapping[str, Found]) -> str:
 def _lines(results: Mapping[str, Found]) -> str:
     """Return JSON with a line for each part."""
     return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items()) + "\n}\n"
-
-
-def _line(row: Row) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
 
 
 def _load_earlier(path: Path) -> dict[str, Any]:
