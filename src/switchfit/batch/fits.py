@@ -1,4 +1,4 @@
-"""What many fits found: arrays with one entry a fit.
+"""What many fits found: arrays with one entry a fit. One model, many logs: every log a problem of its own.
 
 Save many fits as one NumPy archive, and load them without losing a bit.
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,23 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import read_arrays, run_chunks, write_arrays
-from switchfit.batch.study import list_places
-from switchfit.batch.verdict import (
-    count_priors,
-    find_doubts,
-    has_converged,
-    judge_many,
-    measure_variance,
-)
+from switchfit.batch.program import Limits
+from switchfit.batch.study import StudyOfLogs, list_places
+from switchfit.batch.verdict import count_priors, find_doubts, has_converged, judge_many, measure_variance
 from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import check_settings
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.faults import refuse_hidden_switches
 from switchfit.fit.result import Fit, interval, measure_quantile
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
-from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_level, as_path
+from switchfit.problem.problem import Problem, require_estimable
+from switchfit.problem.validation import as_callable, as_instance, as_level, as_path, as_sequence, join_names
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.json_records import find_dtype, from_json, to_json
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
@@ -471,3 +467,73 @@ def list_origins(problem: Problem) -> tuple[Origin | None, ...]:
         for place in places[places >= 0].tolist():
             found[place] = experiment.origin
     return tuple(found)
+
+
+def estimate_many(
+    problems: Sequence[Problem],
+    *,
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    client: Any = None,
+    folder: str | Path | None = None,
+    callback: Callable[[int, int], object] | None = None,
+) -> Fits:
+    """Fit many problems of one model, each with its own data, guess and mesh.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        With the same modes, mode sequences, kinds of data and unknowns. Numbers of samples may differ; problems whose
+        padded lengths agree share one compiled program.
+    tolerance, max_iterations : as of `estimate`
+    client, folder, callback : as of `monte_carlo`
+
+    Returns
+    -------
+    Fits
+        In the order of the problems. Fits whose integration error turns out too large are done again by `estimate`.
+
+    Raises
+    ------
+    ValueError
+        If the problems differ in more than their numbers, or the folder holds something else.
+    TypeError
+        If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate, monte_carlo, multistart
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fits = sf.estimate_many([heater_problem() for _ in range(3)])
+    >>> fits.theta.shape, bool(fits.success.all())
+    ((3, 2), True)
+    """
+    problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
+    limits = Limits(*check_settings(tolerance, max_iterations))
+    how = LongRun.check(client, folder, callback)
+    if not problems:
+        raise ValueError("estimate_many needs one problem or more; got none.")
+    first = problems[0]
+    for k, problem in enumerate(problems):
+        as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
+        require_estimable(problem)
+        if problem.theta_names != first.theta_names or problem.is_sigma_known is not first.is_sigma_known:
+            raise ValueError(
+                f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
+                f"{join_names(problem.theta_names)}, the first one {join_names(first.theta_names)}. Fit it by itself."
+            )
+        units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
+        if units[0] != units[1]:
+            raise ValueError(
+                f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
+                "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
+            )
+    starts = np.array([problem.initial_theta for problem in problems])
+    study = StudyOfLogs(first, [], starts, limits, 0, problems)
+    found = repeat(first, study, len(problems), "Logs", how)
+    every = zip(*map(list_origins, problems), strict=True)
+    return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})

@@ -19,7 +19,7 @@ from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.mesh import Mesh, split_by_cell
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
-from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_near_guards
+from switchfit.fit.evaluator import Evaluator, place_on_near_guards
 from switchfit.fit.trajectory import compare, replace_values
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
@@ -355,14 +355,6 @@ class SimulatedStudy(Study):
                 drawn.append(self.clean)
                 errors[place] = error
         return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
-
-    def measure_variation(self, runs: range) -> float:
-        """Return J of the data of one run that are met by their means; in the others it differs by noise alone."""
-        return self._variation
-
-    @cached_property
-    def _variation(self) -> float:
-        return float(measure_variation(self.problem_of(0)).sum())
 
     def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
