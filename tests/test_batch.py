@@ -236,18 +236,6 @@ def test_monte_carlo_is_the_same_as_single_fits(problem, noise):
     assert np.ptp(study.theta[:, 0]) > 1e-3
 
 
-@pytest.mark.slow
-def test_several_experiments_each_with_its_own_noise():
-    runs = [
-        sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=s), ("on", "off"), (2.0,), 0.0, 6.0)
-        for s in (0.01, 0.1)
-    ]
-    problem = sf.Problem(ROOM, runs, {"k": 0.9})
-    study = sf.monte_carlo(problem, 60, theta=[2.1, 3.0, 0.8])
-    assert study.success.all()
-    assert 5 < study.standard_deviation[1] / study.standard_deviation[0] < 20
-
-
 def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
     """As with a GPU: in calls of 16 fits, not of 4096, and only what JAX evaluates."""
     monkeypatch.setattr(program, "CHUNK_IN_LOCKSTEP", 16)

@@ -214,12 +214,3 @@ def test_command_writes_figures_and_table_and_names_the_parts(tmp_path):
     wrong = runner.invoke(app, ["paper", "--only", "fig7", "--out", str(tmp_path)])
     assert wrong.exit_code == 2
     assert f"there is no part 'fig7'; the parts are {', '.join(PARTS)}" in wrong.output
-
-
-def test_ends_that_agree_are_counted_together():
-    far, near = ([5.0, 9.0, 0.7], 1.0), ([5.0, 9.0, 0.7 + 1e-9], 1.0)
-    ends = []
-    for theta, cost in (far, (None, None), near, (None, None)):
-        status = types.SimpleNamespace(successful=theta is not None)
-        starts._count(ends, types.SimpleNamespace(status=status, theta=np.array(theta), cost=cost) if theta else None)
-    assert [(end["cost"], end["count"]) for end in ends] == [(1.0, 2), (None, 2)]
