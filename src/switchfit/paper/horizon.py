@@ -17,7 +17,7 @@ from switchfit.batch.starts import multistart
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, stick_slip
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray, ReferenceSignal
 
 TITLE = "Horizon"
 #: Ends of the horizon (s); slip lasts from 6 to 10 s.
@@ -53,10 +53,7 @@ def _sample_sets() -> list[Found]:
     found: list[Found] = []
     for label, tf, times in sets:
         theta = TRUTH if tf > end else (TRUTH[0], TRUTH[2])
-        positions = vehicle.states_at(path, times)[:, [0, 2]]
-        hessian = evaluate(
-            stick_slip(Measurements(times, positions, vehicle.position, sigma=SIGMA), theta, tf=tf)
-        ).hessian
+        hessian = evaluate(vehicle.fit_positions(path, times, theta, SIGMA, tf)).hessian
         inside = int(np.sum((times > begin) & (times <= end)))
         errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
         found.append({"label": label, "samples": len(times), "in_slip": inside, "mu": float(errors[-1])})
@@ -71,13 +68,9 @@ def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
     times = np.arange(round(RATE * tf) + 1) / RATE
     names = NAMES if tf > TRUTH[1] else (NAMES[0], NAMES[2])
     truth = tuple(TRUTH[NAMES.index(name)] for name in names)
-    noisy = stick_slip(
-        Measurements(times, vehicle.states_at(path, times)[:, [0, 2]], vehicle.position, sigma=SIGMA), truth, tf=tf
-    )
-    hessian = evaluate(noisy).hessian
-    study = vehicle.complete(
-        monte_carlo(noisy, runs, theta=truth, seed=round(10 * tf), folder=folder / f"noise-{tf:g}")
-    )
+    noisy = vehicle.fit_positions(path, times, truth, SIGMA, tf)
+    hessian, seed = evaluate(noisy).hessian, round(10 * tf)
+    study = vehicle.complete(monte_carlo(noisy, runs, theta=truth, seed=seed, folder=folder / f"noise-{tf:g}"))
     here = slice(0, np.searchsorted(path.times, tf - 1e-9) + 1)  # without the second of two nodes at tf
     exact = stick_slip(ReferenceSignal.from_samples(path.times[here], path.states[here]), truth, tf=tf)
     search = vehicle.complete(multistart(exact, _starts(len(names), tf, starts), folder=folder / f"starts-{tf:g}"))

@@ -11,7 +11,7 @@ from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.fit.result import inverse_on
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, PAGE, RED, SYMBOLS, Figure, Found, Row, Say, tidy
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 
 TITLE = "Measurement noise (Fig. 5)"
@@ -28,10 +28,10 @@ FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
 
 def build_problem(method: str, sigma: float) -> Problem:
     """Return the problem of one of the methods to fit the same samples; a reference signal has no sigma."""
-    clean = vehicle.states_at(vehicle.simulate_drive(step=1.0), TIMES)[:, [0, 2]]
+    path = vehicle.simulate_drive(step=1.0)
     if method == FILTERED:
-        return vehicle.stick_slip(vehicle.gps_reference(TIMES, clean))
-    return vehicle.stick_slip(Measurements(TIMES, clean, vehicle.position, sigma=sigma or 1.0, names=("X", "Y")))
+        return vehicle.stick_slip(vehicle.gps_reference(TIMES, vehicle.positions_at(path, TIMES)))
+    return vehicle.fit_positions(path, TIMES, vehicle.START, sigma or 1.0, vehicle.HORIZON)
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:

@@ -181,15 +181,22 @@ def on_tyres(data: Data, speeds: Input, parameters: dict[str, Any] | None = None
 def log_on_tyres(times: FloatArray, speeds: Input) -> tuple[FloatArray, Trajectory]:
     """Return positions (K, 2) of the Magic Formula vehicle at `times`, and its trajectory."""
     path = simulate(on_tyres(Measurements(times, np.zeros((len(times), 2)), position), speeds))
-    return states_at(path, times)[:, [0, 2]], path
+    return positions_at(path, times), path
 
 
-def states_at(path: Trajectory, times: FloatArray) -> FloatArray:
-    """Return states (K, n) at times that are nodes of the trajectory."""
+def positions_at(path: Trajectory, times: FloatArray) -> FloatArray:
+    """Return positions (K, 2) at times that are nodes of the trajectory."""
     nodes = np.searchsorted(path.times, np.asarray(times) - 1e-9)
     if not np.allclose(path.times[nodes], times, rtol=0, atol=1e-9):
         raise ValueError("these times are not nodes of the trajectory.")
-    return path.states[nodes]
+    return path.states[nodes][:, [0, 2]]
+
+
+def fit_positions(path: Trajectory, times: FloatArray, theta: tuple[float, ...], sigma: float, tf: float) -> Problem:
+    """Return the estimation problem of equation (18) with positions along a trajectory as measurements."""
+    return stick_slip(
+        Measurements(times, positions_at(path, times), position, sigma=sigma, names=("X", "Y")), theta, tf=tf
+    )
 
 
 def curve(path: Trajectory) -> FloatArray:
@@ -220,7 +227,7 @@ def fit_resticks(
         problem = stick_slip(reference, start, stick_force=stick_force, restick=restick)
         fit = fit_locally(problem)
         path = fit.trajectory
-        off = states_at(path, np.arange(float(len(positions))))[:, [0, 2]] - positions
+        off = positions_at(path, np.arange(float(len(positions)))) - positions
         found[restick] = {
             **summary(fit),
             "initial": curve(simulate(problem)).tolist(),
