@@ -18,7 +18,7 @@ from benchmarks.starts.bounces import FALL, ball_on_guards
 from switchfit.batch import program, starts
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
-from switchfit.batch.program import CHUNK, Batch, Limits, Varying, _minimize_fits
+from switchfit.batch.program import CHUNK, Batch, Limits, _minimize_fits
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
@@ -693,7 +693,7 @@ def test_an_end_that_is_out_of_order_by_rounding_is_finished():
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     starts = np.array([[-2.2e-11, 0.9], [6.0 + 1e-9, 0.8], [2.0, 0.8]])
     meshes = evaluator_of(problem).meshes
-    found = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
+    found = Batch(problem, meshes, {}, LIMITS).fit(starts)
     assert "ERROR" not in found.status.tolist()
     assert np.all(found.theta[:, 0] >= 0.0)
     assert np.all(found.theta[:, 0] <= 6.0)
@@ -703,7 +703,7 @@ def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch, 
     """The program leaves the second fit elsewhere: where it did is not where `minimize` begins."""
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     meshes, starts = evaluator_of(problem).meshes, np.array([[1.7, 1.0], [2.0, 0.9]])
-    expected = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
+    expected = Batch(problem, meshes, {}, LIMITS).fit(starts)
 
     def leave_one(*given, layout):
         outcome = _minimize_fits(*given, layout=layout)
@@ -712,7 +712,7 @@ def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch, 
         return outcome._replace(theta=theta, settled=settled)
 
     monkeypatch.setattr(program, "_minimize_fits", leave_one)
-    found = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
+    found = Batch(problem, meshes, {}, LIMITS).fit(starts)
     assert finished == [((2.0, 0.9), 200 - expected.iterations[1])], "together they have what was allowed"
     np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=1e-8)
     assert found.status.tolist() == ["CONVERGED", "CONVERGED"]

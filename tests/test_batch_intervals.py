@@ -11,7 +11,7 @@ import pytest
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
 from switchfit.batch import simulated
-from switchfit.batch.program import Batch, Limits, Varying, _evaluate_fits, _minimize_fits
+from switchfit.batch.program import Batch, Limits, _evaluate_fits, _minimize_fits
 from switchfit.batch.study import Study
 from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.walks import Derivatives, Walks, find_ends, trace_walks
@@ -184,7 +184,7 @@ def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
 def test_evaluations_where_a_model_is_undefined_are_not_numbers():
     problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
     thetas, sides = np.array([[1.9], [2.02], [2.1]]), np.ones(3, dtype=int)
-    batch = Batch(problem, Evaluator(problem, truth).meshes, Varying((), ()), Limits(1e-7, 200))
+    batch = Batch(problem, Evaluator(problem, truth).meshes, {}, Limits(1e-7, 200))
     expected = batch.evaluate(np.arange(3), thetas, sides)
 
     def evaluate_or_raise(theta, side):

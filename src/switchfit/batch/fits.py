@@ -385,30 +385,34 @@ class Fits(Tabular, Displayed):
 
 
 class LongRun(NamedTuple):
-    """Where a long run is done and kept, who is told how far it is, and when it began (``time.perf_counter()``).
+    """When fits end, where a long run is done and kept, who is told how far it is, and when it began.
 
     Attributes
     ----------
+    limits : Limits
     client, folder : as of `run_chunks`
     callback : callable ``(done, total)``, a true value stops; or None
     began : float
+        As of ``time.perf_counter()``.
     """
 
+    limits: Limits
     client: Any
     folder: str | Path | None
     callback: Callable[[int, int], object] | None
     began: float
 
     @classmethod
-    def check(cls, client: Any, folder: Any, callback: Any) -> LongRun:
+    def check(cls, tolerance: Any, max_iterations: Any, client: Any, folder: Any, callback: Any) -> LongRun:
         """Return these settings; raise for those of the wrong type, before anything long is done."""
+        limits = Limits(*check_settings(tolerance, max_iterations))
         if client is not None and not hasattr(client, "submit"):
             raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
         if folder is not None:
             as_path(folder, "folder")
         if callback is not None:
             as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
-        return cls(client, folder, callback, time.perf_counter())
+        return cls(limits, client, folder, callback, time.perf_counter())
 
 
 def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) -> dict[str, Any]:
@@ -513,8 +517,7 @@ def estimate_many(
     ((3, 2), True)
     """
     problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
-    limits = Limits(*check_settings(tolerance, max_iterations))
-    how = LongRun.check(client, folder, callback)
+    how = LongRun.check(tolerance, max_iterations, client, folder, callback)
     if not problems:
         raise ValueError("estimate_many needs one problem or more; got none.")
     first = problems[0]
@@ -533,7 +536,7 @@ def estimate_many(
                 "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
             )
     starts = np.array([problem.initial_theta for problem in problems])
-    study = StudyOfLogs(first, [], starts, limits, 0, problems)
+    study = StudyOfLogs(first, [], starts, how.limits, 0, problems)
     found = repeat(first, study, len(problems), "Logs", how)
     every = zip(*map(list_origins, problems), strict=True)
     return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})

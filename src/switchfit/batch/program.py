@@ -20,7 +20,7 @@ from __future__ import annotations
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -69,18 +69,8 @@ some of them to other threads takes an eighth of the time of all fits."""
 compile_for_layout = partial(jax.jit, static_argnames=("layout",), compiler_options=ONE_BY_ONE)
 
 
-class Varying(NamedTuple):
-    """What differs from fit to fit, each with a leading axis: the leaves of all `Arguments`, in JAX's order.
-
-    Attributes
-    ----------
-    places : tuple of int
-        Which leaves.
-    values : tuple of arrays, (R, ...) each
-    """
-
-    places: tuple[int, ...]
-    values: tuple[Any, ...]
+Varying = Mapping[int, Any]
+"""What differs from fit to fit: values (R, ...) of leaves of all `Arguments`, by their places in JAX's order."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +195,7 @@ class Inputs(NamedTuple):
 
 
 def replace_leaves(
-    arguments: Sequence[Arguments], places: tuple[int, ...], values: Sequence[Any]
+    arguments: Sequence[Arguments], places: Iterable[int], values: Sequence[Any]
 ) -> tuple[Arguments, ...]:
     """Return the arguments of all experiments with some of their leaves replaced."""
     leaves, tree = jax.tree.flatten(tuple(arguments))
@@ -343,7 +333,7 @@ class Batch:
     problem : Problem
     meshes : one an experiment, the same for all fits
     varying : Varying
-        What replaces the problem's own numbers, R of each.
+        What replaces the problem's own numbers.
     limits : Limits
 
     Attributes
@@ -361,7 +351,7 @@ class Batch:
     @cached_property
     def layout(self) -> Layout:
         """Layout of the programs."""
-        return choose_layout(self.evaluator, self.varying.places)
+        return choose_layout(self.evaluator, tuple(self.varying))
 
     def _use_device(self) -> AbstractContextManager[Any]:
         """Return a context in which programs with machine code run on the CPU, whatever JAX's default device is, and
@@ -378,7 +368,7 @@ class Batch:
     @cached_property
     def _values(self) -> tuple[jax.Array, ...]:
         """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of a program."""
-        return tuple(jnp.asarray(pad_fits(value, self.layout.size)) for value in self.varying.values)
+        return tuple(jnp.asarray(pad_fits(value, self.layout.size)) for value in self.varying.values())
 
     def fit(self, starts: FloatArray) -> Chunk:
         """Fit all of them.
@@ -438,8 +428,8 @@ class Batch:
     def _give_data(self, k: int) -> Evaluator:
         """Return the evaluator with the data of the k-th fit."""
         with use_float64():
-            values = [jnp.asarray(value[k]) for value in self.varying.values]
-            self.evaluator.replace_arguments(replace_leaves(self._base, self.varying.places, values))
+            values = [jnp.asarray(value[k]) for value in self.varying.values()]
+            self.evaluator.replace_arguments(replace_leaves(self._base, self.varying, values))
         return self.evaluator
 
     def _run_program(self, starts: FloatArray) -> Outcome:
@@ -471,7 +461,7 @@ class Batch:
         def build(meshes: Sequence[Mesh]) -> Evaluator:
             return Batch(problem, meshes, varying, limits)._give_data(k)
 
-        has_own_times = len(varying.places) == len(jax.tree.leaves(self._base))
+        has_own_times = len(varying) == len(jax.tree.leaves(self._base))
         follower = None if has_own_times else Follower(self.evaluator, build)
         hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
         return minimize_cost(self.evaluator, start, hessian, *limits, follower=follower)

@@ -33,16 +33,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import jax
 import numpy as np
 
 from switchfit.batch.fits import Fits, LongRun, repeat
-from switchfit.batch.program import Limits, Varying
+from switchfit.batch.program import Varying
 from switchfit.batch.simulated import build_study
 from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_study
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import measure_variation
 from switchfit.fit.result import inverse_on
 from switchfit.problem.data import FloatArray, Measurements
@@ -217,8 +215,7 @@ def bootstrap(
     if block is not None and resample != "blocks":
         raise ValueError(f"block is the length of blocks: give it with resample='blocks', not with {resample!r}.")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    limits = Limits(*check_settings(tolerance, max_iterations))
-    how = LongRun.check(client, folder, callback)
+    how = LongRun.check(tolerance, max_iterations, client, folder, callback)
     if not estimate.status.successful:
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
@@ -229,12 +226,12 @@ def bootstrap(
         if len(problem.experiments) < 2:
             raise ValueError("resample='runs' needs two experiments or more; this problem has one. Take 'residuals'.")
         meshes = list(estimate.evaluator_at_solution().meshes)
-        study: Study = StudyOfRuns(problem, meshes, estimate.theta[None], limits, seed)
+        study: Study = StudyOfRuns(problem, meshes, estimate.theta[None], how.limits, seed)
         resampled[np.concatenate([where[where >= 0] for where in problem.unknowns.times])] = False
     else:
         draw = _Draw(estimate, problem, resample, block)
         size = draw.block
-        study, _ = build_study(problem, runs, estimate.theta, estimate.theta, draw, seed, limits)
+        study, _ = build_study(problem, runs, estimate.theta, estimate.theta, draw, seed, how.limits)
     acceleration = _compute_acceleration(estimate, by_run=resample == "runs")
     return Bootstrap(
         **repeat(problem, study, runs, "Bootstrap", how),
@@ -349,14 +346,11 @@ class StudyOfRuns(Study):
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return the weights of all samples (R, K, q), times those of their experiments."""
-        weights = self.weigh(runs)
-        leaves, tree = jax.tree.flatten(self.arguments)
-        places = jax.tree.unflatten(tree, range(len(leaves)))
-        changed = {}
+        weights, (leaves, places), changed = self.weigh(runs), self.leaves, {}
         for e, own in enumerate(places):
             for samples in own.samples:
                 changed[samples.weight] = weights[:, e, None, None] * np.asarray(leaves[samples.weight])[None]
-        return Varying(tuple(changed), tuple(changed.values())), {}
+        return changed, {}
 
     def measure_variation(self, runs: range) -> FloatArray:
         """Return J of data that are met by their means: (R,)."""

@@ -37,7 +37,7 @@ from switchfit.batch.verdict import (
     has_converged,
     measure_variance,
 )
-from switchfit.discretization.mesh import Arguments, Mesh, build_arguments
+from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.branches import has_corners
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
 from switchfit.fit.accuracy import cost_error
@@ -213,13 +213,15 @@ class Study:
         return choose_chunk_size(self.problem)
 
     @cached_property
-    def arguments(self) -> tuple[Arguments, ...]:
-        """Those of the problem itself."""
-        return tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+    def leaves(self) -> tuple[list[Any], Any]:
+        """The leaves of the problem's own arguments, and arguments that have the place of each leaf instead."""
+        arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+        leaves, tree = jax.tree.flatten(arguments)
+        return leaves, jax.tree.unflatten(tree, range(len(leaves)))
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return the data of some runs, and the errors of those that have none, by their places."""
-        return Varying((), ()), {}
+        return {}, {}
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
@@ -325,11 +327,10 @@ class Study:
         """Return a digest of everything that a result depends on."""
         unknowns, data = self.problem.unknowns, self.stack_data([0])[0]  # run 0 stands for all
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        leaves = jax.tree.leaves(self.arguments)
-        shared = [np.asarray(leaf) for place, leaf in enumerate(leaves) if place not in data.places]
+        shared = [np.asarray(leaf) for place, leaf in enumerate(self.leaves[0]) if place not in data]
         settings = type(self).__name__, self.limits, self.seed, unknowns.names, self.problem.solver
         return compute_fingerprint(
-            CHUNK_FORMAT, settings, self.problem.digests, self.starts, *bounds, *data.values, *shared
+            CHUNK_FORMAT, settings, self.problem.digests, self.starts, *bounds, *data.values(), *shared
         )
 
 
@@ -382,8 +383,8 @@ class StudyOfLogs(Study):
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return all arguments of some problems."""
         leaves = [jax.tree.leaves(tuple(evaluator_of(self.problems[k]).arguments)) for k in runs]
-        stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
-        return Varying(tuple(range(len(stacked))), stacked), {}
+        stacked = (np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
+        return dict(enumerate(stacked)), {}
 
     def problem_of(self, run: int) -> Problem:
         """Return one of the problems."""
