@@ -66,11 +66,7 @@ def _reference() -> ReferenceSignal:
 
 
 def _matrix(k: Any, c: Any) -> Any:
-    return (
-        jnp.array([[0.0, 1.0], [0.0, 0.0]])
-        - jnp.array([[0.0, 0.0], [1.0, 0.0]]) * k
-        - jnp.diag(jnp.array([0.0, 1.0])) * c
-    )
+    return jnp.array([[0.0, 1.0], [-k, -c]])
 
 
 def exact(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
