@@ -33,7 +33,8 @@ FRICTIONS: Mapping[int, tuple[str, str]] = {1: ("mu_front", "coulomb_front"), -1
 """Viscous and Coulomb's friction of each axle."""
 
 
-STATES, UNITS = ("X", "dX", "Y", "dY", "theta", "dtheta"), ("m", "m/s", "m", "m/s", "rad", "rad/s")
+STATES: tuple[str, ...] = ("X", "dX", "Y", "dY", "theta", "dtheta")
+UNITS: tuple[str, ...] = ("m", "m/s", "m", "m/s", "rad", "rad/s")
 
 FORCES = ("F1", "F2", "F3", "F4 (N)")
 """Channels of the input: the driving forces of the wheels."""
@@ -178,7 +179,10 @@ def skid_steer(
         },
         others={"slope_x": slope_x, "slope_y": slope_y},
     )  # fmt: skip
-    resets = {}
+    fields, resets = {}, {}
+    for name in names:
+        field: Any = _move_by_input if forces is None else partial(_move, forces[0 if name == "stick" else 1])
+        fields[name] = partial(field, STUCK[name], constants)
     if restick == "reset":
         resets = {
             (before, after): partial(_stop_axles, STUCK[after], constants)
@@ -186,12 +190,7 @@ def skid_steer(
             if not set(STUCK[after]) <= set(STUCK[before])
         }
     return HybridSystem(
-        modes={
-            name: partial(_move_by_input, STUCK[name], constants)
-            if forces is None
-            else partial(_move, forces[len(STUCK[name]) < 2], STUCK[name], constants)
-            for name in names
-        },
+        modes=fields,
         initial_state=check_length(initial_state, STATES),
         reset_maps=resets,
         state_names=STATES,
