@@ -231,8 +231,8 @@ def _drive(constants: Constants, aligning: bool, t: Any, x: Any, p: Any, u: Any)
     m = c["m_b"] + 4 * c["m_w"]
     inertia = c["m_b"] * (c["B_l"] ** 2 + c["B_w"] ** 2) / 12 + 4 * c["m_w"] * (a**2 + b**2)
     static = 1e-3 * c["g"] * m / 4
-    ahead = a * np.array([1, 1, -1, -1])  # wheels 1 and 2 in front,
-    left = b * np.array([-1, 1, 1, -1])  # 2 and 3 on the left
+    ahead = a * np.array([1.0, 1.0, -1.0, -1.0])  # wheels 1 and 2 in front,
+    left = b * np.array([-1.0, 1.0, 1.0, -1.0])  # 2 and 3 on the left
 
     def loads(acceleration: Any) -> Any:
         load = static - 1e-3 * m * height / 4 * (acceleration[0] * ahead / a**2 + acceleration[1] * left / b**2)
