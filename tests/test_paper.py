@@ -191,13 +191,6 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert [entry["quick"] for entry in again.values()] == [False, True]
 
 
-def test_damaged_results_are_named_when_one_part_is_run(tmp_path, monkeypatch):
-    parts_that_find(monkeypatch, lti=lambda: {"value": 1})
-    (tmp_path / "results.json").write_text('{"noise": ')
-    with pytest.raises(ValueError, match=r"results\.json is damaged \(.*\): remove it, and run all parts again"):
-        run(tmp_path, quick=True, only="lti")
-
-
 def test_interrupted_study_is_not_taken_for_a_result(tmp_path, monkeypatch):
     monkeypatch.setattr(noise, "monte_carlo", MagicMock(return_value=MagicMock(requested=5, __len__=lambda study: 3)))
     with pytest.raises(KeyboardInterrupt):

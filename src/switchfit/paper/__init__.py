@@ -21,7 +21,6 @@ from typing import Any
 
 from switchfit.paper import convergence, horizon, lti, magic, noise, starts, trials, vehicle
 from switchfit.paper.vehicle import Found, Say
-from switchfit.runtime.errors import InputError, get_first_line
 from switchfit.runtime.files import write_atomically
 
 #: Name -> part, in the order of the paper.
@@ -38,7 +37,7 @@ PARTS: Mapping[str, ModuleType] = {
 RESULTS, TABLE = "results.json", "table.md"
 
 
-def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | None = None) -> dict[str, Any]:
+def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = lambda text: None) -> dict[str, Any]:
     """Run every part of the paper, or one, and write the results.
 
     Parameters
@@ -71,20 +70,20 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
     """
     if only is not None and only not in PARTS:
         raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
-    tell = say or (lambda text: None)
     names = list(PARTS) if only is None else [only]
     unfinished = out / f".unfinished-{version('switchfit')}-{'quick' if quick else 'full'}-{only or 'all'}"
     unfinished.mkdir(parents=True, exist_ok=True)
-    results = _load_earlier(out / RESULTS) if only is not None else {}
+    is_kept = only is not None and (out / RESULTS).exists()
+    results: dict[str, Any] = json.loads((out / RESULTS).read_bytes()) if is_kept else {}
     for number, name in enumerate(names, start=1):
         part, place = PARTS[name], f"[{number}/{len(names)}] {PARTS[name].TITLE}"
         kept = unfinished / f"{name}.json"
         if kept.exists():
             entry = json.loads(kept.read_bytes())
-            tell(f"{place}: done before the interruption")
+            say(f"{place}: done before the interruption")
         else:
             began = time.perf_counter()
-            found = part.compute(quick, unfinished / name, lambda text, place=place: tell(f"{place}: {text}"))  # type: ignore[misc]  # mypy cannot infer the default
+            found = part.compute(quick, unfinished / name, lambda text, place=place: say(f"{place}: {text}"))  # type: ignore[misc]  # mypy cannot infer the default
             entry = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
             write_atomically(json.dumps(entry), kept)
         results[name] = entry
@@ -115,17 +114,6 @@ def table(results: Mapping[str, Found]) -> str:
 def _lines(results: Mapping[str, Found]) -> str:
     """Return JSON with a line for each part."""
     return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items()) + "\n}\n"
-
-
-def _load_earlier(path: Path) -> dict[str, Any]:
-    """Return results of parts that were run before; empty if there is no file."""
-    if not path.exists():
-        return {}
-    try:
-        earlier: dict[str, Any] = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({get_first_line(error)}): remove it, and run all parts again.") from error
-    return earlier
 
 
 def _save(figure: Any, path: Path) -> None:
