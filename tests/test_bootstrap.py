@@ -126,7 +126,7 @@ def with_reference():
 
 
 REFUSED = {
-    "resample must be one of residuals, wild, blocks; got 'pairs'": made(resample="pairs"),
+    "resample must be 'residuals', 'wild' or 'blocks'; got 'pairs'": made(resample="pairs"),
     "block is the length of blocks: give it with resample='blocks'": made(block=3),
     "block must lie between 1 and the 40 samples there are; got 41": made(resample="blocks", block=41),
     "runs must be 1 or more; got 0": made(runs=0),
