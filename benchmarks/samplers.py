@@ -18,7 +18,7 @@ import numpy as np
 
 import switchfit as sf
 from switchfit.batch.posterior import LogPosterior
-from switchfit.paper.vehicle import TRUTH, position, simulate_drive, states_at, stick_slip
+from switchfit.paper.vehicle import TRUTH, position, positions_at, simulate_drive, stick_slip
 
 CHAINS, WARMUP, DRAWS = 4, 500, 2000
 WALKERS = 32
@@ -56,7 +56,7 @@ class Run(NamedTuple):
 def vehicle(noise: float = 0.1) -> sf.Problem:
     """The vehicle of the paper: positions at 10 Hz with noise of 0.1 m."""
     times = np.linspace(0.1, 15.0, 150)
-    xy = states_at(simulate_drive(), times)[:, [0, 2]] + noise * np.random.default_rng(1).standard_normal((150, 2))
+    xy = positions_at(simulate_drive(), times) + noise * np.random.default_rng(1).standard_normal((150, 2))
     return stick_slip(sf.Measurements(times, xy, observe=position, sigma=noise, names=("X", "Y")), TRUTH)
 
 

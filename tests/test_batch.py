@@ -20,13 +20,14 @@ from benchmarks.starts.bounces import FALL, ball_on_guards
 from switchfit.batch import program, starts
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
-from switchfit.batch.program import CHUNK, Batch, Limits, Varying, _minimize_fits
+from switchfit.batch.program import CHUNK, Batch, Limits, _minimize_fits
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Breakpoints, Constraints, minimize_traced, nonnegative_minimum
 from switchfit.problem.functions import use_float64
+from switchfit.strategy.starts import draw_starts
 
 TIMES = np.linspace(0.25, 6.0, 24)
 TRUTH = np.array([2.1, 0.8])
@@ -232,18 +233,6 @@ def test_monte_carlo_is_the_same_as_single_fits(problem, noise):
     assert np.ptp(study.theta[:, 0]) > 1e-3
 
 
-@pytest.mark.slow
-def test_several_experiments_each_with_its_own_noise():
-    runs = [
-        sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=s), ("on", "off"), (2.0,), 0.0, 6.0)
-        for s in (0.01, 0.1)
-    ]
-    problem = sf.Problem(ROOM, runs, {"k": 0.9})
-    study = sf.monte_carlo(problem, 60, theta=[2.1, 3.0, 0.8])
-    assert study.success.all()
-    assert 5 < study.standard_deviation[1] / study.standard_deviation[0] < 20
-
-
 def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
     """As with a GPU: in calls of 16 fits, not of 4096, and only what JAX evaluates."""
     monkeypatch.setattr(program, "CHUNK_IN_LOCKSTEP", 16)
@@ -325,7 +314,7 @@ def bump(t, x, p):
     return jnp.array([-2.0 * x[0]])
 
 
-def two_minima(**bounds):
+def two_minima():
     """One pulse, given twice in the data: a schedule with one gap fits the first or the second."""
     system = sf.HybridSystem({"rest": pulses, "pulse": bump}, [0.9])
     run = lambda data, times: sf.Experiment(data, ("rest", "pulse", "rest"), times, 0.0, 10.0)  # noqa: E731
@@ -359,14 +348,12 @@ def test_multistart_finds_both_minima_and_estimates_the_lower_one():
     assert "cost above the best" in study.plot().axes[0].get_ylabel()
 
 
-@pytest.mark.slow
 def test_fixed_times_and_bounds_keep_their_place_among_the_starts():
     data = sf.Measurements(TIMES, np.zeros(24), sigma=0.01)
     times = (1.0, sf.Parameter(2.0, fixed=True), sf.Parameter(3.0, lower=2.5, upper=3.5), 4.0)
     run = sf.Experiment(data, ("on", "off", "on", "off", "on"), times, 0.0, 6.0)
     problem = sf.Problem(ROOM, run, {"k": sf.Parameter(0.8, lower=0.1, upper=2.0)}, min_duration=0.1)
-    study = sf.multistart(problem, 20, max_iterations=0)
-    first, third, fourth, k = study.start.T
+    first, third, fourth, k = draw_starts(problem, 20, 0).T
     assert np.all((first >= 0.1 - 1e-12) & (first <= 1.9 + 1e-12))
     assert np.all((third >= 2.5) & (third <= 3.5) & (fourth - third >= 0.1 - 1e-12) & (fourth <= 5.9 + 1e-12))
     assert k.min() < 0.4
@@ -701,7 +688,7 @@ def test_an_end_that_is_out_of_order_by_rounding_is_finished():
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     starts = np.array([[-2.2e-11, 0.9], [6.0 + 1e-9, 0.8], [2.0, 0.8]])
     meshes = evaluator_of(problem).meshes
-    found = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
+    found = Batch(problem, meshes, {}, LIMITS).fit(starts)
     assert "ERROR" not in found.status.tolist()
     assert np.all(found.theta[:, 0] >= 0.0)
     assert np.all(found.theta[:, 0] <= 6.0)
@@ -711,7 +698,7 @@ def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch, 
     """The program leaves the second fit elsewhere: where it did is not where `minimize` begins."""
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     meshes, starts = evaluator_of(problem).meshes, np.array([[1.7, 1.0], [2.0, 0.9]])
-    expected = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
+    expected = Batch(problem, meshes, {}, LIMITS).fit(starts)
 
     def leave_one(*given, layout):
         outcome = _minimize_fits(*given, layout=layout)
@@ -720,7 +707,7 @@ def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch, 
         return outcome._replace(theta=theta, settled=settled)
 
     monkeypatch.setattr(program, "_minimize_fits", leave_one)
-    found = Batch(problem, meshes, Varying((), ()), LIMITS).fit(starts)
+    found = Batch(problem, meshes, {}, LIMITS).fit(starts)
     assert finished == [((2.0, 0.9), 200 - expected.iterations[1])], "together they have what was allowed"
     np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=1e-8)
     assert found.status.tolist() == ["CONVERGED", "CONVERGED"]

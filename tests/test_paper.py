@@ -10,10 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from switchfit.cli import app
-from switchfit.paper import PARTS, convergence, drawing, horizon, lti, magic, noise, run, starts, table, trials
+from switchfit.paper import PARTS, convergence, horizon, lti, magic, noise, run, starts, table, trials, vehicle
 from switchfit.paper.vehicle import NAMES, TRUTH, Row, wheel_speeds
 
-COEFFICIENTS = ("eigenvalues", "scaled_eigenvalues", "undetermined", "worst")
+COEFFICIENTS = ("eigenvalues", "undetermined", "worst")
 """What is found of the Hessian in the 16 coefficients of the Magic Formula."""
 
 
@@ -70,7 +70,7 @@ def test_magic_formula_reference_gives_values_like_the_paper(tmp_path, monkeypat
     monkeypatch.setattr(magic, "RAMPS", ((0.6, 3.4),))
     found = found_by(magic, tmp_path)
     (slow,) = found["ramps"]
-    assert abs(slow["theta"]["tau_2"] - magic.PAPER["tau_2"]) < 0.3  # later by the wheels' own delay
+    assert abs(slow["theta"]["tau_2"] - 11.7) < 0.3  # later by the wheels' own delay
     literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
     for fit in (literal, reset):
         assert fit["sufficient"]
@@ -85,7 +85,7 @@ def test_sixteen_coefficients_do_not_work():
     found = magic._coefficients(wheel_speeds(), lambda text: None)
     assert found.keys() == set(COEFFICIENTS)
     assert found["undetermined"] > 6
-    assert len(found["scaled_eigenvalues"]) == 16
+    assert len(found["eigenvalues"]) == 16
     assert found["eigenvalues"][0] < 1e-12 * found["eigenvalues"][-1]
 
 
@@ -99,8 +99,8 @@ def test_starts_end_at_the_truth_or_at_the_bound_of_mu_and_strategies_lead_away_
 
 
 def test_drawing_shows_all_wheels(tmp_path):
-    found = drawing.compute(True, tmp_path, lambda text: None)
-    (ax,) = drawing.draw(found)["fig2-vehicle"].axes
+    found = vehicle.compute(True, tmp_path, lambda text: None)
+    (ax,) = vehicle.draw(found)["fig2-vehicle"].axes
     assert {f"$F_{n}$ = {force:g} N" for n, force in enumerate(found["forces"], 1)} <= {t.get_text() for t in ax.texts}
 
 
@@ -191,13 +191,6 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert [entry["quick"] for entry in again.values()] == [False, True]
 
 
-def test_damaged_results_are_named_when_one_part_is_run(tmp_path, monkeypatch):
-    parts_that_find(monkeypatch, lti=lambda: {"value": 1})
-    (tmp_path / "results.json").write_text('{"noise": ')
-    with pytest.raises(ValueError, match=r"results\.json is damaged \(.*\): remove it, and run all parts again"):
-        run(tmp_path, quick=True, only="lti")
-
-
 def test_interrupted_study_is_not_taken_for_a_result(tmp_path, monkeypatch):
     monkeypatch.setattr(noise, "monte_carlo", MagicMock(return_value=MagicMock(requested=5, __len__=lambda study: 3)))
     with pytest.raises(KeyboardInterrupt):
@@ -214,12 +207,3 @@ def test_command_writes_figures_and_table_and_names_the_parts(tmp_path):
     wrong = runner.invoke(app, ["paper", "--only", "fig7", "--out", str(tmp_path)])
     assert wrong.exit_code == 2
     assert f"there is no part 'fig7'; the parts are {', '.join(PARTS)}" in wrong.output
-
-
-def test_ends_that_agree_are_counted_together():
-    far, near = ([5.0, 9.0, 0.7], 1.0), ([5.0, 9.0, 0.7 + 1e-9], 1.0)
-    ends = []
-    for theta, cost in (far, (None, None), near, (None, None)):
-        status = types.SimpleNamespace(successful=theta is not None)
-        starts._count(ends, types.SimpleNamespace(status=status, theta=np.array(theta), cost=cost) if theta else None)
-    assert [(end["cost"], end["count"]) for end in ends] == [(1.0, 2), (None, 2)]

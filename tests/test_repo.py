@@ -23,9 +23,6 @@ def tracked():
     return [path for name in listed.split("\0") if name and (path := ROOT / name).is_file()]
 
 
-#: Only `estimate` makes these.
-
-
 def test_every_key_of_problem_files_is_described_and_in_the_reference(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "docs")
     import key_pages

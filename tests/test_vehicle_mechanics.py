@@ -234,21 +234,18 @@ def test_bicycle_follows_from_forces_on_points(mode):
             Q = Q + work_of(point, force, q)
         return balance(masses, q, dq, Q)
 
+    def turn(heading, v):
+        return place(v, jnp.array([0.0, 0.0, heading]))
+
     for _ in range(5):
-        q = random.uniform(-3, 3, 3)
-        v_x, v_y, r = random.uniform([5, -2, -1], [20, 2, 1])
+        q, v, r = random.uniform(-3, 3, 3), random.uniform([5, -2], [20, 2]), random.uniform(-1, 1)
         delta, drive = random.uniform(-0.5, 0.5), random.uniform(-500, 3000)
-        dq = np.array([
-            v_x * np.cos(q[2]) - v_y * np.sin(q[2]), v_x * np.sin(q[2]) + v_y * np.cos(q[2]), r,
-        ])  # fmt: skip
+        dq = np.array([*turn(q[2], v), r])
         ddq = accelerate(*sum_forces(q, dq, delta, drive))
-        rates = evaluate(field, [*q, v_x, v_y, r], CAR, [delta, drive])
+        rates = evaluate(field, [*q, *v, r], CAR, [delta, drive])
         np.testing.assert_allclose(rates[:3], dq, rtol=1e-13, atol=1e-13)
-        cos, sin = np.cos(q[2]), np.sin(q[2])
-        # ddX = d/dt (v_x cos - v_y sin)
-        ddX = rates[3] * cos - rates[4] * sin - r * (v_x * sin + v_y * cos)
-        ddY = rates[3] * sin + rates[4] * cos + r * (v_x * cos - v_y * sin)
-        np.testing.assert_allclose([ddX, ddY, rates[5]], ddq, rtol=1e-11, atol=1e-11)
+        ddXY = jax.jvp(turn, (q[2], v), (r, rates[3:5]))[1]
+        np.testing.assert_allclose([*ddXY, rates[5]], ddq, rtol=1e-11, atol=1e-11)
 
 
 # --- a body that slides and rolls -------------------------------------------------------------------------------------

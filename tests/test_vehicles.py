@@ -22,14 +22,7 @@ from switchfit.models import (
     skid_steer,
     sliding_block,
 )
-from switchfit.models.magic_formula import (
-    ALIGNING_MOMENT,
-    MAGIC_FORMULA,
-    _curve,
-    compute_aligning_moment,
-    lateral_force,
-    longitudinal_force,
-)
+from switchfit.models.magic_formula import MAGIC_FORMULA, _curve, lateral_force, longitudinal_force
 
 MASS, LENGTH, WIDTH, GRAVITY = 80.0, 0.25, 0.23, 9.81
 
@@ -219,11 +212,6 @@ def test_magic_formula_against_values_worked_out_apart():
     np.testing.assert_allclose(longitudinal, [2191.82, 4234.44, 6090.57, 7736.34], rtol=0, atol=0.006)
 
 
-def test_aligning_moment_against_a_value_worked_out_apart():
-    """With the coefficients of Bakker, Nyborg and Pacejka (1987): 3 degrees at 4 kN."""
-    assert float(compute_aligning_moment(3.0, 4.0, ALIGNING_MOMENT)) == pytest.approx(-52.605, abs=5e-4)
-
-
 def test_derivatives_of_the_curve_in_closed_form_are_those_of_its_operations():
     def plain(z):
         return jnp.sin(1.65 * jnp.arctan(z[0] + z[1] * (jnp.arctan(z[0]) - z[0])))
@@ -241,8 +229,7 @@ def test_derivatives_of_the_curve_in_closed_form_are_those_of_its_operations():
 
 def turn_on_tyres(x, treads, **settings):
     drive = magic_formula(wheel_radius=0.2, **settings).modes["drive"]
-    p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
-    return evaluate(drive, np.array(x), p, np.array(treads) / 0.2)[[1, 3, 5, *range(6, len(x))]]
+    return evaluate(drive, np.array(x), MAGIC_FORMULA, np.array(treads) / 0.2)[[1, 3, 5, *range(6, len(x))]]
 
 
 def test_forces_of_tyres_do_not_depend_on_the_heading():
@@ -280,22 +267,10 @@ def test_loads_balance_the_moments_of_the_accelerations():
     assert np.abs(turn_on_tyres(x, treads)[2] - found[2]) > 1e-2  # loads matter
 
 
-def test_aligning_moments_turn_the_body_into_its_velocity():
-    V, angle, load = 4.0, np.radians(3.0), 1e-3 * GRAVITY * MASS / 4
-    x = [0.0, V, 0.0, V * np.tan(angle), 0.0, 0.0]
-    without, with_moment = (turn_on_tyres(x, [V] * 4, low_speed=1e-6, aligning=a) for a in (False, True))
-    np.testing.assert_array_equal(without[:2], with_moment[:2])
-    inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (LENGTH**2 + WIDTH**2)
-    expected = -4 * float(compute_aligning_moment(3.0, load, ALIGNING_MOMENT)) / inertia
-    assert with_moment[2] - without[2] == pytest.approx(expected, rel=2e-3)
-
-
 WRONG = [
     (skid_steer, {"modes": ("stick", "drift")}, "modes must be different ones of stick, front_slip, re"),
-    (skid_steer, {"modes": 3}, "modes must be a sequence of names out of stick, front_slip, rear_slip"),
     (skid_steer, {"modes": ()}, "rear_slip, slip; got none"),
     (skid_steer, {"modes": ("stick", "rear_slip")}, "'rear_slip', in which one axle sticks, needs restick="),
-    (skid_steer, {"restick": "jump"}, "restick must be 'continuous' or 'reset'; got 'jump'"),
     (skid_steer, {"forces_from_input": True, "slip_forces": (1, 2, 3, 4)}, "slip_forces must be left out"),
     (skid_steer, {"forces_from_input": "no"}, "forces_from_input must be True or False; got 'no'"),
     (skid_steer, {"stick_forces": (1, 2, 3)}, "stick_forces must be four numbers (N), one for each wheel; got (1"),
@@ -305,21 +280,17 @@ WRONG = [
     (skid_steer, {"c_1": np.nan}, "c_1 must be finite; got nan"),
     (skid_steer, {"m_b": "70 kg"}, "m_b must be a number or the name of a parameter; got the name '70 kg'"),
     (skid_steer, {"m_w": sf.Parameter(2.5)}, "m_w must be a number, or the name of a parameter to be fixed"),
-    (skid_steer, {"small_speed": "v0"}, "small_speed must be a number; got 'v0'"),
     (skid_steer, {"initial_state": [0.0] * 5}, "initial_state must have 6 entries, X, dX, Y, dY, theta, d"),
     (bicycle, {"initial_state": [0.0] * 6}, "initial_state must have a positive v_x, "),
     (bicycle, {"modes": "drift"}, "modes must be different ones of grip, front_slide"),
     (differential_drive, {"track": -0.5}, "track must be positive; got -0.5"),
-    (differential_drive, {"speeds": "wheels"}, "speeds must be 'measured' or 'commanded'; got 'wheels'"),
     (differential_drive, {"delay": 0.1}, "delay is that of commanded speeds; got speeds='measured'"),
     (differential_drive, {"speeds": "commanded", "delay": -1.0}, "delay must be 0 or more; got -1.0"),
     (differential_drive, {"y_l": 0.4, "y_r": 0.4}, "y_l, on the left, must be larger than y_r; got 0"),
     (differential_drive, {"turn_slip": 2.0}, "turn_slip must be from 0 to 1; got 2.0"),
     (rolling_body, {"radius": None}, "radius must be a number, or the name of a parameter"),
     (lugre, {"sigma_1": -1}, "sigma_1 must be 0 or more; got -1"),
-    (sliding_block, {"g": "g"}, "g must be a number; got 'g'"),
     (magic_formula, {"wheel_radius": 0.0}, "wheel_radius must be positive; got 0"),
-    (magic_formula, {"aligning": "yes"}, "aligning must be True or False; got 'yes'"),
     (magic_formula, {"height": -0.1}, "height must be 0 or more; got -0.1"),
 ]
 

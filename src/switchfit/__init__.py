@@ -79,7 +79,7 @@ _MODULES = {
     "compare": "strategy.comparison",
     "design": "experiment_design.search",
     "estimate": "strategy.choice",
-    "estimate_many": "batch.logs",
+    "estimate_many": "batch.fits",
     "evaluate": "fit.evaluator",
     "evaluate_on_guards": "fit.evaluator",
     "find_modes": "modes.search",

@@ -1,7 +1,7 @@
 """Public names for type checkers; `__init__.py` has the same names in its table."""
 
 from switchfit.batch.fits import Fits as Fits
-from switchfit.batch.logs import estimate_many as estimate_many
+from switchfit.batch.fits import estimate_many as estimate_many
 from switchfit.batch.posterior import LogPosterior as LogPosterior
 from switchfit.batch.posterior import log_posterior as log_posterior
 from switchfit.batch.resampling import Bootstrap as Bootstrap

@@ -1,4 +1,4 @@
-"""What many fits found: arrays with one entry a fit.
+"""What many fits found: arrays with one entry a fit. One model, many logs: every log a problem of its own.
 
 Save many fits as one NumPy archive, and load them without losing a bit.
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, make_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,23 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import read_arrays, run_chunks, write_arrays
-from switchfit.batch.study import list_places
-from switchfit.batch.verdict import (
-    count_priors,
-    find_doubts,
-    has_converged,
-    judge_many,
-    measure_variance,
-)
+from switchfit.batch.program import Limits
+from switchfit.batch.study import StudyOfLogs, list_places
+from switchfit.batch.verdict import count_priors, find_doubts, has_converged, judge_many, measure_variance
 from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import check_settings
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.faults import refuse_hidden_switches
 from switchfit.fit.result import interval, measure_quantile
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
-from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_level, as_path
+from switchfit.problem.problem import Problem, require_estimable
+from switchfit.problem.validation import as_callable, as_instance, as_level, as_path, as_sequence, join_names
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.json_records import find_dtype, from_json, to_json
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
@@ -67,10 +63,11 @@ def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 
 def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[str, Any]) -> Any:
-    """Return fits of a kind from the content of a file."""
-    _, rest = _split_fields(kind)
+    """Return fits of a kind from the content of a file; arrays that this version does not have are left out."""
+    names, rest = _split_fields(kind)
     nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
-    return kind(**arrays, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
+    known = {name: array for name, array in arrays.items() if name in names}
+    return kind(**known, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
@@ -389,30 +386,34 @@ class Fits(Tabular, Displayed):
 
 
 class LongRun(NamedTuple):
-    """Where a long run is done and kept, who is told how far it is, and when it began (``time.perf_counter()``).
+    """When fits end, where a long run is done and kept, who is told how far it is, and when it began.
 
     Attributes
     ----------
+    limits : Limits
     client, folder : as of `run_chunks`
     callback : callable ``(done, total)``, a true value stops; or None
     began : float
+        As of ``time.perf_counter()``.
     """
 
+    limits: Limits
     client: Any
     folder: str | Path | None
     callback: Callable[[int, int], object] | None
     began: float
 
     @classmethod
-    def check(cls, client: Any, folder: Any, callback: Any) -> LongRun:
+    def check(cls, tolerance: Any, max_iterations: Any, client: Any, folder: Any, callback: Any) -> LongRun:
         """Return these settings; raise for those of the wrong type, before anything long is done."""
+        limits = Limits(*check_settings(tolerance, max_iterations))
         if client is not None and not hasattr(client, "submit"):
             raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
         if folder is not None:
             as_path(folder, "folder")
         if callback is not None:
             as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
-        return cls(client, folder, callback, time.perf_counter())
+        return cls(limits, client, folder, callback, time.perf_counter())
 
 
 def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) -> dict[str, Any]:
@@ -471,3 +472,72 @@ def list_origins(problem: Problem) -> tuple[Origin | None, ...]:
         for place in places[places >= 0].tolist():
             found[place] = experiment.origin
     return tuple(found)
+
+
+def estimate_many(
+    problems: Sequence[Problem],
+    *,
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    client: Any = None,
+    folder: str | Path | None = None,
+    callback: Callable[[int, int], object] | None = None,
+) -> Fits:
+    """Fit many problems of one model, each with its own data, guess and mesh.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        With the same modes, mode sequences, kinds of data and unknowns. Numbers of samples may differ; problems whose
+        padded lengths agree share one compiled program.
+    tolerance, max_iterations : as of `estimate`
+    client, folder, callback : as of `monte_carlo`
+
+    Returns
+    -------
+    Fits
+        In the order of the problems. Fits whose integration error turns out too large are done again by `estimate`.
+
+    Raises
+    ------
+    ValueError
+        If the problems differ in more than their numbers, or the folder holds something else.
+    TypeError
+        If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate, monte_carlo, multistart
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fits = sf.estimate_many([heater_problem() for _ in range(3)])
+    >>> fits.theta.shape, bool(fits.success.all())
+    ((3, 2), True)
+    """
+    problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
+    how = LongRun.check(tolerance, max_iterations, client, folder, callback)
+    if not problems:
+        raise ValueError("estimate_many needs one problem or more; got none.")
+    first = problems[0]
+    for k, problem in enumerate(problems):
+        as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
+        require_estimable(problem)
+        if problem.theta_names != first.theta_names or problem.is_sigma_known is not first.is_sigma_known:
+            raise ValueError(
+                f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
+                f"{join_names(problem.theta_names)}, the first one {join_names(first.theta_names)}. Fit it by itself."
+            )
+        units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
+        if units[0] != units[1]:
+            raise ValueError(
+                f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
+                "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
+            )
+    starts = np.array([problem.initial_theta for problem in problems])
+    study = StudyOfLogs(first, [], starts, how.limits, 0, problems)
+    found = repeat(first, study, len(problems), "Logs", how)
+    every = zip(*map(list_origins, problems), strict=True)
+    return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})

@@ -20,7 +20,7 @@ from __future__ import annotations
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -36,6 +36,7 @@ from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.branches import has_corners
 from switchfit.engine.choice import derivatives_inside_program, runs_natively
 from switchfit.engine.native.experiment import places_in_library
+from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit, Kink, Termination, inverse_on, termination_of
@@ -68,18 +69,8 @@ some of them to other threads takes an eighth of the time of all fits."""
 compile_for_layout = partial(jax.jit, static_argnames=("layout",), compiler_options=ONE_BY_ONE)
 
 
-class Varying(NamedTuple):
-    """What differs from fit to fit, each with a leading axis: the leaves of all `Arguments`, in JAX's order.
-
-    Attributes
-    ----------
-    places : tuple of int
-        Which leaves.
-    values : tuple of arrays, (R, ...) each
-    """
-
-    places: tuple[int, ...]
-    values: tuple[Any, ...]
+Varying = Mapping[int, Any]
+"""What differs from fit to fit: values (R, ...) of leaves of all `Arguments`, by their places in JAX's order."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +84,11 @@ class Layout:
     lockstep: bool
     natively: bool  # whether machine code evaluates J
 
+    @property
+    def size(self) -> int:
+        """Fits in a call of the program."""
+        return CHUNK_IN_LOCKSTEP if self.lockstep else CHUNK
+
 
 def has_gpu() -> bool:
     """Return whether JAX's default device is not a CPU."""
@@ -101,8 +97,7 @@ def has_gpu() -> bool:
 
 def choose_chunk_size(problem: Problem) -> int:
     """Return how many fits of a problem are a chunk."""
-    in_lockstep = has_gpu() and choose_layout(evaluator_of(problem)).lockstep
-    return CHUNK_IN_LOCKSTEP if in_lockstep else CHUNK
+    return choose_layout(evaluator_of(problem)).size if has_gpu() else CHUNK
 
 
 def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = (), *, on_gpu: bool = False) -> Layout:
@@ -141,81 +136,72 @@ class Inputs(NamedTuple):
     sequences : tuple of dict
         What machine code reads at run time of the sequence of modes of each experiment; JAX is written for it.
     priors : PriorTerms
+    variables : Variables
+        Those that the optimiser has in place of theta.
+    lower, upper : (d,), bounds of theta
     """
 
     arguments: tuple[Arguments, ...]
     times: tuple[Any, ...]
     sequences: tuple[dict[str, Any], ...]
     priors: PriorTerms
+    variables: Variables
+    lower: Any
+    upper: Any
 
     @classmethod
     def of(cls, evaluator: Evaluator, layout: Layout) -> Inputs:
         """Return those of a problem on the meshes of an evaluator."""
-        experiments, natively = evaluator.problem.experiments, layout.natively
-        times = tuple(experiment.initial_times_with_jumps for experiment in experiments)
+        unknowns, natively = evaluator.problem.unknowns, layout.natively
+        times = tuple(experiment.initial_times_with_jumps for experiment in evaluator.problem.experiments)
         sequences = tuple(places_in_library(structure) if natively else {} for structure in evaluator.structures)
-        return cls(tuple(evaluator.arguments), times, sequences, evaluator.problem.unknowns.priors)
+        of_theta = unknowns.priors, unknowns.variables, unknowns.lower, unknowns.upper
+        return cls(tuple(evaluator.arguments), times, sequences, *of_theta)
+
+    def find_theta(self, z: Any) -> Any:
+        """Return theta (d,) at z, the variables of the optimiser."""
+        return jnp.clip(self.variables.outward(z, jnp), self.lower, self.upper)
 
     def evaluate(self, layout: Layout, own: Sequence[Any], theta: Any, side: Any) -> tuple[Any, Any, Any]:
-        """Return cost, gradient and Hessian of a fit with its own data, inside a program."""
-        arguments = replace_leaves(self.arguments, layout.varying, own)
-        J, g, H = evaluate_total(layout, arguments, self.times, self.sequences, theta, side)
-        prior, slope, curvature = self.priors.evaluate(theta, jnp)
-        return J + prior, g + slope, H + jnp.diag(curvature)
+        """Return cost, gradient and Hessian of a fit with its own data, inside a program.
+
+        Experiments that share a structure and all lengths are taken in a loop, so that the program does not grow with
+        them.
+        """
+        arguments, d = replace_leaves(self.arguments, layout.varying, own), theta.shape[0]
+        J, g, curvature = self.priors.evaluate(theta, jnp)
+        H, extended = jnp.diag(curvature), jnp.append(theta, 0.0)
+        for group in _group_experiments(layout, arguments, self.sequences):
+            structure, N = layout.structures[group[0]], layout.transitions[group[0]]
+            where = np.array([layout.places[e] for e in group])
+            where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
+            fixed = jnp.stack([self.times[e] for e in group])
+            tau = jnp.where(where[:, :N] < d, extended[where[:, :N]], fixed)
+            given = jax.tree.map(lambda *leaves: jnp.stack(leaves), *((arguments[e], self.sequences[e]) for e in group))
+
+            def one(given: Any, structure: Structure = structure) -> tuple[jax.Array, jax.Array, jax.Array]:
+                (own, sequence), tau, p = given
+                return derivatives_inside_program(structure, own, tau, p, side, sequence)
+
+            operands = (given, tau, extended[where[:, N:]])
+            if len(group) == 1:
+                J_e, g_e, H_e = (value[None] for value in one(jax.tree.map(lambda leaf: leaf[0], operands)))
+            else:
+                J_e, g_e, H_e = jax.vmap(one)(operands) if layout.lockstep else lax.map(one, operands)
+            J = J + J_e.sum()
+            g = g.at[where].add(g_e, mode="drop")
+            H = H.at[where[:, :, None], where[:, None, :]].add(H_e, mode="drop")
+        return J, g, H
 
 
 def replace_leaves(
-    arguments: Sequence[Arguments], places: tuple[int, ...], values: Sequence[Any]
+    arguments: Sequence[Arguments], places: Iterable[int], values: Sequence[Any]
 ) -> tuple[Arguments, ...]:
     """Return the arguments of all experiments with some of their leaves replaced."""
     leaves, tree = jax.tree.flatten(tuple(arguments))
     for place, value in zip(places, values, strict=True):
         leaves[place] = value
     return tuple(jax.tree.unflatten(tree, leaves))
-
-
-def evaluate_total(
-    layout: Layout,
-    arguments: tuple[Arguments, ...],
-    times: tuple[jax.Array, ...],
-    sequences: tuple[dict[str, jax.Array], ...],
-    theta: jax.Array,
-    side: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the cost, gradient and Hessian of all experiments together.
-
-    Those that share a structure and all lengths are taken in a loop, so that the program does not grow with them.
-    """
-    d = theta.shape[0]
-    J, g, H = jnp.zeros(()), jnp.zeros(d), jnp.zeros((d, d))
-    extended = jnp.append(theta, 0.0)
-    for group in _group_experiments(layout, arguments, sequences):
-        structure, N = layout.structures[group[0]], layout.transitions[group[0]]
-        where = np.array([layout.places[e] for e in group])
-        where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
-        fixed = jnp.stack([times[e] for e in group])
-        tau = jnp.where(where[:, :N] < d, extended[where[:, :N]], fixed)
-        given = jax.tree.map(lambda *leaves: jnp.stack(leaves), *((arguments[e], sequences[e]) for e in group))
-
-        def one(
-            given: tuple[tuple[Arguments, dict[str, jax.Array]], jax.Array, jax.Array],
-            structure: Structure = structure,
-        ) -> tuple[jax.Array, jax.Array, jax.Array]:
-            (own, sequence), tau, p = given
-            found: tuple[jax.Array, jax.Array, jax.Array] = derivatives_inside_program(
-                structure, own, tau, p, side, sequence
-            )
-            return found
-
-        operands = (given, tau, extended[where[:, N:]])
-        if len(group) == 1:
-            J_e, g_e, H_e = (value[None] for value in one(jax.tree.map(lambda leaf: leaf[0], operands)))
-        else:
-            J_e, g_e, H_e = jax.vmap(one)(operands) if layout.lockstep else lax.map(one, operands)
-        J = J + J_e.sum()
-        g = g.at[where].add(g_e, mode="drop")
-        H = H.at[where[:, :, None], where[:, None, :]].add(H_e, mode="drop")
-    return J, g, H
 
 
 def _group_experiments(
@@ -271,24 +257,6 @@ class Limits(NamedTuple):
 
     tolerance: float
     max_iterations: int
-
-
-class Unscaled(NamedTuple):
-    """What is known about theta itself, in whose place the optimiser has variables of its own.
-
-    Attributes
-    ----------
-    variables : Variables
-    lower, upper : (d,), bounds of theta
-    """
-
-    variables: Variables
-    lower: Any
-    upper: Any
-
-    def theta(self, z: Any) -> Any:
-        """Return theta at z: (d,)."""
-        return jnp.clip(self.variables.outward(z, jnp), self.lower, self.upper)
 
 
 @dataclass
@@ -365,7 +333,7 @@ class Batch:
     problem : Problem
     meshes : one an experiment, the same for all fits
     varying : Varying
-        What replaces the problem's own numbers, R of each.
+        What replaces the problem's own numbers.
     limits : Limits
 
     Attributes
@@ -383,12 +351,7 @@ class Batch:
     @cached_property
     def layout(self) -> Layout:
         """Layout of the programs."""
-        return choose_layout(self.evaluator, self.varying.places)
-
-    @property
-    def size(self) -> int:
-        """Fits in a call of the program."""
-        return CHUNK_IN_LOCKSTEP if self.layout.lockstep else CHUNK
+        return choose_layout(self.evaluator, tuple(self.varying))
 
     def _use_device(self) -> AbstractContextManager[Any]:
         """Return a context in which programs with machine code run on the CPU, whatever JAX's default device is, and
@@ -405,7 +368,7 @@ class Batch:
     @cached_property
     def _values(self) -> tuple[jax.Array, ...]:
         """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of a program."""
-        return tuple(jnp.asarray(pad_fits(value, self.size)) for value in self.varying.values)
+        return tuple(jnp.asarray(pad_fits(value, self.layout.size)) for value in self.varying.values())
 
     def fit(self, starts: FloatArray) -> Chunk:
         """Fit all of them.
@@ -426,6 +389,12 @@ class Batch:
             outcome = self._run_program(starts)
         return self._finish_rest(outcome, starts)
 
+    def replace_fit(self, chunk: Chunk, k: int, again: Estimate) -> None:
+        """Replace the k-th fit by an estimate, on meshes of its own."""
+        ordinary = again.status is Status.CONVERGED and not again.active
+        chunk.replace_fit(k, again, "" if ordinary else again.message)
+        self.own[k] = again.evaluator_at_solution
+
     def evaluate(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
         """Return costs, gradients and Hessians at thetas (n, d), to one side (n,) of breakpoints.
 
@@ -437,8 +406,10 @@ class Batch:
         together = np.flatnonzero(~alone)
         for first in range(0, len(together), EVALUATIONS):
             call = together[first : first + EVALUATIONS]
-            for all_, found in zip(at, self._evaluate(fits[call], thetas[call], sides[call]), strict=True):
-                all_[call] = found
+            padded = [pad_fits(each[call], EVALUATIONS) for each in (fits, thetas, sides.astype(float))]
+            found = self._run(_evaluate_fits, *padded, len(call))
+            for all_, each in zip(at, found, strict=True):
+                all_[call] = each[: len(call)]
         for s in np.flatnonzero(alone).tolist():
             k = int(fits[s])
             with suppress(*UNDEFINED):
@@ -447,50 +418,40 @@ class Batch:
                 at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
         return at
 
-    def _evaluate(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
+    def _run(self, program: Callable[..., Any], *own: Any) -> Any:
+        """Return the results of a program as arrays of NumPy; `own` is what it is given beside inputs and data."""
         with use_float64(), self._use_device():
-            padded = (pad_fits(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float)))
-            given = self._inputs, self._values, *padded, len(fits)
+            given = (self._inputs, self._values, *own)
             with compile_once(self.layout, given):
-                found = _evaluate_fits(*given, layout=self.layout)
-        return tuple(np.asarray(each)[: len(fits)] for each in found)
+                return jax.tree.map(np.asarray, program(*given, layout=self.layout))
 
     def _give_data(self, k: int) -> Evaluator:
         """Return the evaluator with the data of the k-th fit."""
         with use_float64():
-            values = [jnp.asarray(value[k]) for value in self.varying.values]
-            self.evaluator.replace_arguments(replace_leaves(self._base, self.varying.places, values))
+            values = [jnp.asarray(value[k]) for value in self.varying.values()]
+            self.evaluator.replace_arguments(replace_leaves(self._base, self.varying, values))
         return self.evaluator
 
     def _run_program(self, starts: FloatArray) -> Outcome:
         """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""
-        problem, layout, limits = self.evaluator.problem, self.layout, self.limits
-        count, unknowns = len(starts), problem.unknowns
-        variables = unknowns.variables
+        problem, limits = self.evaluator.problem, self.limits
+        unknowns, variables = problem.unknowns, problem.unknowns.variables
         bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
-        constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
-        with use_float64(), self._use_device():
-            given = (
-                self._inputs,
-                self._values,
-                Constraints(*map(jnp.asarray, constraints)),
-                Unscaled(variables, unknowns.lower, unknowns.upper),
-                # What it does not settle has as many iterations left for the optimiser that finishes it.
-                limits._replace(max_iterations=limits.max_iterations // 2),
-                pad_fits(variables.inward(np.asarray(starts)), self.size),
-                count,
-            )
-            try:
-                with compile_once(layout, given):
-                    outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _minimize_fits(*given, layout=layout))
-            except Exception as error:
-                # A function of the model that calls back into Python may raise for one fit and ends the whole program:
-                # the fits are then done one by one, and that one is listed. Any other error is a defect of the program.
-                if not _is_raised_in_callback(error):
-                    warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
-                return Outcome.at_starts(starts, np)
+        constraints = Constraints(unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
+        # What it does not settle has as many iterations left for the optimiser that finishes it.
+        limits = limits._replace(max_iterations=limits.max_iterations // 2)
+        padded = pad_fits(variables.inward(starts), self.layout.size)
+        try:
+            found = self._run(_minimize_fits, constraints, limits, padded, len(starts))
+        except Exception as error:
+            # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
+            # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
+            if not _is_raised_in_callback(error):
+                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
+            return Outcome.at_starts(starts, np)
+        outcome: Outcome = jax.tree.map(lambda a: a[: len(starts)], found)
         # A program has one mesh for all fits: it is refused where it does not suit the first and the last of them.
-        is_sharp = layout.natively and not all(map(Follower(self.evaluator).suits, outcome.theta[[0, -1]]))
+        is_sharp = self.layout.natively and not all(map(Follower(self.evaluator).suits, outcome.theta[[0, -1]]))
         return Outcome.at_starts(starts, np) if is_sharp else outcome
 
     def _fit_on_meshes(self, k: int, start: FloatArray, limits: Limits) -> Result:
@@ -500,7 +461,7 @@ class Batch:
         def build(meshes: Sequence[Mesh]) -> Evaluator:
             return Batch(problem, meshes, varying, limits)._give_data(k)
 
-        has_own_times = len(varying.places) == len(jax.tree.leaves(self._base))
+        has_own_times = len(varying) == len(jax.tree.leaves(self._base))
         follower = None if has_own_times else Follower(self.evaluator, build)
         hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
         return minimize_cost(self.evaluator, start, hessian, *limits, follower=follower)
@@ -541,7 +502,6 @@ def _minimize_fits(
     inputs: Inputs,
     values: tuple[jax.Array, ...],
     constraints: Constraints,
-    unscaled: Unscaled,
     limits: Limits,
     starts: jax.Array,
     count: jax.Array,
@@ -550,27 +510,21 @@ def _minimize_fits(
 ) -> Outcome:
     """Return the outcomes of the first `count` fits."""
 
-    def build_functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
-        """Return the function `evaluate` and the breakpoints of the fit with these data, for `minimize_traced`."""
-
-        # The optimizer's own variables z (theta on its scales): derivatives follow by the chain rule, and back in
-        # `convert`.
-        def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            theta = unscaled.theta(z)
-            J, g, H = inputs.evaluate(layout, own, theta, side)
-            return J, *unscaled.variables.derivatives_inward(theta, g, H, jnp)
-
-        return evaluate, _list_breakpoints(layout, replace_leaves(inputs.arguments, layout.varying, own))
-
-    def convert(found: Outcome) -> Outcome:
-        theta = unscaled.theta(found.theta)
-        left = unscaled.variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
-        gradient, hessian = unscaled.variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
-        return found._replace(theta=theta, gradient=gradient, hessian=hessian, left=left)
+    variables = inputs.variables
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
-        evaluate, breakpoints = build_functions(own)
-        return convert(minimize_traced(evaluate, start, constraints, breakpoints, **limits._asdict()))
+        # In the optimiser's own variables z (theta on its scales): derivatives follow by the chain rule.
+        def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            theta = inputs.find_theta(z)
+            J, g, H = inputs.evaluate(layout, own, theta, side)
+            return J, *variables.derivatives_inward(theta, g, H, jnp)
+
+        breakpoints = _list_breakpoints(layout, replace_leaves(inputs.arguments, layout.varying, own))
+        found = minimize_traced(evaluate, start, constraints, breakpoints, **limits._asdict())
+        theta = inputs.find_theta(found.theta)
+        left = variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
+        gradient, hessian = variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
+        return found._replace(theta=theta, gradient=gradient, hessian=hessian, left=left)
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)

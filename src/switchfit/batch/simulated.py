@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -18,9 +17,9 @@ from switchfit.batch.program import Limits, Varying
 from switchfit.batch.study import Study
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.mesh import Mesh, split_by_cell
-from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, fit_locally
 from switchfit.fit.accuracy import cost_error
-from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_guards
+from switchfit.fit.evaluator import Evaluator, place_on_guards
 from switchfit.fit.trajectory import compare, replace_values
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
@@ -180,14 +179,13 @@ def monte_carlo(
     as_instance(problem, "problem", Problem, "an sf.Problem")
     require_estimable(problem)
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    limits = Limits(*check_settings(tolerance, max_iterations))
-    how = LongRun.check(client, folder, callback)
+    how = LongRun.check(tolerance, max_iterations, client, folder, callback)
     noise = _check_noise(noise)
     given = None if theta is None else problem.check_theta(theta)
     begin = None if start is None else problem.check_theta(start, "start")
     truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
     begin = truth if begin is None else begin
-    study, error = build_study(problem, runs, truth, begin, noise, seed, limits)
+    study, error = build_study(problem, runs, truth, begin, noise, seed, how.limits)
     return MonteCarlo(**repeat(problem, study, runs, "Monte Carlo", how), truth=truth, integration_error=error)
 
 
@@ -353,19 +351,9 @@ class SimulatedStudy(Study):
                 errors[place] = error
         return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
 
-    def measure_variation(self, runs: range) -> float:
-        """Return J of the data of one run that are met by their means; in the others it differs by noise alone."""
-        return self._variation
-
-    @cached_property
-    def _variation(self) -> float:
-        return float(measure_variation(self.problem_of(0)).sum())
-
     def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
-        leaves, tree = jax.tree.flatten(self.arguments)
-        places = jax.tree.unflatten(tree, range(len(leaves)))
-        changed: dict[int, Any] = {}
+        (leaves, places), changed = self.leaves, dict[int, Any]()
         for e, experiment in enumerate(self.problem.experiments):
             measured = channel = 0
             for k, item in enumerate(experiment.data):
@@ -384,7 +372,7 @@ class SimulatedStudy(Study):
                             changed[leaf] = np.repeat(np.asarray(leaves[leaf])[None], R, axis=0)
                         changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
                     channel += q
-        return Varying(tuple(changed), tuple(changed.values()))
+        return changed
 
 
 def _find_cells(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:

@@ -18,7 +18,7 @@ from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_failed_starts
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.local_fit import check_settings, fit_locally
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
@@ -185,15 +185,14 @@ def multistart(
     as_instance(problem, "problem", Problem, "an sf.Problem")
     require_estimable(problem)
     seed = as_seed(seed)
-    limits = Limits(*check_settings(tolerance, max_iterations))
-    how = LongRun.check(client, folder, callback)
+    how = LongRun.check(tolerance, max_iterations, client, folder, callback)
     if hasattr(type(starts), "__len__"):
         points = _check_starts(problem, starts)
     else:
         points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
-    study = Study(problem, _find_meshes(problem, points), points, limits, seed)
+    study = Study(problem, _find_meshes(problem, points), points, how.limits, seed)
     found = repeat(problem, study, len(points), "Multistart", how)
-    best, errors = _find_best(problem, Fits(**found), limits)
+    best, errors = _find_best(problem, Fits(**found), how.limits)
     status, message = found["status"].tolist(), found["message"].tolist()
     for k, error in errors.items():
         status[k], message[k] = Status.ERROR.name, describe_failure(error)

@@ -1,4 +1,4 @@
-"""Studies of one problem: its data differ from run to run, or where its fits begin.
+"""Studies of one problem, whose data differ from run to run, or where its fits begin; and of one model, of many logs.
 
 What is said of a fit beyond its end is the same in every study, and in a batch of logs: fits are done again that need
 it, and pieces of profiles are added, and how well each fit explains its data.
@@ -20,20 +20,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.program import (
-    UNDEFINED,
-    Batch,
-    Chunk,
-    Limits,
-    Varying,
-    choose_chunk_size,
-)
+from switchfit.batch.program import Batch, Chunk, Limits, Varying, choose_chunk_size, describe_failure
 from switchfit.batch.verdict import (
     EXPLAINED_BADLY,
     count_priors,
@@ -43,14 +37,14 @@ from switchfit.batch.verdict import (
     has_converged,
     measure_variance,
 )
-from switchfit.discretization.mesh import Arguments, Mesh, build_arguments
+from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.branches import has_corners
-from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
 from switchfit.fit.result import measure_quantile
 from switchfit.optimize import Status
+from switchfit.optimize.traced import Outcome
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.strategy.starts import End, fit_briefly
@@ -173,17 +167,6 @@ def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:
     return free if free.failed else fit_briefly(problem, free.theta)
 
 
-def _is_doubted(problem: Problem, chunk: Chunk, k: int, variation: float) -> bool:
-    """Return whether a better end may be elsewhere: not converged, a mode has collapsed, or far from the data."""
-    arrays = {name: array[k : k + 1] for name, array in chunk.to_arrays().items()}
-    arrays |= describe_ends(problem, arrays["theta"], arrays["cost"], variation)
-    if arrays["collapsed"][0] > 0:
-        return True
-    arrays["samples"] = np.array([count_samples(problem)])
-    doubts = find_doubts(arrays, problem.is_sigma_known, count_priors(problem))
-    return any(doubt.kind in ("not converged", "little explained", *EXPLAINED_BADLY) for doubt in doubts)
-
-
 def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatArray, cost: float) -> bool:
     """Return whether cutting all steps in two changes J at theta by no more than the integration error that is allowed.
 
@@ -193,13 +176,6 @@ def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatAr
     fine = evaluator.halve_rows(theta).cost(theta)
     error = cost_error(problem, fine, cost if meshes is None else evaluator.cost(theta), 0.0)
     return error <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-
-
-def replace_fit(chunk: Chunk, batch: Batch, k: int, again: Estimate) -> None:
-    """Replace the k-th fit by an estimate, on meshes of its own."""
-    ordinary = again.status is Status.CONVERGED and not again.active
-    chunk.replace_fit(k, again, "" if ordinary else again.message)
-    batch.own[k] = again.evaluator_at_solution
 
 
 CHUNK_FORMAT = "fits 3"
@@ -229,7 +205,6 @@ class Study:
     seed: int
 
     shares_problem = True  # whether bounds, sample times and meshes are those of `problem`
-    is_finished = True  # whether fits are done again that need it, and get pieces
 
     @property
     def size(self) -> int:
@@ -237,21 +212,27 @@ class Study:
         return choose_chunk_size(self.problem)
 
     @cached_property
-    def arguments(self) -> tuple[Arguments, ...]:
-        """Those of the problem itself."""
-        return tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+    def leaves(self) -> tuple[list[Any], Any]:
+        """The leaves of the problem's own arguments, and arguments that have the place of each leaf instead."""
+        arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+        leaves, tree = jax.tree.flatten(arguments)
+        return leaves, jax.tree.unflatten(tree, range(len(leaves)))
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return the data of some runs, and the errors of those that have none, by their places."""
-        return Varying((), ()), {}
+        return {}, {}
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
         return self.problem
 
     def measure_variation(self, runs: range) -> FloatArray | float:
-        """Return J of data that are met by their means: (R,), or that of all runs."""
-        return float(measure_variation(self.problem).sum())
+        """Return J of data that are met by their means: (R,), or that of one run, from which others differ by noise."""
+        return self._variation
+
+    @cached_property
+    def _variation(self) -> float:
+        return float(measure_variation(self.problem_of(0)).sum())
 
     def group_fits(self, runs: range) -> list[tuple[Problem, NDArray[np.intp]]]:
         """Return each problem whose bounds and sample times fits share, with these fits."""
@@ -267,21 +248,17 @@ class Study:
         chunk = batch.fit(self.list_starts(runs))
         for k, error in errors.items():
             chunk.clear_fit(k, error)
-        return self.finish_fits(chunk, runs, batch) if self.is_finished else self.describe_fits(chunk, runs)
+        self._redo_unresolved(chunk, runs, batch)
+        if self.problem.constraint_names:
+            self._redo_doubted(chunk, runs, batch)
+        pieces = make_no_pieces(self.problem, len(runs))
+        if not any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
+            pieces = trace_chunk(chunk, self.group_fits(runs), batch)
+        return self.describe_fits(chunk, runs) | {"pieces": pieces}
 
     def list_starts(self, runs: range) -> FloatArray:
         """Return where some of the runs begin: (R, d)."""
         return self.starts[runs.start : runs.stop] if len(self.starts) > 1 else self.starts.repeat(len(runs), axis=0)
-
-    def finish_fits(self, chunk: Chunk, runs: range, batch: Batch) -> Arrays:
-        """Return the arrays of fits, of which those that need it are done again, with pieces of profiles."""
-        self._redo_unresolved(chunk, runs, batch)
-        if self.problem.constraint_names:
-            self._redo_doubted(chunk, runs, batch)
-        if any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
-            return self.describe_fits(chunk, runs)
-        pieces = trace_chunk(chunk, self.group_fits(runs), batch)
-        return self.describe_fits(chunk, runs) | {"pieces": pieces}
 
     def _redo_unresolved(self, chunk: Chunk, runs: range, batch: Batch) -> None:
         """Replace fits whose integration error is too large by those that `estimate` finds.
@@ -304,52 +281,133 @@ class Study:
                     chunk.set_error(k, error)
                 continue  # a fit from this end fails too: the first one stays, and is listed as failed
             if again.status.successful or not failed[k]:
-                replace_fit(chunk, batch, k, again)
+                batch.replace_fit(chunk, k, again)
 
     def _redo_doubted(self, chunk: Chunk, runs: range, batch: Batch) -> None:
         """Replace fits that did not converge, lost modes or are far from their data by better ones, if there are any.
 
         Only of problems with guards or terminal constraints, which the compiled program does not take.
         """
-        starts = self.list_starts(runs)
-        variations = np.broadcast_to(self.measure_variation(runs), len(runs))
-        for k, run in enumerate(runs):
-            try:
-                problem = self.problem_of(run)
-            except Exception:  # the problem cannot be built, and the fit is listed as failed
-                continue
-            guarded = any(structure.guarded for structure in problem.structures)
-            for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
-                if not _is_doubted(problem, chunk, k, float(variations[k])):
-                    break
+        starts, guarded = self.list_starts(runs), any(structure.guarded for structure in self.problem.structures)
+        for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
+            for k in np.flatnonzero(self._find_doubted(chunk, runs)).tolist():
                 try:
+                    problem = self.problem_of(runs[k])
                     end = find(problem, starts[k])
                     if end.failed:
                         continue
                     again = fit_locally(problem, start=end.theta, **self.limits._asdict())
-                except UNDEFINED:  # nothing better from this start
+                except Exception:  # nothing better from this start, or a problem that cannot be built: it is listed
                     continue
                 before = chunk.cost[k] if has_converged(chunk.status)[k] else np.inf
                 if again.status.successful and again.cost < before:
-                    replace_fit(chunk, batch, k, again)
+                    batch.replace_fit(chunk, k, again)
+
+    def _find_doubted(self, chunk: Chunk, runs: range) -> NDArray[np.bool_]:
+        """Return of which fits a better end may be elsewhere: not converged, a mode collapsed, or far from the data."""
+        arrays = self.describe_fits(chunk, runs)
+        doubted = arrays["collapsed"] > 0
+        for doubt in find_doubts(arrays, self.problem.is_sigma_known, count_priors(self.problem)):
+            if doubt.kind in ("not converged", "little explained", *EXPLAINED_BADLY):
+                doubted |= doubt.which
+        return doubted
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
-        """Return the arrays of fits as they are, without pieces of profiles."""
+        """Return the arrays of fits as they are."""
         variation, described = np.broadcast_to(self.measure_variation(runs), len(runs)), []
         for problem, fits in self.group_fits(runs):
             ends = describe_ends(problem, chunk.theta[fits], chunk.cost[fits], variation[fits])
             described.append(ends | {"samples": np.full(len(fits), count_samples(problem))})
         ends = {name: np.concatenate([one[name] for one in described]) for name in described[0]}
-        pieces = make_no_pieces(self.problem, len(runs))
-        return {**chunk.to_arrays(), **ends, "start": self.list_starts(runs), "pieces": pieces}
+        return {**chunk.to_arrays(), **ends, "start": self.list_starts(runs)}
 
     def fingerprint(self) -> str:
         """Return a digest of everything that a result depends on."""
         unknowns, data = self.problem.unknowns, self.stack_data([0])[0]  # run 0 stands for all
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        leaves = jax.tree.leaves(self.arguments)
-        shared = [np.asarray(leaf) for place, leaf in enumerate(leaves) if place not in data.places]
+        shared = [np.asarray(leaf) for place, leaf in enumerate(self.leaves[0]) if place not in data]
         settings = type(self).__name__, self.limits, self.seed, unknowns.names, self.problem.solver
         return compute_fingerprint(
-            CHUNK_FORMAT, settings, self.problem.digests, self.starts, *bounds, *data.values, *shared
+            CHUNK_FORMAT, settings, self.problem.digests, self.starts, *bounds, *data.values(), *shared
         )
+
+
+@dataclass
+class StudyOfLogs(Study):
+    """Problems of one model, each with data, guess and meshes of its own."""
+
+    problems: list[Problem]
+
+    shares_problem = False
+
+    def __call__(self, runs: range) -> Arrays:
+        """Fits of some of the problems: those whose programs agree go together, and then back into their order."""
+        groups: dict[Any, list[int]] = {}
+        errors: dict[int, Exception] = {}
+        for k in runs:
+            try:
+                groups.setdefault(_get_kind(self.problems[k]), []).append(k)
+            except Exception as error:  # as where its guess cannot be integrated: listed, it must not end the others
+                errors[k] = error
+        parts = []
+        for members in groups.values():
+            meshes = evaluator_of(self.problems[members[0]]).meshes
+            parts.append(super(StudyOfLogs, self._select(members, meshes)).__call__(range(len(members))))
+        order = [k for members in groups.values() for k in members]
+        if errors:
+            order += errors
+            parts.append(self._select(list(errors), []).list_failed(list(errors.values())))
+        place = np.argsort(order)
+        return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
+
+    def _select(self, members: list[int], meshes: list[Mesh]) -> StudyOfLogs:
+        """Return some of the problems, on meshes that they share."""
+        problems = [self.problems[k] for k in members]
+        return replace(self, problem=problems[0], meshes=meshes, starts=self.starts[members], problems=problems)
+
+    def fingerprint(self) -> str:
+        """Return a digest of everything that a result depends on."""
+        parts: list[Any] = [CHUNK_FORMAT, "logs", len(self.problems), self.limits]
+        for problem in self.problems:
+            parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]
+            try:
+                evaluator = evaluator_of(problem)
+            except Exception as error:  # this one will be listed as failed
+                parts.append(describe_failure(error))
+            else:
+                parts += map(np.asarray, jax.tree.leaves(tuple(evaluator.arguments)))
+        return compute_fingerprint(*parts)
+
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
+        """Return all arguments of some problems."""
+        leaves = [jax.tree.leaves(tuple(evaluator_of(self.problems[k]).arguments)) for k in runs]
+        stacked = (np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
+        return dict(enumerate(stacked)), {}
+
+    def problem_of(self, run: int) -> Problem:
+        """Return one of the problems."""
+        return self.problems[run]
+
+    def measure_variation(self, runs: range) -> FloatArray:
+        """Return J of the data of each problem that are met by their means: (R,)."""
+        return np.array([measure_variation(self.problems[k]).sum() for k in runs])
+
+    def list_failed(self, errors: list[Exception]) -> Arrays:
+        """Return the arrays of problems whose fits failed before they began."""
+        chunk = Chunk.of(Outcome.at_starts(self.starts, np))
+        for k, error in enumerate(errors):
+            chunk.clear_fit(k, error)
+        runs = range(len(errors))
+        return self.describe_fits(chunk, runs) | {"pieces": make_no_pieces(self.problem, len(runs))}
+
+
+def _get_kind(problem: Problem) -> Any:
+    """Return a key that is equal for problems that one program can fit with one set of constraints."""
+    evaluator = evaluator_of(problem)
+    shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(tuple(evaluator.arguments)))
+    unknowns = problem.unknowns
+    numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *problem.places]
+    numbers += [*unknowns.priors, *unknowns.variables]
+    times = [experiment.initial_times_with_jumps for experiment in problem.experiments]
+    fixed = [np.where(where[: len(t)] < 0, t, 0.0) for where, t in zip(problem.places, times, strict=True)]
+    return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))

@@ -16,13 +16,8 @@ from switchfit.problem.system import HybridSystem
 #: Name in a problem file -> function that returns the system; its arguments are keyword-only.
 BUILT_IN: Mapping[str, Callable[..., HybridSystem]] = MappingProxyType(
     {
-        "skid_steer": skid_steer,
-        "sliding_block": sliding_block,
-        "magic_formula": magic_formula,
-        "differential_drive": differential_drive,
-        "bicycle": bicycle,
-        "rolling_body": rolling_body,
-        "lugre": lugre,
+        model.__name__: model
+        for model in (skid_steer, sliding_block, magic_formula, differential_drive, bicycle, rolling_body, lugre)
     }
 )
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, check_constants, check_length, check_modes, read_constants, read_input
+from switchfit.models.constants import Constant, Values, check_constants, check_length, check_modes, read_input
 from switchfit.problem.system import HybridSystem
 
 STATES = ("X", "Y", "theta", "v_x", "v_y", "r")
@@ -104,9 +104,7 @@ def bicycle(
     """
     names = check_modes(modes, SLIDING)
     constants = check_constants(
-        {"m": m, "I_z": I_z, "a": a, "b": b, "C_f": C_f, "C_r": C_r, "mu": mu, "g": g},
-        positive=("m", "I_z", "a", "b", "g"),
-        not_negative=("C_f", "C_r", "mu"),
+        positive={"m": m, "I_z": I_z, "a": a, "b": b, "g": g}, not_negative={"C_f": C_f, "C_r": C_r, "mu": mu}
     )
     given = check_length(initial_state, STATES)
     if not callable(given):
@@ -125,7 +123,7 @@ def _move(sliding: tuple[bool, bool], constants: dict[str, Constant], t: Any, x:
     front_slides, rear_slides = sliding
     _, _, theta, v_x, v_y, r = x
     delta, F_x = read_input(u, INPUTS)
-    c = read_constants(constants, p)
+    c = Values(constants, p)
     cos, sin = jnp.cos(delta), jnp.sin(delta)
     front, rear = v_y + c["a"] * r, v_y - c["b"] * r  # lateral velocities of the axles
     weight = c["m"] * c["g"] / (c["a"] + c["b"])

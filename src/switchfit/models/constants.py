@@ -16,16 +16,18 @@ Constants = Mapping[str, Constant]
 
 
 def check_constants(
-    given: Mapping[str, Any], *, positive: Iterable[str] = (), not_negative: Iterable[str] = ()
+    *,
+    positive: Mapping[str, Any],
+    not_negative: Mapping[str, Any] | None = None,
+    others: Mapping[str, Any] | None = None,
 ) -> dict[str, Constant]:
     """Return constants as floats and names.
 
     Parameters
     ----------
-    given : mapping of str to float or str
-        The value of each argument.
-    positive, not_negative : tuples of str
-        Arguments that must be positive, or 0 or more, where they are numbers.
+    positive, not_negative, others : mapping of str to float or str
+        The value of each argument: those that must be positive where they are numbers, those that must be 0 or more,
+        and those that may have either sign.
 
     Raises
     ------
@@ -34,35 +36,17 @@ def check_constants(
     ValueError
         If a number is not finite, or not positive where it must be, or a name is no identifier.
     """
-    names = {name: value for name, value in given.items() if isinstance(value, str)}
-    for name, value in names.items():
-        if not value.isidentifier():
-            raise ValueError(f"{name} must be a number or the name of a parameter; got the name {value!r}.")
-    others = {name: value for name, value in given.items() if name not in names}
-    or_name = ", or the name of a parameter to be fixed or estimated in the Problem"
-    return names | check_numbers(others, positive=positive, not_negative=not_negative, or_name=or_name)
-
-
-def check_numbers(
-    given: Mapping[str, Any], *, positive: Iterable[str] = (), not_negative: Iterable[str] = (), or_name: str = ""
-) -> dict[str, float]:
-    """Return constants that cannot be the names of parameters, as floats.
-
-    Parameters
-    ----------
-    given, positive, not_negative : as of `check_constants`
-    or_name : str, optional
-        What else one may be, for messages.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `check_constants`, and for a name.
-    """
-    found = {}
-    for name, value in given.items():
+    found: dict[str, Constant] = {}
+    not_negative = not_negative or {}
+    for name, value in {**positive, **not_negative, **(others or {})}.items():
+        if isinstance(value, str):
+            if not value.isidentifier():
+                raise ValueError(f"{name} must be a number or the name of a parameter; got the name {value!r}.")
+            found[name] = value
+            continue
         if not isinstance(value, (float, int, np.integer, np.floating)) or isinstance(value, bool):
-            raise TypeError(f"{name} must be a number{or_name}; got {shorten(value)}.")
+            or_name = "or the name of a parameter to be fixed or estimated in the Problem"
+            raise TypeError(f"{name} must be a number, {or_name}; got {shorten(value)}.")
         found[name] = as_positive(value, name) if name in positive else as_finite(value, name)
         if name in not_negative and value < 0:
             raise ValueError(f"{name} must be 0 or more; got {value}.")
@@ -141,8 +125,10 @@ def read_input(u: Any, channels: Sequence[str]) -> tuple[Any, ...]:
     return tuple(u[k] for k in range(len(channels)))
 
 
-def read_constants(constants: Constants, p: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value of each constant: itself, or that of the parameter of its name.
+class Values:
+    """The value of each constant: itself, or that of the parameter of its name, which is read when it is asked for.
+
+    So a mode needs only the parameters that it reads.
 
     Parameters
     ----------
@@ -150,7 +136,14 @@ def read_constants(constants: Constants, p: Mapping[str, Any]) -> dict[str, Any]
     p : mapping of str to array
         The parameters that a mode gets.
     """
-    return {name: p[value] if isinstance(value, str) else value for name, value in constants.items()}
+
+    def __init__(self, constants: Constants, p: Mapping[str, Any]) -> None:
+        self._constants, self._p = constants, p
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the value of a constant."""
+        value = self._constants[name]
+        return self._p[value] if isinstance(value, str) else value
 
 
 def is_absent(value: Constant) -> bool:

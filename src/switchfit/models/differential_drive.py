@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from switchfit.models.constants import (
     Constant,
     Constants,
+    Values,
     check_constants,
     check_length,
     check_modes,
     is_absent,
-    read_constants,
     read_input,
 )
 from switchfit.problem.system import HybridSystem
@@ -126,10 +126,10 @@ def differential_drive(
             f"delay is that of commanded speeds; got speeds='measured' and delay={delay!r}. Measured speeds that are "
             "late against the positions are a delay of the Measurements."
         )
-    given = {"radius": radius, "track": track, "alpha_l": alpha_l, "alpha_r": alpha_r, "y_l": y_l, "y_r": y_r}
-    given |= {"x_v": x_v, "turn_slip": turn_slip, "lag": lag} | ({} if delay is None else {"delay": delay})
     constants = check_constants(
-        given, positive=("radius", "track", "alpha_l", "alpha_r", "lag"), not_negative=("delay", "turn_slip")
+        positive={"radius": radius, "track": track, "alpha_l": alpha_l, "alpha_r": alpha_r, "lag": lag},
+        not_negative={"turn_slip": turn_slip, "delay": 0.0 if delay is None else delay},
+        others={"y_l": y_l, "y_r": y_r, "x_v": x_v},
     )
     left, right, loss = constants["y_l"], constants["y_r"], constants["turn_slip"]
     if not isinstance(left, str) and not isinstance(right, str) and not left > right:
@@ -154,12 +154,7 @@ def differential_drive(
 
 
 def _until(constants: Constants, t: Any, x: Any, p: Any) -> Any:
-    return t - read_constants({"delay": constants["delay"]}, p)["delay"]
-
-
-def _read(constants: Constants, names: Sequence[str], p: Any) -> list[Any]:
-    """Return the values of some constants, so that a mode needs only the parameters that it reads."""
-    return list(read_constants({name: constants[name] for name in names}, p).values())
+    return t - Values(constants, p)["delay"]
 
 
 def _magnitude(V: Any) -> Any:
@@ -169,29 +164,25 @@ def _magnitude(V: Any) -> Any:
 
 def _move(slips: bool, commanded: bool, waits: bool, constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
     """Return dx/dt; where the wheels wait they keep their speeds."""
-    theta = x[2]
+    theta, c = x[2], Values(constants, p)
     given = read_input(u, SPEEDS)
-    w = (x[3], x[4]) if commanded else given
-    (R,) = _read(constants, ("radius",), p)
+    w_l, w_r = (x[3], x[4]) if commanded else given
+    V_l, V_r = c["radius"] * w_l, c["radius"] * w_r
     if slips:
-        alpha_l, alpha_r, y_l, y_r = _read(constants, ("alpha_l", "alpha_r", "y_l", "y_r"), p)
-        V_l, V_r = alpha_l * R * w[0], alpha_r * R * w[1]
+        y_l, y_r, V_l, V_r = c["y_l"], c["y_r"], c["alpha_l"] * V_l, c["alpha_r"] * V_r
     else:
-        (track,) = _read(constants, ("track",), p)
-        y_l, y_r, V_l, V_r = track / 2, -track / 2, R * w[0], R * w[1]
+        y_l, y_r = c["track"] / 2, -c["track"] / 2
     turn = (V_r - V_l) / (y_l - y_r)
     v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
     if slips and not is_absent(constants["turn_slip"]):
-        (turn_slip,) = _read(constants, ("turn_slip",), p)
-        v_x = v_x * (1 - turn_slip * _magnitude(V_r - V_l) / (_magnitude(V_l) + _magnitude(V_r)))
+        v_x = v_x * (1 - c["turn_slip"] * _magnitude(V_r - V_l) / (_magnitude(V_l) + _magnitude(V_r)))
     cos, sin = jnp.cos(theta), jnp.sin(theta)
     dX, dY = v_x * cos, v_x * sin
     if slips and not is_absent(constants["x_v"]):
-        v_y = -_read(constants, ("x_v",), p)[0] * turn
+        v_y = -c["x_v"] * turn
         dX, dY = dX - v_y * sin, dY + v_y * cos
     if not commanded:
         return jnp.stack([dX, dY, turn])
     if waits:
-        return jnp.stack([dX, dY, turn, 0.0 * w[0], 0.0 * w[1]])
-    (lag,) = _read(constants, ("lag",), p)
-    return jnp.stack([dX, dY, turn, (given[0] - w[0]) / lag, (given[1] - w[1]) / lag])
+        return jnp.stack([dX, dY, turn, 0.0 * w_l, 0.0 * w_r])
+    return jnp.stack([dX, dY, turn, (given[0] - w_l) / c["lag"], (given[1] - w_r) / c["lag"]])

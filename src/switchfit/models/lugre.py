@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, Constants, check_constants, check_length, read_constants
+from switchfit.models.constants import Constant, Constants, Values, check_constants, check_length
 from switchfit.problem.system import HybridSystem
 
 
@@ -80,13 +80,9 @@ def lugre(
     ('m', 'm/s', 'm')
     """
     constants = check_constants(
-        {
-            "m": m, "k": k, "sigma_0": sigma_0, "sigma_1": sigma_1, "sigma_2": sigma_2, "F_c": F_c, "F_s": F_s,
-            "v_s": v_s,
-        },
-        positive=("m", "sigma_0", "F_c", "F_s", "v_s"),
-        not_negative=("k", "sigma_1", "sigma_2"),
-    )  # fmt: skip
+        positive={"m": m, "sigma_0": sigma_0, "F_c": F_c, "F_s": F_s, "v_s": v_s},
+        not_negative={"k": k, "sigma_1": sigma_1, "sigma_2": sigma_2},
+    )
     return HybridSystem(
         modes={"forward": partial(_move, constants, 1), "backward": partial(_move, constants, -1)},
         initial_state=check_length(initial_state, ("x", "v", "z")),
@@ -102,7 +98,7 @@ def _get_speed(t: Any, x: Any, p: Any) -> Any:
 
 def _move(constants: Constants, direction: int, t: Any, x: Any, p: Any, u: Any) -> Any:
     position, v, z = x
-    c = read_constants(constants, p)
+    c = Values(constants, p)
     level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # G(v)
     dz = v - direction * c["sigma_0"] * v * z / level
     friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v

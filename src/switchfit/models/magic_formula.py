@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import check_length, check_numbers, read_input
+from switchfit.models.constants import Constant, Constants, Values, check_constants, check_length, is_absent, read_input
+from switchfit.models.skid_steer import STATES, UNITS
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation import as_flag
 
 #: Coefficients a_1 to a_8 of the longitudinal (x) and the lateral (y) force of 1987, by the parameter's name.
 MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
@@ -24,15 +24,10 @@ MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
     }
 )
 
-#: Coefficients a_1 to a_8 of the aligning moment of 1987, by the parameter's name.
-ALIGNING_MOMENT: Mapping[str, float] = MappingProxyType(
-    {f"a_z{i}": a for i, a in enumerate((-2.72, -2.28, -1.86, -2.73, 0.110, -0.070, 0.643, -4.04), start=1)}
-)
-
 #: Channels of the input: angular velocities of the wheels.
 WHEELS = ("w1", "w2", "w3", "w4 (rad/s)")
 #: Shape factors C, which are not among the fitted coefficients.
-C_X, C_Y, C_Z = 1.65, 1.30, 2.40
+C_X, C_Y = 1.65, 1.30
 #: Slip below which a wheel's force is linear in the slip: at zero, the direction of the slip is undefined.
 SMALL_SLIP = 1e-3
 #: Part of the static load that a wheel keeps, about, where it would lift.
@@ -55,15 +50,6 @@ def lateral_force(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
     BCD = a_3 * jnp.sin(a_4 * jnp.arctan(a_5 * load))
     E = (a_6 * load + a_7) * load + a_8
     return _magic_formula(angle, BCD / (C_Y * D), C_Y, D, E)
-
-
-def compute_aligning_moment(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
-    """Return the aligning moment of a tyre (N m) at a slip angle in degrees and a load in kN, from a_z1 to a_z8."""
-    a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_z{i}"] for i in range(1, 9))
-    D = a_1 * load**2 + a_2 * load
-    BCD = (a_3 * load**2 + a_4 * load) * jnp.exp(-a_5 * load)
-    E = a_6 * load**2 + a_7 * load + a_8
-    return _magic_formula(angle, BCD / (C_Z * D), C_Z, D, E)
 
 
 def _magic_formula(X: Any, B: Any, C: float, D: Any, E: Any) -> Any:
@@ -121,19 +107,18 @@ def _derive_sine(x: Any, E: Any, C: float) -> tuple[Any, Any]:
 
 def magic_formula(
     *,
-    wheel_radius: float = 0.15,
-    low_speed: float = 0.1,
-    height: float = 0.0,
-    load_lag: float = 0.05,
-    aligning: bool = False,
+    wheel_radius: Constant = 0.15,
+    low_speed: Constant = 0.1,
+    height: Constant = 0.0,
+    load_lag: Constant = 0.05,
     initial_state: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    m_b: float = 70.0,
-    m_w: float = 2.5,
-    B_l: float = 0.89,
-    B_w: float = 0.55,
-    a: float = 0.25,
-    b: float = 0.23,
-    g: float = 9.81,
+    m_b: Constant = 70.0,
+    m_w: Constant = 2.5,
+    B_l: Constant = 0.89,
+    B_w: Constant = 0.55,
+    a: Constant = 0.25,
+    b: Constant = 0.23,
+    g: Constant = 9.81,
 ) -> HybridSystem:
     r"""Return the vehicle of `skid_steer` on tyres of the Magic Formula, driven by wheel speeds; one mode, ``"drive"``.
 
@@ -156,31 +141,27 @@ def magic_formula(
 
     which balances the moments of the forces at the ground. The body follows them with a lag, that of its pitch and
     roll: (a_x, a_y) are two more states, ``a' = (F / m - a) / load_lag``. A wheel that would lift keeps some of its
-    load: the limit is smooth, and changes a load above a tenth of the static one by less than 1e-4 of that. With
-    `aligning` the aligning moments of the tyres, each times its wheel's share of s, act on the vehicle too.
+    load: the limit is smooth, and changes a load above a tenth of the static one by less than 1e-4 of that.
 
     Parameters
     ----------
-    wheel_radius : float, optional
+    wheel_radius : float or str, optional
         R (m).
-    height : float, optional
+    height : float or str, optional
         Height h of the center of mass (m); 0: no transfer of load.
-    load_lag : float, optional
+    load_lag : float or str, optional
         Time constant of the transfer of load (s).
-    aligning : bool, optional
-        Add the aligning moments.
-    low_speed : float, optional
+    low_speed : float or str, optional
         Speed (m/s) below which slip becomes viscous friction, with a force proportional to velocity.
     initial_state : (6,) array_like, optional
         ``(X, dX, Y, dY, theta, dtheta)`` at t0 (m, m/s, m, m/s, rad, rad/s); a_x and a_y are zero there.
-    m_b, m_w, B_l, B_w, a, b, g : float, optional
+    m_b, m_w, B_l, B_w, a, b, g : float or str, optional
         As in `skid_steer`. The wheels are point masses at (±a, ±b), as in equation (18).
 
     Returns
     -------
     HybridSystem
-        Its parameters are a_x1 to a_x8 and a_y1 to a_y8; `MAGIC_FORMULA` holds their published values. With `aligning`
-        a_z1 to a_z8 too, whose published values `ALIGNING_MOMENT` holds.
+        Its parameters are a_x1 to a_x8 and a_y1 to a_y8; `MAGIC_FORMULA` holds their published values.
 
     Raises
     ------
@@ -209,31 +190,28 @@ def magic_formula(
     >>> magic_formula(height=0.2).state_names
     ('X', 'dX', 'Y', 'dY', 'theta', 'dtheta', 'a_x', 'a_y')
     """
-    given = {
-        "wheel_radius": wheel_radius, "low_speed": low_speed, "height": height, "load_lag": load_lag, "m_b": m_b,
-        "m_w": m_w, "B_l": B_l, "B_w": B_w, "a": a, "b": b, "g": g,
-    }  # fmt: skip
-    loose = ("height", "m_w")
-    numbers = check_numbers(given, positive=set(given) - set(loose), not_negative=loose)
-    names, units = ("X", "dX", "Y", "dY", "theta", "dtheta"), ("m", "m/s", "m", "m/s", "rad", "rad/s")
-    check_length(initial_state, names)
-    return HybridSystem(
-        modes={"drive": partial(_drive, numbers, as_flag(aligning, "aligning"))},
-        initial_state=initial_state if height == 0 else [*np.asarray(initial_state, dtype=float), 0.0, 0.0],
-        state_names=(*names, "a_x", "a_y") if height > 0 else names,
-        state_units=(*units, "m/s^2", "m/s^2") if height > 0 else units,
-    )
+    constants = check_constants(
+        positive={
+            "wheel_radius": wheel_radius, "low_speed": low_speed, "load_lag": load_lag, "m_b": m_b, "B_l": B_l,
+            "B_w": B_w, "a": a, "b": b, "g": g,
+        },
+        not_negative={"height": height, "m_w": m_w},
+    )  # fmt: skip
+    start, names, units = check_length(initial_state, STATES), STATES, UNITS
+    if not is_absent(constants["height"]):
+        start = [*np.asarray(initial_state, dtype=float), 0.0, 0.0]
+        names, units = (*STATES, "a_x", "a_y"), (*UNITS, "m/s^2", "m/s^2")
+    return HybridSystem({"drive": partial(_drive, constants)}, start, state_names=names, state_units=units)
 
 
-def _drive(constants: Mapping[str, float], aligning: bool, t: Any, x: Any, p: Any, u: Any) -> Any:
-    m_b, m_w, B_l, B_w, a, b, g = (constants[name] for name in ("m_b", "m_w", "B_l", "B_w", "a", "b", "g"))
-    settings = "wheel_radius", "low_speed", "height", "load_lag"
-    wheel_radius, low_speed, height, load_lag = (constants[name] for name in settings)
-    m = m_b + 4 * m_w
-    inertia = m_b * (B_l**2 + B_w**2) / 12 + 4 * m_w * (a**2 + b**2)
-    static = 1e-3 * g * m / 4
-    ahead = np.array([a, a, -a, -a])  # wheels 1 and 2 in front,
-    left = np.array([-b, b, b, -b])  # 2 and 3 on the left
+def _drive(constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
+    c = Values(constants, p)
+    a, b, height = c["a"], c["b"], c["height"]
+    m = c["m_b"] + 4 * c["m_w"]
+    inertia = c["m_b"] * (c["B_l"] ** 2 + c["B_w"] ** 2) / 12 + 4 * c["m_w"] * (a**2 + b**2)
+    static = 1e-3 * c["g"] * m / 4
+    ahead = a * np.array([1.0, 1.0, -1.0, -1.0])  # wheels 1 and 2 in front,
+    left = b * np.array([-1.0, 1.0, 1.0, -1.0])  # 2 and 3 on the left
 
     def loads(acceleration: Any) -> Any:
         load = static - 1e-3 * m * height / 4 * (acceleration[0] * ahead / a**2 + acceleration[1] * left / b**2)
@@ -244,20 +222,18 @@ def _drive(constants: Mapping[str, float], aligning: bool, t: Any, x: Any, p: An
     cos, sin = jnp.cos(theta), jnp.sin(theta)
     V_x = cos * dX + sin * dY - left * dtheta
     V_y = -sin * dX + cos * dY + ahead * dtheta
-    tread = wheel_radius * jnp.stack(read_input(u, WHEELS))
-    V_squared = 0.5 * (V_x**2 + tread**2) + low_speed**2
+    tread = c["wheel_radius"] * jnp.stack(read_input(u, WHEELS))
+    V_squared = 0.5 * (V_x**2 + tread**2) + c["low_speed"] ** 2
     creep = jnp.sqrt((tread - V_x) ** 2 + V_y**2 + SMALL_SLIP**2 * V_squared)
     slip = creep / jnp.sqrt(V_squared)  # the norm of s
     share_x, share_y = (tread - V_x) / creep, -V_y / creep  # s_x / slip, s_y / slip
     angle = jnp.degrees(jnp.arctan(slip))
-    load = static if height == 0 else loads(x[6:])
+    load = static if len(x) == 6 else loads(x[6:])
     F_x = longitudinal_force(100 * slip, load, p) * share_x
     F_y = lateral_force(angle, load, p) * share_y
     along, across = jnp.sum(F_x) / m, jnp.sum(F_y) / m
     torque = jnp.sum(ahead * F_y - left * F_x)
-    if aligning:
-        torque = torque + jnp.sum(compute_aligning_moment(angle, load, p) * share_y)
     rates = [dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia]
-    if height > 0:
-        rates += [(along - x[6]) / load_lag, (across - x[7]) / load_lag]
+    if len(x) > 6:
+        rates += [(along - x[6]) / c["load_lag"], (across - x[7]) / c["load_lag"]]
     return jnp.stack(rates)

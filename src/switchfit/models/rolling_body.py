@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from switchfit.models.constants import Constant, Constants, check_constants, is_absent, read_constants
+from switchfit.models.constants import Constant, Constants, Values, check_constants, is_absent
 from switchfit.problem.system import HybridSystem
 
 
@@ -78,9 +78,9 @@ def rolling_body(
     5.0
     """
     constants = check_constants(
-        {"radius": radius, "inertia": inertia, "mu": mu, "rolling": rolling, "slope": slope, "g": g},
-        positive=("radius", "inertia", "g"),
-        not_negative=("mu", "rolling"),
+        positive={"radius": radius, "inertia": inertia, "g": g},
+        not_negative={"mu": mu, "rolling": rolling},
+        others={"slope": slope},
     )
     return HybridSystem(
         modes={
@@ -99,7 +99,7 @@ def _start(p: Any) -> Any:
     return jnp.stack([0.0 * p["v_0"], p["v_0"], p["omega_0"]])
 
 
-def _slope(constants: Constants, c: dict[str, Any]) -> tuple[Any, Any]:
+def _slope(constants: Constants, c: Values) -> tuple[Any, Any]:
     """Return the cosine and the sine of the slope."""
     if is_absent(constants["slope"]):
         return 1.0, 0.0
@@ -107,7 +107,7 @@ def _slope(constants: Constants, c: dict[str, Any]) -> tuple[Any, Any]:
 
 
 def _slide(constants: Constants, direction: int, t: Any, x: Any, p: Any) -> Any:
-    c = read_constants(constants, p)
+    c = Values(constants, p)
     cos, sin = _slope(constants, c)
     friction = direction * c["mu"] * c["g"] * cos
     dv = -friction - c["g"] * sin
@@ -115,11 +115,11 @@ def _slide(constants: Constants, direction: int, t: Any, x: Any, p: Any) -> Any:
 
 
 def _roll(constants: Constants, t: Any, x: Any, p: Any) -> Any:
-    c = read_constants(constants, p)
+    c = Values(constants, p)
     cos, sin = _slope(constants, c)
     dv = -c["g"] * (sin + c["rolling"] * cos) / (1 + c["inertia"])
     return jnp.stack([x[1], dv + 0.0 * x[1], dv / c["radius"] + 0.0 * x[1]])
 
 
 def _get_slip(constants: Constants, t: Any, x: Any, p: Any) -> Any:
-    return x[1] - read_constants(constants, p)["radius"] * x[2]
+    return x[1] - Values(constants, p)["radius"] * x[2]

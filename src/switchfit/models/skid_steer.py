@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import permutations
 from typing import Any, Literal
@@ -14,12 +14,11 @@ from numpy.typing import ArrayLike
 from switchfit.models.constants import (
     Constant,
     Constants,
+    Values,
     check_constants,
     check_length,
     check_modes,
-    check_numbers,
     is_absent,
-    read_constants,
     read_input,
 )
 from switchfit.problem.system import HybridSystem
@@ -34,7 +33,8 @@ FRICTIONS: Mapping[int, tuple[str, str]] = {1: ("mu_front", "coulomb_front"), -1
 """Viscous and Coulomb's friction of each axle."""
 
 
-STATES = ("X", "dX", "Y", "dY", "theta", "dtheta")
+STATES: tuple[str, ...] = ("X", "dX", "Y", "dY", "theta", "dtheta")
+UNITS: tuple[str, ...] = ("m", "m/s", "m", "m/s", "rad", "rad/s")
 
 FORCES = ("F1", "F2", "F3", "F4 (N)")
 """Channels of the input: the driving forces of the wheels."""
@@ -67,7 +67,7 @@ def skid_steer(
     rolling: Constant = 0.0,
     slope_x: Constant = 0.0,
     slope_y: Constant = 0.0,
-    small_speed: float = 0.01,
+    small_speed: Constant = 0.01,
 ) -> HybridSystem:
     r"""Return a vehicle with four driven wheels that turns by skidding.
 
@@ -123,7 +123,7 @@ def skid_steer(
         Rolling resistance (1), against the velocity along the body.
     slope_x, slope_y : float or str, optional
         Slope of the ground along X and Y (1): positive uphill, small.
-    small_speed : float, optional
+    small_speed : float or str, optional
         Speed below which Coulomb's friction and rolling resistance are about viscous (m/s).
 
     Returns
@@ -172,16 +172,17 @@ def skid_steer(
     names = _check_modes(modes, restick)
     forces = _check_forces(forces_from_input, stick_forces=stick_forces, slip_forces=slip_forces)
     constants = check_constants(
-        {
-            "m_b": m_b, "m_w": m_w, "B_l": B_l, "B_w": B_w, "a": a, "b": b, "c_1": c_1, "c_2": c_2, "g": g,
-            "mu_front": mu_front, "mu_rear": mu_rear, "coulomb_front": coulomb_front, "coulomb_rear": coulomb_rear,
-            "rolling": rolling, "slope_x": slope_x, "slope_y": slope_y,
+        positive={"m_b": m_b, "B_l": B_l, "B_w": B_w, "a": a, "b": b, "g": g, "small_speed": small_speed},
+        not_negative={
+            "m_w": m_w, "c_1": c_1, "c_2": c_2, "mu_front": mu_front, "mu_rear": mu_rear,
+            "coulomb_front": coulomb_front, "coulomb_rear": coulomb_rear, "rolling": rolling,
         },
-        positive=("m_b", "B_l", "B_w", "a", "b", "g"),
-        not_negative=("m_w", "c_1", "c_2", "mu_front", "mu_rear", "coulomb_front", "coulomb_rear", "rolling"),
+        others={"slope_x": slope_x, "slope_y": slope_y},
     )  # fmt: skip
-    speed = check_numbers({"small_speed": small_speed}, positive=("small_speed",))["small_speed"]
-    resets = {}
+    fields, resets = {}, {}
+    for name in names:
+        field: Any = _move_by_input if forces is None else partial(_move, forces[0 if name == "stick" else 1])
+        fields[name] = partial(field, STUCK[name], constants)
     if restick == "reset":
         resets = {
             (before, after): partial(_stop_axles, STUCK[after], constants)
@@ -189,11 +190,11 @@ def skid_steer(
             if not set(STUCK[after]) <= set(STUCK[before])
         }
     return HybridSystem(
-        modes={name: _make_mode(name, forces, constants, speed) for name in names},
+        modes=fields,
         initial_state=check_length(initial_state, STATES),
         reset_maps=resets,
         state_names=STATES,
-        state_units=("m", "m/s", "m", "m/s", "rad", "rad/s"),
+        state_units=UNITS,
     )
 
 
@@ -222,26 +223,14 @@ def _check_forces(from_input: bool, **given: Any) -> list[tuple[float, ...]] | N
     return found
 
 
-def _make_mode(
-    name: str, forces: list[tuple[float, ...]] | None, constants: Constants, small: float
-) -> Callable[..., Any]:
-    """Return the vector field of a mode."""
-    stuck = STUCK[name]
-    if forces is None:
-        return partial(_move_by_input, stuck, constants, small)
-    return partial(_move, forces[0] if len(stuck) == 2 else forces[1], stuck, constants, small)
+def _move_by_input(stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
+    return _move(read_input(u, FORCES), stuck, constants, t, x, p)
 
 
-def _move_by_input(stuck: tuple[int, ...], constants: Constants, small: float, t: Any, x: Any, p: Any, u: Any) -> Any:
-    return _move(read_input(u, FORCES), stuck, constants, small, t, x, p)
-
-
-def _move(
-    forces: tuple[Any, ...], stuck: tuple[int, ...], constants: Constants, small: float, t: Any, x: Any, p: Any
-) -> Any:
+def _move(forces: tuple[Any, ...], stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p: Any) -> Any:
     """Return dx/dt with driving forces (4,) where some axles do not move sideways."""
     _, dX, _, dY, theta, dtheta = x
-    c = read_constants(constants, p)
+    c = Values(constants, p)
     m, inertia = _masses(c)
     F_1, F_2, F_3, F_4 = forces
     F = F_1 + F_2 + F_3 + F_4
@@ -251,7 +240,7 @@ def _move(
     ddX = (F * cos - drag * dX) / m  # (18)
     ddY = (F * sin - drag * dY) / m  # (18)
     if not is_absent(constants["rolling"]):
-        resistance = c["g"] * c["rolling"] * along / jnp.sqrt(along**2 + small**2)
+        resistance = c["g"] * c["rolling"] * along / jnp.sqrt(along**2 + c["small_speed"] ** 2)
         ddX, ddY = ddX - resistance * cos, ddY - resistance * sin
     sloped = not (is_absent(constants["slope_x"]) and is_absent(constants["slope_y"]))
     if len(stuck) == 2:
@@ -275,7 +264,7 @@ def _move(
         if viscous:
             terms.append(c[viscous] * speed)
         if not is_absent(constants[coulomb]):
-            terms.append(c[coulomb] * speed / jnp.sqrt(speed**2 + small**2))
+            terms.append(c[coulomb] * speed / jnp.sqrt(speed**2 + c["small_speed"] ** 2))
         if terms:
             force = 0.5 * c["g"] * sum(terms)  # a unit of mass, against the speed
             ddX, ddY = ddX + force * sin, ddY - force * cos
@@ -297,7 +286,7 @@ def _stop_axles(stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p:
     if len(stuck) == 2:
         return jnp.stack([X, along * cos, Y, along * sin, theta, jnp.zeros_like(dtheta)])
     (side,) = stuck
-    c = read_constants(constants, p)
+    c = Values(constants, p)
     m, inertia = _masses(c)
     ratio = 12 * m * c["a"] ** 2 / inertia
     v = -sin * dX + cos * dY
@@ -306,7 +295,7 @@ def _stop_axles(stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p:
     return jnp.stack([X, along * cos - across * sin, Y, along * sin + across * cos, theta, turn])
 
 
-def _masses(c: Mapping[str, Any]) -> tuple[Any, Any]:
+def _masses(c: Values) -> tuple[Any, Any]:
     """Return the mass, and twelve times the moment of inertia, as in (18)."""
     m = c["m_b"] + 4 * c["m_w"]
     return m, 4 * c["m_w"] * (12 * c["a"] ** 2 + 12 * c["b"] ** 2) + c["m_b"] * (c["B_l"] ** 2 + c["B_w"] ** 2)

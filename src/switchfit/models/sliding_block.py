@@ -7,11 +7,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from switchfit.models.constants import check_numbers
+from switchfit.models.constants import Constant, Constants, Values, check_constants
 from switchfit.problem.system import HybridSystem
 
 
-def sliding_block(*, g: float = 9.81) -> HybridSystem:
+def sliding_block(*, g: Constant = 9.81) -> HybridSystem:
     r"""Return a body sliding on a level plane, modes ``"slide"`` and ``"stick"``, state ``(x, y, vx, vy)``.
 
     Friction acts opposite to the velocity, so that the body moves on a straight line. With ``e`` the unit vector along
@@ -24,7 +24,7 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
 
     Parameters
     ----------
-    g : float, optional
+    g : float or str, optional
         Acceleration of gravity (m/s²).
 
     Returns
@@ -58,19 +58,17 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
     >>> fit.theta.round(2)
     array([0.51, 0.4 ])
     """
-
-    known = check_numbers({"g": g}, positive=("g",))
     return HybridSystem(
-        modes={"slide": partial(_slide, known["g"]), "stick": _stick},
+        modes={"slide": partial(_slide, check_constants(positive={"g": g})), "stick": _stick},
         initial_state=_start,
         state_names=("x", "y", "vx", "vy"),
         state_units=("m", "m", "m/s", "m/s"),
     )
 
 
-def _slide(g: float, t: Any, x: Any, p: Any) -> Any:
+def _slide(constants: Constants, t: Any, x: Any, p: Any) -> Any:
     speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)
-    deceleration = p["mu"] * g / speed
+    deceleration = p["mu"] * Values(constants, p)["g"] / speed
     return jnp.stack([x[2], x[3], -deceleration * p["vx0"], -deceleration * p["vy0"]])
 
 

@@ -1,7 +1,8 @@
 """Every experiment and figure of Section V of the paper, with its numbers compared to ours.
 
-One module per part. Each has ``compute(quick, folder, say)``, which returns results as plain numbers and lists,
-``draw(found)``, which draws figures from these alone, and ``rows(found)``, lines of the table. `run` runs all parts.
+One module per part. Each has a TITLE, ``compute(quick, folder, say)``, which returns results as plain numbers and lists
+and keeps what its long studies have done in a folder, ``draw(found)``, which returns figures drawn from these alone by
+the names of their files, and ``rows(found)``, lines of the table. `run` runs all parts.
 
 Run all parts: figures, ``results.json``, and the table that compares the paper's numbers with ours.
 """
@@ -15,16 +16,16 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from switchfit.paper import convergence, drawing, horizon, lti, magic, noise, starts, trials
-from switchfit.paper.vehicle import Found, Part, Row, Say
-from switchfit.runtime.errors import InputError, get_first_line
+from switchfit.paper import convergence, horizon, lti, magic, noise, starts, trials, vehicle
+from switchfit.paper.vehicle import Found, Say
 from switchfit.runtime.files import write_atomically
 
 #: Name -> part, in the order of the paper.
-PARTS: Mapping[str, Part] = {
-    "vehicle": drawing,
+PARTS: Mapping[str, ModuleType] = {
+    "vehicle": vehicle,
     "lti": lti,
     "magic-formula": magic,
     "convergence": convergence,
@@ -36,7 +37,7 @@ PARTS: Mapping[str, Part] = {
 RESULTS, TABLE = "results.json", "table.md"
 
 
-def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | None = None) -> dict[str, Any]:
+def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = lambda text: None) -> dict[str, Any]:
     """Run every part of the paper, or one, and write the results.
 
     Parameters
@@ -69,20 +70,20 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say | N
     """
     if only is not None and only not in PARTS:
         raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
-    tell = say or (lambda text: None)
     names = list(PARTS) if only is None else [only]
     unfinished = out / f".unfinished-{version('switchfit')}-{'quick' if quick else 'full'}-{only or 'all'}"
     unfinished.mkdir(parents=True, exist_ok=True)
-    results = _load_earlier(out / RESULTS) if only is not None else {}
+    is_kept = only is not None and (out / RESULTS).exists()
+    results: dict[str, Any] = json.loads((out / RESULTS).read_bytes()) if is_kept else {}
     for number, name in enumerate(names, start=1):
         part, place = PARTS[name], f"[{number}/{len(names)}] {PARTS[name].TITLE}"
         kept = unfinished / f"{name}.json"
         if kept.exists():
             entry = json.loads(kept.read_bytes())
-            tell(f"{place}: done before the interruption")
+            say(f"{place}: done before the interruption")
         else:
             began = time.perf_counter()
-            found = part.compute(quick, unfinished / name, lambda text, place=place: tell(f"{place}: {text}"))  # type: ignore[misc]  # mypy cannot infer the default
+            found = part.compute(quick, unfinished / name, lambda text, place=place: say(f"{place}: {text}"))  # type: ignore[misc]  # mypy cannot infer the default
             entry = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
             write_atomically(json.dumps(entry), kept)
         results[name] = entry
@@ -100,7 +101,8 @@ def table(results: Mapping[str, Found]) -> str:
     """Return a Markdown table of the paper's numbers and ours, from the content of ``results.json``."""
     lines = ["| claim | paper | switchfit | remark |", "|---|---|---|---|"]
     for name, entry in results.items():
-        lines += [_line(row) for row in PARTS[name].rows(entry["found"])]
+        for row in PARTS[name].rows(entry["found"]):
+            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |")
     seconds = sum(entry["seconds"] for entry in results.values())
     fewer = [name for name, entry in results.items() if entry["quick"]]
     note = f"switchfit {version('switchfit')}, {seconds:.0f} s in all."
@@ -112,21 +114,6 @@ def table(results: Mapping[str, Found]) -> str:
 def _lines(results: Mapping[str, Found]) -> str:
     """Return JSON with a line for each part."""
     return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items()) + "\n}\n"
-
-
-def _line(row: Row) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
-
-
-def _load_earlier(path: Path) -> dict[str, Any]:
-    """Return results of parts that were run before; empty if there is no file."""
-    if not path.exists():
-        return {}
-    try:
-        earlier: dict[str, Any] = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({get_first_line(error)}): remove it, and run all parts again.") from error
-    return earlier
 
 
 def _save(figure: Any, path: Path) -> None:

@@ -12,23 +12,8 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.optimize.problem import HessianKind
-from switchfit.paper.vehicle import (
-    BLUE,
-    COLUMN,
-    DARK,
-    LIGHT,
-    RED,
-    TRUTH,
-    Figure,
-    Found,
-    Row,
-    Say,
-    build_simulated_problem,
-    conditions,
-    new_figure,
-    summary,
-    tidy,
-)
+from switchfit.paper import vehicle
+from switchfit.paper.vehicle import BLUE, DARK, LIGHT, RED, Figure, Found, Row, Say
 from switchfit.problem.problem import Problem
 
 TITLE = "Convergence (Fig. 4)"
@@ -57,15 +42,14 @@ def fit_kinds(problem: Problem, kinds: Sequence[HessianKind], say: Say) -> dict[
     for kind in kinds:
         say(kind)
         fit = fit_locally(problem, hessian=kind, max_iterations=20000)
-        found[kind] = {**summary(fit), "history": thin(fit)}
+        found[kind] = {**vehicle.summary(fit), "history": thin(fit)}
     return found
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
     """Fit with every algorithm, to 1e-7."""
-    problem = build_simulated_problem()
+    problem = vehicle.build_simulated_problem()
     found: Found = {
-        "truth": list(TRUTH),
         "eigenvalues_at_start": np.linalg.eigvalsh(evaluate(problem).hessian).tolist(),
         "fits": fit_kinds(problem, KINDS, say),
     }
@@ -77,14 +61,14 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 def convergence_figure(fits: Found) -> Figure:
     """Draw the norm of the gradient against iteration, both logarithmic, for several algorithms."""
-    figure = new_figure(COLUMN, 3.0)
+    figure = vehicle.new_figure(vehicle.COLUMN, 3.0)
     ax = figure.subplots()
     for kind, fit in fits.items():
         iterations, norms = fit["history"]
         ax.loglog(np.array(iterations) + 1, np.maximum(norms, 1e-13), linewidth=1.2, **LOOKS[kind])
     ax.axhline(1e-7, color=DARK, linewidth=0.6)
     ax.annotate("tolerance", (1, 1e-7), xytext=(1, 3), textcoords="offset points", fontsize=6)
-    tidy(ax, "iteration + 1", r"$\|DJ\|$")
+    vehicle.tidy(ax, "iteration + 1", r"$\|DJ\|$")
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=6.5)
     return figure
 
@@ -108,38 +92,26 @@ def factor(history: list[list[float]]) -> float:
     return float((norms[-1] / norms[middle]) ** (1 / (iterations[-1] - iterations[middle])))
 
 
+LINES = """
+* Fig. 4: values found (mu; tau) | (0.7; 6, 10), the correct ones
+| ({exact[theta][mu]:.4f}; {exact[theta][tau_1]:.4f}, {exact[theta][tau_2]:.4f})
+* Fig. 4: iterations of steepest descent to ‖DJ‖ < 1e-7 | about 1000 | {steepest[iterations]}
+| {ratio:.0f} times those with the exact Hessian; in the metric of (s, s, 1) as given, steps halved from 1 until 0.4 of
+the predicted decrease is reached (the paper does not print its line search, and the count depends on it)
+* Fig. 4: iterations with the block-diagonal Hessian | not quadratic
+| {block[iterations]}, linear: a factor of {factor:.3f} each
+* Fig. 4: iterations with the exact Hessian | 12 | {exact[iterations]}, order {order:.2f}
+| the Hessian is made positive definite where it is not, instead of descending first
+* Section II-A: descent until the Hessian is positive definite, then SQP | 12 (the same)
+| {first[iterations]}, of which {descents} descents | smallest eigenvalue at the start {eigenvalues_at_start[0]:.1f}
+* Fig. 4: second-order sufficient conditions | not printed | {conditions}
+"""
+
+
 def rows(found: Found) -> list[Row]:
     """Return the lines of the table."""
-    fits = found["fits"]
-    block, exact, first = fits["block-diagonal"], fits["exact"], fits["descent-first"]
-    result = fits["exact"]["theta"]
-    values = f"({result['mu']:.4f}; {result['tau_1']:.4f}, {result['tau_2']:.4f})"
-    return [
-        Row("Fig. 4: values found (mu; tau)", "(0.7; 6, 10), the correct ones", values),
-        Row(
-            "Fig. 4: iterations of steepest descent to ‖DJ‖ < 1e-7",
-            "about 1000",
-            str(fits["none"]["iterations"]),
-            f"{fits['none']['iterations'] / exact['iterations']:.0f} times those with the exact Hessian; in the metric "
-            "of (s, s, 1) as given, steps halved from 1 until 0.4 of the predicted decrease is reached (the paper does "
-            "not print its line search, and the count depends on it)",
-        ),
-        Row(
-            "Fig. 4: iterations with the block-diagonal Hessian",
-            "not quadratic",
-            f"{block['iterations']}, linear: a factor of {factor(block['history']):.3f} each",
-        ),
-        Row(
-            "Fig. 4: iterations with the exact Hessian",
-            "12",
-            f"{exact['iterations']}, order {order(exact['history']):.2f}",
-            "the Hessian is made positive definite where it is not, instead of descending first",
-        ),
-        Row(
-            "Section II-A: descent until the Hessian is positive definite, then SQP",
-            "12 (the same)",
-            f"{first['iterations']}, of which {found['descents']} descents",
-            f"smallest eigenvalue at the start {found['eigenvalues_at_start'][0]:.1f}",
-        ),
-        Row("Fig. 4: second-order sufficient conditions", "not printed", conditions(exact)),
-    ]
+    steepest, block, exact, first = (found["fits"][kind] for kind in KINDS)
+    fits = {"steepest": steepest, "block": block, "exact": exact, "first": first}
+    rates = {"factor": factor(block["history"]), "order": order(exact["history"])}
+    ratio, conditions = steepest["iterations"] / exact["iterations"], vehicle.conditions(exact)
+    return vehicle.fill_rows(LINES, ratio=ratio, conditions=conditions, **fits, **rates, **found)

@@ -15,28 +15,9 @@ import numpy as np
 from switchfit.batch.simulated import monte_carlo
 from switchfit.batch.starts import multistart
 from switchfit.fit.evaluator import evaluate
-from switchfit.paper.vehicle import (
-    BLUE,
-    COLUMN,
-    DARK,
-    HORIZON,
-    NAMES,
-    RED,
-    SYMBOLS,
-    TRUTH,
-    Figure,
-    Found,
-    Row,
-    Say,
-    complete,
-    new_figure,
-    position,
-    simulate_drive,
-    states_at,
-    stick_slip,
-    tidy,
-)
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.paper import vehicle
+from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, stick_slip
+from switchfit.problem.data import FloatArray, ReferenceSignal
 
 TITLE = "Horizon"
 #: Ends of the horizon (s); slip lasts from 6 to 10 s.
@@ -63,7 +44,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 def _sample_sets() -> list[Found]:
     """Return the standard error of mu from 1 Hz positions over several horizons, and without positions in slip."""
-    path = simulate_drive(tf=ENDS[-1])
+    path = vehicle.simulate_drive(tf=ENDS[-1])
     begin, end = TRUTH[:2]
     sets = [(f"0 to {tf:g} s", tf, np.arange(tf + 1)) for tf in (end, 11.0, 12.0, 13.0, HORIZON, 20.0, 30.0)]
     seconds = np.arange(HORIZON + 1)
@@ -72,8 +53,7 @@ def _sample_sets() -> list[Found]:
     found: list[Found] = []
     for label, tf, times in sets:
         theta = TRUTH if tf > end else (TRUTH[0], TRUTH[2])
-        positions = states_at(path, times)[:, [0, 2]]
-        hessian = evaluate(stick_slip(Measurements(times, positions, position, sigma=SIGMA), theta, tf=tf)).hessian
+        hessian = evaluate(vehicle.fit_positions(path, times, theta, SIGMA, tf)).hessian
         inside = int(np.sum((times > begin) & (times <= end)))
         errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
         found.append({"label": label, "samples": len(times), "in_slip": inside, "mu": float(errors[-1])})
@@ -84,23 +64,22 @@ def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
     """Return accuracy and conditioning with noisy positions; convergence of the noise-free fit of Fig. 4 from many
     starts.
     """
-    path = simulate_drive(tf=max(tf, HORIZON))
+    path = vehicle.simulate_drive(tf=max(tf, HORIZON))
     times = np.arange(round(RATE * tf) + 1) / RATE
     names = NAMES if tf > TRUTH[1] else (NAMES[0], NAMES[2])
     truth = tuple(TRUTH[NAMES.index(name)] for name in names)
-    noisy = stick_slip(Measurements(times, states_at(path, times)[:, [0, 2]], position, sigma=SIGMA), truth, tf=tf)
-    hessian = evaluate(noisy).hessian
-    study = complete(monte_carlo(noisy, runs, theta=truth, seed=round(10 * tf), folder=folder / f"noise-{tf:g}"))
+    noisy = vehicle.fit_positions(path, times, truth, SIGMA, tf)
+    hessian, seed = evaluate(noisy).hessian, round(10 * tf)
+    study = vehicle.complete(monte_carlo(noisy, runs, theta=truth, seed=seed, folder=folder / f"noise-{tf:g}"))
     here = slice(0, np.searchsorted(path.times, tf - 1e-9) + 1)  # without the second of two nodes at tf
     exact = stick_slip(ReferenceSignal.from_samples(path.times[here], path.states[here]), truth, tf=tf)
-    search = complete(multistart(exact, _starts(len(names), tf, starts), folder=folder / f"starts-{tf:g}"))
+    search = vehicle.complete(multistart(exact, _starts(len(names), tf, starts), folder=folder / f"starts-{tf:g}"))
     arrived = search.success & np.all(np.abs(search.theta / truth - 1) < NEAR, axis=1)
     return {
         "tf": tf,
         "names": list(names),
         "standard_errors": (np.sqrt(np.diag(np.linalg.inv(hessian))) / truth).tolist(),
         "rms_errors": (np.sqrt(np.mean(study.errors**2, axis=0)) / truth).tolist(),
-        "converged": int(study.success.sum()),
         "condition": float(np.linalg.cond(hessian * np.outer(truth, truth))),
         "arrived": float(np.mean(arrived)),
     }
@@ -118,7 +97,7 @@ def _starts(d: int, tf: float, count: int) -> FloatArray:
 
 def draw(found: Found) -> dict[str, Figure]:
     """Draw accuracy, conditioning and region of convergence against the end of the horizon."""
-    figure = new_figure(COLUMN, 5.6)
+    figure = vehicle.new_figure(vehicle.COLUMN, 5.6)
     accuracy, conditioning, region = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
     levels = found["horizons"]
     for name, colour, marker in zip(NAMES, (RED, BLUE, DARK), ("o", "s", "^"), strict=True):
@@ -137,33 +116,32 @@ def draw(found: Found) -> dict[str, Figure]:
         ax.axvline(HORIZON, color="#999999", linestyle=":", linewidth=0.9)
     accuracy.annotate("slip", (8.0, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=7)
     accuracy.annotate("paper", (HORIZON, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=7)
-    tidy(accuracy, "", "error (%)")
-    tidy(conditioning, "", "condition number")
-    tidy(region, "end of the horizon (s)", "starts that reach\nthe optimum (%)")
+    vehicle.tidy(accuracy, "", "error (%)")
+    vehicle.tidy(conditioning, "", "condition number")
+    vehicle.tidy(region, "end of the horizon (s)", "starts that reach\nthe optimum (%)")
     figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=6)
     return {"horizon": figure}
 
 
+LINE = """
+* Horizon 0 to {tf:g} s | left for further analysis
+| {errors}; condition number {condition:.0f}; {share:.0f} % of starts reach the optimum
+| {rate} Hz positions, sigma {sigma:g} m; {runs} runs, {starts} starts
+"""
+
+SAMPLES_LINE = """
+* V-A 3: standard error of mu, 1 Hz positions {label} | effectively only four measurements affect it | {mu:.4f}
+| {samples} samples, {in_slip} of them in slip; sigma {sigma:g} m
+"""
+
+
 def rows(found: Found) -> list[Row]:
     """Return the lines of the table."""
-    remark = f"{RATE} Hz positions, sigma {SIGMA:g} m; {found['runs']} runs, {found['starts']} starts"
-    return [
-        Row(f"Horizon 0 to {level['tf']:g} s", "left for further analysis", _line(level), remark)
-        for level in found["horizons"]
-    ] + [
-        Row(
-            f"V-A 3: standard error of mu, 1 Hz positions {line['label']}",
-            "effectively only four measurements affect it",
-            f"{line['mu']:.4f}",
-            f"{line['samples']} samples, {line['in_slip']} of them in slip; sigma {SIGMA:g} m",
-        )
-        for line in found["samples"]
-    ]
-
-
-def _line(level: Found) -> str:
-    errors = ", ".join(f"{name} {100 * e:.2g} %" for name, e in zip(level["names"], level["rms_errors"], strict=True))
-    return (
-        f"{errors}; condition number {level['condition']:.0f}; {100 * level['arrived']:.0f} % of starts reach the "
-        "optimum"
-    )
+    lines, settings = [], {"rate": RATE, "sigma": SIGMA, "runs": found["runs"], "starts": found["starts"]}
+    for level in found["horizons"]:
+        errors = [f"{name} {100 * e:.2g} %" for name, e in zip(level["names"], level["rms_errors"], strict=True)]
+        own = {"errors": ", ".join(errors), "share": 100 * level["arrived"]}
+        lines += vehicle.fill_rows(LINE, **settings, **own, **level)
+    for line in found["samples"]:
+        lines += vehicle.fill_rows(SAMPLES_LINE, sigma=SIGMA, **line)
+    return lines

@@ -11,7 +11,7 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.models.magic_formula import MAGIC_FORMULA
 from switchfit.paper import vehicle
-from switchfit.paper.vehicle import BLUE, DARK, LIGHT, PAGE, RED, Figure, Found, Row, Say, conditions, new_figure, tidy
+from switchfit.paper.vehicle import BLUE, DARK, LIGHT, PAGE, RED, Figure, Found, Row, Say, tidy
 from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Parameter
 from switchfit.report.style import MODE_COLOURS
@@ -19,7 +19,6 @@ from switchfit.uncertainty.certificate import identifiability
 
 TITLE = "Magic Formula reference (Fig. 3)"
 START = (5.0, 10.0, 0.8)
-PAPER = {"tau_1": 5.0, "tau_2": 11.7, "mu": 0.676}
 SECONDS = np.arange(16.0)
 #: Eigenvalues below this part of the largest one are rounding.
 ROUNDING = 1e-15
@@ -67,7 +66,6 @@ def _coefficients(speeds: Any, say: Say) -> Found:
     analysis = identifiability(problem)
     return {
         "eigenvalues": np.linalg.eigvalsh(hessian * np.outer(size, size)).tolist(),
-        "scaled_eigenvalues": analysis.eigenvalues.tolist(),
         "undetermined": analysis.undetermined,
         "worst": [direction.summary for direction in analysis.directions],
     }
@@ -75,7 +73,7 @@ def _coefficients(speeds: Any, say: Say) -> Found:
 
 def draw(found: Found) -> dict[str, Figure]:
     """Draw figure 3: the paths, the yaw rates that explain the second transition, the eigenvalues."""
-    figure = new_figure(PAGE, 2.9)
+    figure = vehicle.new_figure(PAGE, 2.9)
     paths, yaw, spectrum = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1.0))
     reference, literal, reset = np.array(found["path"]), found["fits"]["continuous"], found["fits"]["reset"]
     paths.plot(*reference.T, "--", color="#888888", linewidth=2.2, label="Magic Formula")
@@ -103,59 +101,42 @@ def draw(found: Found) -> dict[str, Figure]:
     return {"fig3-magic-formula": figure}
 
 
+LINES = """
+* Fig. 3: tau_1 (s) | 5, the commanded change | {ours[tau_1]:.2f} (with reset {other[tau_1]:.2f})
+| commanded at 5 s, the wheels take {rise:g} s to follow
+* Fig. 3: tau_2 (s) | 11.7, later than the commanded 10 | {ours[tau_2]:.2f} (with reset {other[tau_2]:.2f})
+| delayed by {delay:.2f} s instead of 1.7 s: tyres of this stiffness stop turning within 0.1 s of the wheels, so the
+delay is that of the wheels ({rise:g} s)
+* Fig. 3: mu | 0.676; 0.6 to 0.85 on asphalt | {ours[mu]:.3f} (with reset {other[mu]:.3f})
+| mu of (18) sets the yaw rate, which the treads' difference of speed sets here (±{differential:g} m/s, a choice): 0.253
+rad/s / mu
+* Fig. 3: the reference is tracked well | by eye
+| {literal[rms_position_error]:.2f} m rms (with reset {reset[rms_position_error]:.2f} m)
+| taken literally, (18) keeps turning after it sticks again
+"""
+
+RAMP_LINE = """
+* Fig. 3: the wheels take {rise:g} s to turn and {fall:g} s to stop turning | not printed; finds 5, 11.7, 0.676
+| {theta[tau_1]:.2f}, {theta[tau_2]:.2f}, {theta[mu]:.3f} | tau_1, tau_2 (s), mu
+"""
+
+LAST_LINES = """
+* Fig. 3: optimality | necessary and sufficient conditions | {conditions}
+* V-A 1: Hessian in 16 Magic Formula coefficients | ill-conditioned
+| eigenvalues {eigenvalues[15]:.1e} to below rounding; {undetermined} of 16 combinations undetermined
+| positions at 10 Hz without noise, coefficients in units of their values; the identifiability analysis (scaled Hessian)
+says of one that it cannot be seen: {worst[0]}
+"""
+
+
 def rows(found: Found) -> list[Row]:
     """Return the lines of the table."""
     literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
     ours, other = literal["theta"], reset["theta"]
-    values = np.array(found["eigenvalues"])
+    fits = {"literal": literal, "reset": reset, "ours": ours, "other": other}
+    choices = {"rise": vehicle.RISE, "differential": vehicle.DIFFERENTIAL}
     return [
-        Row(
-            "Fig. 3: tau_1 (s)",
-            f"{PAPER['tau_1']:g}, the commanded change",
-            f"{ours['tau_1']:.2f} (with reset {other['tau_1']:.2f})",
-            f"commanded at 5 s, the wheels take {vehicle.RISE:g} s to follow",
-        ),
-        Row(
-            "Fig. 3: tau_2 (s)",
-            f"{PAPER['tau_2']:g}, later than the commanded 10",
-            f"{ours['tau_2']:.2f} (with reset {other['tau_2']:.2f})",
-            f"delayed by {ours['tau_2'] - vehicle.COMMANDED[1]:.2f} s instead of 1.7 s: tyres of this stiffness stop "
-            f"turning within 0.1 s of the wheels, so the delay is that of the wheels ({vehicle.RISE:g} s)",
-        ),
-        Row(
-            "Fig. 3: mu",
-            f"{PAPER['mu']:g}; 0.6 to 0.85 on asphalt",
-            f"{ours['mu']:.3f} (with reset {other['mu']:.3f})",
-            f"mu of (18) sets the yaw rate, which the treads' difference of speed sets here "
-            f"(±{vehicle.DIFFERENTIAL:g} m/s, a choice): 0.253 rad/s / mu",
-        ),
-        Row(
-            "Fig. 3: the reference is tracked well",
-            "by eye",
-            f"{literal['rms_position_error']:.2f} m rms (with reset {reset['rms_position_error']:.2f} m)",
-            "taken literally, (18) keeps turning after it sticks again",
-        ),
-        *_ramp_rows(found["ramps"]),
-        Row("Fig. 3: optimality", "necessary and sufficient conditions", conditions(literal)),
-        Row(
-            "V-A 1: Hessian in 16 Magic Formula coefficients",
-            "ill-conditioned",
-            f"eigenvalues {values[-1]:.1e} to below rounding; {found['undetermined']} of 16 combinations undetermined",
-            f"positions at 10 Hz without noise, coefficients in units of their values; the identifiability analysis "
-            f"(scaled Hessian) says of one that it cannot be seen: {found['worst'][0]}",
-        ),
-    ]
-
-
-def _ramp_rows(ramps: list[Found]) -> list[Row]:
-    """Return a line for each ramp."""
-    theta = [line["theta"] for line in ramps]
-    return [
-        Row(
-            f"Fig. 3: the wheels take {line['rise']:g} s to turn and {line['fall']:g} s to stop turning",
-            f"not printed; finds {PAPER['tau_1']:g}, {PAPER['tau_2']:g}, {PAPER['mu']:g}",
-            f"{t['tau_1']:.2f}, {t['tau_2']:.2f}, {t['mu']:.3f}",
-            "tau_1, tau_2 (s), mu",
-        )
-        for line, t in zip(ramps, theta, strict=True)
+        *vehicle.fill_rows(LINES, delay=ours["tau_2"] - vehicle.COMMANDED[1], **fits, **choices),
+        *(row for ramp in found["ramps"] for row in vehicle.fill_rows(RAMP_LINE, **ramp)),
+        *vehicle.fill_rows(LAST_LINES, conditions=vehicle.conditions(literal), **found),
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import numpy as np
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.fit.result import inverse_on
 from switchfit.paper import vehicle
-from switchfit.paper.vehicle import BLUE, DARK, PAGE, RED, SYMBOLS, Figure, Found, Row, Say, new_figure, tidy
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.paper.vehicle import BLUE, DARK, PAGE, RED, SYMBOLS, Figure, Found, Row, Say, tidy
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 
 TITLE = "Measurement noise (Fig. 5)"
@@ -27,44 +26,33 @@ TIMES = np.arange(vehicle.HORIZON + 1)
 FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
 
 
-def problems() -> dict[str, Problem]:
-    """Return the problems of the two methods to fit the same samples."""
-    clean = vehicle.states_at(vehicle.simulate_drive(step=1.0), TIMES)[:, [0, 2]]
-    return {
-        FILTERED: vehicle.stick_slip(vehicle.gps_reference(TIMES, clean)),
-        DIRECT: vehicle.stick_slip(Measurements(TIMES, clean, vehicle.position, sigma=1.0, names=("X", "Y"))),
-    }
-
-
-def set_sigma(problem: Problem, sigma: float) -> Problem:
-    """Return the problem with another known sigma; a reference signal has no sigma and is unchanged."""
-    (run,) = problem.experiments
-    (data,) = run.data
-    if not isinstance(data, Measurements) or sigma == 0:
-        return problem
-    return replace(problem, experiments=[replace(run, data=replace(data, sigma=sigma))])
+def build_problem(method: str, sigma: float) -> Problem:
+    """Return the problem of one of the methods to fit the same samples; a reference signal has no sigma."""
+    path = vehicle.simulate_drive(step=1.0)
+    if method == FILTERED:
+        return vehicle.stick_slip(vehicle.gps_reference(TIMES, vehicle.positions_at(path, TIMES)))
+    return vehicle.fit_positions(path, TIMES, vehicle.START, sigma or 1.0, vehicle.HORIZON)
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
     """Run a Monte Carlo study at every level of noise, with both methods, from the paper's start."""
     levels, runs = (QUICK_LEVELS, QUICK_RUNS) if quick else (LEVELS, RUNS)
     found: Found = {"sigma": list(levels), "runs": runs, "ways": {}}
-    for method, problem in problems().items():
+    for method in (FILTERED, DIRECT):
         rows: list[Found] = []
         for level, sigma in enumerate(levels):
             say(f"{method}: sigma {sigma:g} m")
-            study = vehicle.complete(
-                monte_carlo(
-                    set_sigma(problem, sigma),
-                    1 if sigma == 0 else runs,
-                    theta=vehicle.TRUTH,
-                    start=problem.initial_theta,
-                    noise=sigma,
-                    seed=level,
-                    folder=folder / f"{method.split()[0]}-{sigma:g}",
-                )
+            study = monte_carlo(
+                build_problem(method, sigma),
+                1 if sigma == 0 else runs,
+                theta=vehicle.TRUTH,
+                start=vehicle.START,
+                noise=sigma,
+                seed=level,
+                folder=folder / f"{method.split()[0]}-{sigma:g}",
             )
-            rows.append(_level(study, sigma, np.array(rows[0]["median"] if rows else vehicle.TRUTH)))
+            noise_free = np.array(rows[0]["median"] if rows else vehicle.TRUTH)
+            rows.append(_level(vehicle.complete(study), sigma, noise_free))
         found["ways"][method] = rows
     return found
 
@@ -101,7 +89,7 @@ def _coverage(study: MonteCarlo, sigma: float) -> FloatArray:
 
 def draw(found: Found) -> dict[str, Figure]:
     """Draw figure 5, with the standard deviation on a second axis, and the coverage below."""
-    figure = new_figure(PAGE, 4.6)
+    figure = vehicle.new_figure(PAGE, 4.6)
     axes = figure.subplots(2, 3, sharex=True, height_ratios=(1.6, 1.0))
     variance = np.array(found["sigma"]) ** 2
     line: dict[str, Any] = {"markersize": 3, "linewidth": 1}
@@ -137,63 +125,47 @@ def draw(found: Found) -> dict[str, Figure]:
     return {"fig5-noise": figure}
 
 
+LINES = """
+* Fig. 5: error without noise | zero | bias of {bias} (tau_1 s, tau_2 s, mu)
+| from interpolating 1 Hz positions and filtering them at {lowpass:g} Hz; the samples fitted directly give {direct_bias}
+* Fig. 5: mean normalised error at variance {variance:g} m² (%), from the truth
+| degrades gracefully; mu is the most sensitive | tau_1, tau_2, mu: {last_size}
+| {runs} runs a level, {last[converged]} converged
+* Fig. 5: the same at standard deviation 0.25 m, the other reading of the paper's unit (%) | | {quarter_size}
+| samples fitted directly: {direct_quarter_size}
+* at variance {variance:g} m² with the samples fitted directly (%) | not done | {direct_last_size}
+| {direct_last[converged]} of {runs} converged; rms error of the filtered fit is {ratio} times as large
+* Fig. 5: rms normalised error from the noise-free estimate (%) | not printed | {from_noise_free} | from the truth {rms}
+* coverage of 95 % intervals, filtered (%) | not done | {coverage}
+| tau_1, tau_2, mu at sigma = {levels} m; covariance sigma² (1 s) H⁻¹
+* coverage of 95 % intervals, direct (%) | not done | {direct_coverage} | tau_1, tau_2, mu at the same levels
+"""
+
+
 def rows(found: Found) -> list[Row]:
     """Return the lines of the table."""
-    filtered, direct = found["ways"][FILTERED], found["ways"][DIRECT]
-    last, quarter = -1, found["sigma"].index(0.25)
-    runs, sigma = found["runs"], found["sigma"][last]
-    bias = [m - t for m, t in zip(filtered[0]["median"], vehicle.TRUTH, strict=True)]
-    return [
-        Row(
-            "Fig. 5: error without noise",
-            "zero",
-            f"bias of {_list(bias, '+.4f')} (tau_1 s, tau_2 s, mu)",
-            f"from interpolating 1 Hz positions and filtering them at {vehicle.LOWPASS_HZ:g} Hz; the samples fitted "
-            f"directly give {_list([m - t for m, t in zip(direct[0]['median'], vehicle.TRUTH, strict=True)], '.0e')}",
-        ),
-        Row(
-            f"Fig. 5: mean normalised error at variance {sigma**2:g} m² (%), from the truth",
-            "degrades gracefully; mu is the most sensitive",
-            f"tau_1, tau_2, mu: {_list([100 * e for e in filtered[last]['mean_size']], '.2f')}",
-            f"{runs} runs a level, {filtered[last]['converged']} converged",
-        ),
-        Row(
-            "Fig. 5: the same at standard deviation 0.25 m, the other reading of the paper's unit (%)",
-            "",
-            f"{_list([100 * e for e in filtered[quarter]['mean_size']], '.2f')}",
-            f"samples fitted directly: {_list([100 * e for e in direct[quarter]['mean_size']], '.2f')}",
-        ),
-        Row(
-            f"at variance {sigma**2:g} m² with the samples fitted directly (%)",
-            "not done",
-            f"{_list([100 * e for e in direct[last]['mean_size']], '.2f')}",
-            f"{direct[last]['converged']} of {runs} converged; rms error of the filtered fit is "
-            f"{_list(np.divide(filtered[last]['rms'], direct[last]['rms']), '.2f')} times as large",
-        ),
-        Row(
-            "Fig. 5: rms normalised error from the noise-free estimate (%)",
-            "not printed",
-            f"{_list([100 * e for e in filtered[last]['rms_from_noise_free']], '.2f')}",
-            f"from the truth {_list([100 * e for e in filtered[last]['rms']], '.2f')}",
-        ),
-        Row(
-            "coverage of 95 % intervals, filtered (%)",
-            "not done",
-            "; ".join(_list([100 * c for c in level["coverage"]], ".0f") for level in _some(filtered)),
-            f"tau_1, tau_2, mu at sigma = {_list(_some(found['sigma']), 'g')} m; covariance sigma² (1 s) H⁻¹",
-        ),
-        Row(
-            "coverage of 95 % intervals, direct (%)",
-            "not done",
-            "; ".join(_list([100 * c for c in level["coverage"]], ".0f") for level in _some(direct)),
-            "tau_1, tau_2, mu at the same levels",
-        ),
-    ]
-
-
-def _some(levels: list[Any]) -> list[Any]:
-    """Return the first level with noise, the middle one and the last."""
-    return [levels[1], levels[len(levels) // 2], levels[-1]]
+    sigma, values = found["sigma"], {"runs": found["runs"], "variance": found["sigma"][-1] ** 2}
+    shown = [1, len(sigma) // 2, -1]  # the first level with noise, the middle one and the last
+    for prefix, method, digits in (("", FILTERED, "+.4f"), ("direct_", DIRECT, ".0e")):
+        levels = found["ways"][method]
+        quarter, last = levels[sigma.index(0.25)], levels[-1]
+        values |= {
+            f"{prefix}bias": _list(np.subtract(levels[0]["median"], vehicle.TRUTH), digits),
+            f"{prefix}last": last,
+            f"{prefix}last_size": _list(np.multiply(100, last["mean_size"]), ".2f"),
+            f"{prefix}quarter_size": _list(np.multiply(100, quarter["mean_size"]), ".2f"),
+            f"{prefix}coverage": "; ".join(_list(np.multiply(100, levels[k]["coverage"]), ".0f") for k in shown),
+        }
+    filtered, direct = values["last"], values["direct_last"]
+    return vehicle.fill_rows(
+        LINES,
+        lowpass=vehicle.LOWPASS_HZ,
+        ratio=_list(np.divide(filtered["rms"], direct["rms"]), ".2f"),
+        from_noise_free=_list(np.multiply(100, filtered["rms_from_noise_free"]), ".2f"),
+        rms=_list(np.multiply(100, filtered["rms"]), ".2f"),
+        levels=_list([sigma[k] for k in shown], "g"),
+        **values,
+    )
 
 
 def _list(values: Any, form: str) -> str:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.local_fit import fit_locally
 from switchfit.paper.vehicle import HORIZON, Figure, Found, Row, Say, build_simulated_problem
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.choice import estimate, was_interrupted
 
@@ -21,7 +21,11 @@ LOWER_MU, UPPER_MU = 0.05, 2.0
 SAME = 1e-3
 #: Number of estimates in the table, the most frequent ones.
 SHOWN = 4
-METHODS = {"exact": "one fit, exact Hessian", "local": "one fit, trust region", "auto": 'strategy "auto"'}
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "exact": ("one fit, exact Hessian", {"strategy": "local", "hessian": "exact"}),
+    "local": ("one fit, trust region", {"strategy": "local"}),
+    "auto": ('strategy "auto"', {"strategy": "auto"}),
+}
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
@@ -29,12 +33,17 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     problem = build_simulated_problem()
     starts = draw_starts(QUICK_COUNT if quick else COUNT)
     found: Found = {"starts": len(starts), "ways": {}}
-    for method, label in METHODS.items():
+    for method, (label, settings) in METHODS.items():
         ends: list[Found] = []
         for k, start in enumerate(starts):
             if k % 100 == 0:
                 say(f"{label}: start {k} of {len(starts)}")
-            _count(ends, _fit(problem, method, start))
+            fit = None
+            with suppress(NotIntegrableError):
+                fit = estimate(problem, start=start, **settings)
+            if fit is not None and was_interrupted(fit):
+                raise KeyboardInterrupt
+            _count(ends, fit)
         found["ways"][method] = sorted(ends, key=lambda end: -end["count"])
     return found
 
@@ -46,37 +55,22 @@ def draw_starts(count: int) -> FloatArray:
     return np.column_stack([times, rng.uniform(LOWER_MU, UPPER_MU, count)])
 
 
-def _fit(problem: Problem, method: str, start: FloatArray) -> Estimate | None:
-    """Return the estimate; None if the model cannot be integrated at the start."""
-    try:
-        if method == "exact":
-            fit = fit_locally(problem, hessian="exact", start=start)
-        else:
-            fit = estimate(problem, strategy="local" if method == "local" else "auto", start=start)
-    except NotIntegrableError:
-        return None
-    if was_interrupted(fit):
-        raise KeyboardInterrupt
-    return fit
-
-
 def _count(ends: list[Found], fit: Estimate | None) -> None:
     """Add an estimate to the count of those with which it agrees."""
-    if fit is None or not fit.status.successful:
-        theta, cost = None, None
-        fitting = [end for end in ends if end["theta"] is None]
-    else:
-        theta, cost = fit.theta.tolist(), fit.cost
-        size = np.array([HORIZON, HORIZON, 1.0])
-        fitting = [
-            end
-            for end in ends
-            if end["theta"] is not None and np.all(np.abs(np.array(end["theta"]) - fit.theta) < SAME * size)
-        ]
-    if fitting:
-        fitting[0]["count"] += 1
-    else:
-        ends.append({"theta": theta, "cost": cost, "count": 1})
+    found: Found = {"theta": None, "cost": None}
+    if fit is not None and fit.status.successful:
+        found = {"theta": fit.theta.tolist(), "cost": fit.cost}
+    for end in ends:
+        if _agree(end["theta"], found["theta"]):
+            end["count"] += 1
+            return
+    ends.append(found | {"count": 1})
+
+
+def _agree(one: list[float] | None, other: list[float] | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return bool(np.all(np.abs(np.subtract(one, other)) < SAME * np.array([HORIZON, HORIZON, 1.0])))
 
 
 def draw(found: Found) -> dict[str, Figure]:
@@ -88,7 +82,7 @@ def rows(found: Found) -> list[Row]:
     """Return a line for each method."""
     return [
         Row(
-            f"V-B: {found['starts']} starts all over the bounds, {METHODS[method]}",
+            f"V-B: {found['starts']} starts all over the bounds, {METHODS[method][0]}",
             "would generally lead to the same estimate",
             "; ".join(_name(end) for end in ends[:SHOWN]),
             _rest(ends[SHOWN:]),

@@ -7,22 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.paper.vehicle import (
-    COLUMN,
-    DARK,
-    LIGHT,
-    RED,
-    Figure,
-    Found,
-    Row,
-    Say,
-    fit_resticks,
-    gps_reference,
-    log_on_tyres,
-    new_figure,
-    tidy,
-    wheel_speeds,
-)
+from switchfit.paper import vehicle
+from switchfit.paper.vehicle import DARK, LIGHT, RED, Figure, Found, Row, Say
 
 TITLE = "Trials (Fig. 6)"
 START = (5.0, 10.0, 0.8)
@@ -38,10 +24,7 @@ LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("initial trajectory", {"color": LIGHT, "linewidth": 1.2}),
     ("interpolated and filtered", {"color": "#666666", "linewidth": 1.6, "linestyle": "--"}),
     ("optimal trajectory", {"color": DARK, "linewidth": 1.0}),
-    (
-        "GPS at 1 Hz (simulated)",
-        {"color": RED, "ls": "", "marker": "o", "markersize": 2.5, "markeredgewidth": 0},
-    ),
+    ("GPS at 1 Hz (simulated)", {"color": RED, "ls": "", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}),
 )
 
 
@@ -50,16 +33,14 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     found: Found = {"trials": []}
     for number, (force, differential) in enumerate(TRIALS, start=1):
         say(f"trial {number}")
-        clean, _ = log_on_tyres(SECONDS, wheel_speeds(differential, force))
-        noise = GPS_SIGMA * np.random.default_rng(number).standard_normal(clean.shape)
-        reference = gps_reference(SECONDS, clean + noise)
-        dense = np.linspace(0.0, 15.0, 151)
+        clean, _ = vehicle.log_on_tyres(SECONDS, vehicle.wheel_speeds(differential, force))
+        samples = clean + GPS_SIGMA * np.random.default_rng(number).standard_normal(clean.shape)
+        reference = vehicle.gps_reference(SECONDS, samples)
         trial: Found = {
             "force": force,
-            "differential": differential,
-            "samples": (clean + noise).tolist(),
-            "filtered": reference.signal(dense).round(4).tolist(),
-            "fits": fit_resticks(reference, START, clean, stick_force=force),
+            "samples": samples.tolist(),
+            "filtered": reference.signal(np.linspace(0.0, 15.0, 151)).round(4).tolist(),
+            "fits": vehicle.fit_resticks(reference, START, clean, stick_force=force),
         }
         found["trials"].append(trial)
     return found
@@ -74,7 +55,7 @@ def draw(found: Found) -> dict[str, Figure]:
 
 
 def _paths(found: Found, restick: str) -> Figure:
-    figure = new_figure(2 * COLUMN, 3.9)
+    figure = vehicle.new_figure(2 * vehicle.COLUMN, 3.9)
     ax = figure.subplots()
     for k, trial in enumerate(found["trials"]):
         shift, fit = np.array([SHIFT * k, 0.0]), trial["fits"][restick]
@@ -90,44 +71,41 @@ def _paths(found: Found, restick: str) -> Figure:
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=7)
     model = "with reset at re-stick" if restick == "reset" else "as printed"
     ax.set_title(f"Simulated logs (Magic Formula vehicle), equation (18) {model}", fontsize=8, loc="left")
-    tidy(ax, f"X (m), each trial shifted by {SHIFT:g} m", "Y (m)")
+    vehicle.tidy(ax, f"X (m), each trial shifted by {SHIFT:g} m", "Y (m)")
     return figure
+
+
+TRIAL_LINE = """
+* Fig. 6, trial {number} (simulated log): tau_1, tau_2 (s), mu | values are in the figure only
+| {theta[tau_1]:.2f}, {theta[tau_2]:.2f}, {theta[mu]:.3f}
+| {iterations} iterations, ‖DJ‖ = {gradient_norm:.0e}, smallest eigenvalue of D²J {smallest_eigenvalue:.3g}
+"""
+
+LINES = """
+* Fig. 6 (simulated logs): all trials converge to ‖DJ‖ < 1e-7 in fewer than 15 iterations | yes
+| {answer}: at most {most} iterations, ‖DJ‖ at most {largest:.0e}
+* Re-stick (simulated logs): cost J as printed, and with a reset map | not done | {costs} | {remark}
+"""
+
+BETTER = (
+    "the reset explains every log better: rms distance to the noise-free log {:.2f} m as printed, {:.2f} m with it, at "
+    "as many unknowns"
+)
 
 
 def rows(found: Found) -> list[Row]:
     """Return the lines of the table."""
-    trials = found["trials"]
-    lines = []
-    for k, trial in enumerate(trials, start=1):
-        ours = trial["fits"]["continuous"]
-        theta = ours["theta"]
-        lines.append(
-            Row(
-                f"Fig. 6, trial {k} (simulated log): tau_1, tau_2 (s), mu",
-                "values are in the figure only",
-                f"{theta['tau_1']:.2f}, {theta['tau_2']:.2f}, {theta['mu']:.3f}",
-                f"{ours['iterations']} iterations, ‖DJ‖ = {ours['gradient_norm']:.0e}, smallest eigenvalue of D²J "
-                f"{ours['smallest_eigenvalue']:.3g}",
-            )
-        )
-    literal, reset = ([trial["fits"][kind] for trial in trials] for kind in ("continuous", "reset"))
-    most = max(fit["iterations"] for fit in literal)
-    largest = max(fit["gradient_norm"] for fit in literal)
-    return [
-        *lines,
-        Row(
-            "Fig. 6 (simulated logs): all trials converge to ‖DJ‖ < 1e-7 in fewer than 15 iterations",
-            "yes",
-            f"{'yes' if most < 15 and largest < 1e-7 else 'no'}: at most {most} iterations, ‖DJ‖ at most {largest:.0e}",
-        ),
-        Row(
-            "Re-stick (simulated logs): cost J as printed, and with a reset map",
-            "not done",
-            "; ".join(f"{a['cost']:.2f}, {b['cost']:.3f}" for a, b in zip(literal, reset, strict=True)),
-            f"the reset explains every log better: rms distance to the noise-free log "
-            f"{np.mean([f['rms_position_error'] for f in literal]):.2f} m as printed, "
-            f"{np.mean([f['rms_position_error'] for f in reset]):.2f} m with it, at as many unknowns"
-            if all(b["cost"] < a["cost"] for a, b in zip(literal, reset, strict=True))
-            else "the reset does not explain every log better",
-        ),
-    ]
+    literal, reset = ([trial["fits"][kind] for trial in found["trials"]] for kind in ("continuous", "reset"))
+    lines = [row for k, fit in enumerate(literal, start=1) for row in vehicle.fill_rows(TRIAL_LINE, number=k, **fit)]
+    most, largest = (max(fit[name] for fit in literal) for name in ("iterations", "gradient_norm"))
+    costs = [(a["cost"], b["cost"]) for a, b in zip(literal, reset, strict=True)]
+    distances = (np.mean([fit["rms_position_error"] for fit in fits]) for fits in (literal, reset))
+    better = all(b < a for a, b in costs)
+    return lines + vehicle.fill_rows(
+        LINES,
+        answer="yes" if most < 15 and largest < 1e-7 else "no",
+        most=most,
+        largest=largest,
+        costs="; ".join(f"{a:.2f}, {b:.3f}" for a, b in costs),
+        remark=BETTER.format(*distances) if better else "the reset does not explain every log better",
+    )

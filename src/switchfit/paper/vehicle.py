@@ -1,30 +1,30 @@
-"""The vehicle of Section V: its simulated problem, and logs of a vehicle on tyres of the Magic Formula.
+"""The vehicle of Section V and figure 2; its simulated problem, and logs of a vehicle on tyres of the Magic Formula.
 
 Shared by all parts: lines of the table, and the style of figures.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.trajectory import Trajectory, simulate
 from switchfit.models.magic_formula import MAGIC_FORMULA, magic_formula
-from switchfit.models.skid_steer import skid_steer
+from switchfit.models.skid_steer import SLIP_FORCES, skid_steer
 from switchfit.optimize import Status
 from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.problem import Problem
 from switchfit.runtime.presentation import Axes
 from switchfit.runtime.presentation import Figure as Figure
-from switchfit.uncertainty.certificate import analyse_solution, certify
+from switchfit.uncertainty.certificate import certify
 
 Found = dict[str, Any]
 Say = Callable[[str], None]
@@ -36,6 +36,13 @@ DARK, RED, BLUE, LIGHT = "#222222", "#b2182b", "#4a7fb5", "#b5b5b5"
 SYMBOLS = {"tau_1": r"$\tau_1$", "tau_2": r"$\tau_2$", "mu": r"$\mu$"}
 
 
+TITLE = "The vehicle (Fig. 2)"
+#: Length and width of a wheel as drawn (m).
+WHEEL = (0.22, 0.08)
+#: Heading as drawn (degrees), and length of the longest force (m).
+HEADING, LONGEST = 25.0, 0.34
+
+
 class Row(NamedTuple):
     """One line of the table of results."""
 
@@ -45,22 +52,17 @@ class Row(NamedTuple):
     remark: str = ""
 
 
-class Part(Protocol):
-    """A module that reproduces one part of the paper."""
+def fill_rows(text: str, **values: Any) -> list[Row]:
+    """Return the lines of a template: each begins with "* ", and "|" is between its cells; values stand by their names.
 
-    TITLE: str
-
-    def compute(self, quick: bool, folder: Path, say: Say) -> Found:
-        """Return the results, as they are written to JSON; long studies store finished runs in `folder`."""
-        ...
-
-    def draw(self, found: Found) -> dict[str, Figure]:
-        """Return the figures by file name."""
-        ...
-
-    def rows(self, found: Found) -> list[Row]:
-        """Return the lines of the table."""
-        ...
+    Parameters
+    ----------
+    text : str
+    **values : object
+        What stands in braces, as of `str.format`: ``{fit[theta][mu]:.3f}``.
+    """
+    lines = text.strip().removeprefix("* ").split("\n* ")
+    return [Row(*(" ".join(cell.split()).format_map(values) for cell in line.split("|"))) for line in lines]
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -179,15 +181,20 @@ def on_tyres(data: Data, speeds: Input, parameters: dict[str, Any] | None = None
 def log_on_tyres(times: FloatArray, speeds: Input) -> tuple[FloatArray, Trajectory]:
     """Return positions (K, 2) of the Magic Formula vehicle at `times`, and its trajectory."""
     path = simulate(on_tyres(Measurements(times, np.zeros((len(times), 2)), position), speeds))
-    return states_at(path, times)[:, [0, 2]], path
+    return positions_at(path, times), path
 
 
-def states_at(path: Trajectory, times: FloatArray) -> FloatArray:
-    """Return states (K, n) at times that are nodes of the trajectory."""
+def positions_at(path: Trajectory, times: FloatArray) -> FloatArray:
+    """Return positions (K, 2) at times that are nodes of the trajectory."""
     nodes = np.searchsorted(path.times, np.asarray(times) - 1e-9)
-    if not np.allclose(path.times[nodes], times, rtol=0, atol=1e-9):
-        raise ValueError("these times are not nodes of the trajectory.")
-    return path.states[nodes]
+    return path.states[nodes][:, [0, 2]]
+
+
+def fit_positions(path: Trajectory, times: FloatArray, theta: tuple[float, ...], sigma: float, tf: float) -> Problem:
+    """Return the estimation problem of equation (18) with positions along a trajectory as measurements."""
+    return stick_slip(
+        Measurements(times, positions_at(path, times), position, sigma=sigma, names=("X", "Y")), theta, tf=tf
+    )
 
 
 def curve(path: Trajectory) -> FloatArray:
@@ -201,10 +208,7 @@ def gps_reference(times: FloatArray, positions: FloatArray) -> ReferenceSignal:
     return ReferenceSignal.from_samples(times, positions, observe=position, lowpass_hz=LOWPASS_HZ, names=("X", "Y"))
 
 
-Study = TypeVar("Study", bound=Fits)
-
-
-def complete(study: Study) -> Study:
+def complete(study: Any) -> Any:
     """Return the study itself; raise KeyboardInterrupt if it was stopped before its end."""
     if len(study) < study.requested:
         raise KeyboardInterrupt
@@ -221,7 +225,7 @@ def fit_resticks(
         problem = stick_slip(reference, start, stick_force=stick_force, restick=restick)
         fit = fit_locally(problem)
         path = fit.trajectory
-        off = states_at(path, np.arange(float(len(positions))))[:, [0, 2]] - positions
+        off = positions_at(path, np.arange(float(len(positions)))) - positions
         found[restick] = {
             **summary(fit),
             "initial": curve(simulate(problem)).tolist(),
@@ -237,14 +241,66 @@ def summary(fit: Estimate) -> dict[str, Any]:
     """Return the result of a fit, with the second-order sufficient conditions, as plain numbers."""
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    smallest, scaled = certify(fit, None).smallest_eigenvalue, analyse_solution(fit, None).eigenvalues
+    smallest = certify(fit, None).smallest_eigenvalue
     return {
         "theta": dict(zip(fit.theta_names, fit.theta.tolist(), strict=True)),
         "cost": fit.cost,
         "gradient_norm": fit.optimality,
         "iterations": fit.iterations,
-        "status": fit.status.name,
         "smallest_eigenvalue": smallest,
-        "scaled_eigenvalues": scaled.tolist(),
         "sufficient": bool(fit.status.successful and smallest > 0),
     }
+
+
+def compute(quick: bool, folder: Path, say: Say) -> Found:
+    """Return the lengths (m) and the forces in slip (N) of the model."""
+    settings = inspect.signature(skid_steer).parameters
+    return {name: settings[name].default for name in ("B_l", "B_w", "a", "b")} | {"forces": list(SLIP_FORCES)}
+
+
+def draw(found: Found) -> dict[str, Figure]:
+    """Draw the vehicle in slip, turning to the left: wheels with their forces, friction against the lateral speed."""
+    from matplotlib.patches import Rectangle
+    from matplotlib.transforms import Affine2D
+
+    figure = new_figure(COLUMN, 3.2)
+    ax = figure.subplots()
+    length, width, a, b = (found[name] for name in ("B_l", "B_w", "a", "b"))
+    turn = Affine2D().rotate_deg(HEADING) + ax.transData
+    ax.add_patch(Rectangle((-length / 2, -width / 2), length, width, fill=False, edgecolor=DARK, transform=turn))
+    places = ((a, -b), (a, b), (-a, b), (-a, -b))  # 1 and 4 on the right, 2 and 3 on the left
+    largest = max(found["forces"])
+    arrow = {"transform": turn, "length_includes_head": True, "width": 0.008, "head_width": 0.04}
+    words: dict[str, Any] = {"fontsize": 6.5, "ha": "center", "transform": turn, "rotation": HEADING}
+    for number, ((x, y), force) in enumerate(zip(places, found["forces"], strict=True), start=1):
+        corner = x - WHEEL[0] / 2, y - WHEEL[1] / 2
+        ax.add_patch(Rectangle(corner, *WHEEL, facecolor=LIGHT, edgecolor=DARK, linewidth=0.7, transform=turn))
+        if force > 0:
+            ax.arrow(x, y, LONGEST * force / largest, 0.0, color=RED, **arrow)
+        friction = 0.07 if x > 0 else 0.14  # the center of mass slides outwards: more at the rear
+        ax.arrow(x, y, 0.0, -friction if x > 0 else friction, color=BLUE, **arrow)
+        below = -0.09 if x > 0 and y > 0 else 0.1
+        label = rf"$F_{number}$ = {force:g} N"
+        ax.text(x + (0.05 if x > 0 else -0.05), y - below, label, va="center", **words)
+    dash: dict[str, Any] = {"color": DARK, "linewidth": 0.6, "linestyle": "--"}
+    ax.plot([0.0, 0.75], [0, 0], transform=turn, **dash)
+    ax.plot([0, 0.7], [0, 0], **dash)
+    ax.text(0.47, 0.08, r"$\theta$", fontsize=9)
+    ax.plot(0, 0, "o", color=DARK, markersize=3)
+    ax.text(-0.03, -0.05, "(X, Y)", fontsize=7, ha="right")
+    ax.plot([0, a], [0, 0], color=DARK, linewidth=1.5, transform=turn)
+    ax.plot([a, a], [0, b], color=DARK, linewidth=1.5, transform=turn)
+    ax.text(a / 2 - 0.02, 0.02, f"{a:g} m", **words)
+    ax.text(a + 0.04, 0.55 * b, f"{b:g} m", fontsize=6.5, va="center", transform=turn, rotation=HEADING)
+    ax.plot([], [], color=RED, label="drive forces in slip")
+    ax.plot([], [], color=BLUE, label="friction against a turn to the left (slip)")
+    ax.set(xlim=(-0.7, 0.85), ylim=(-0.75, 0.62), xlabel="X (m)", ylabel="Y (m)")
+    ax.set_aspect("equal")
+    ax.tick_params(labelsize=7)
+    ax.legend(frameon=False, fontsize=6.5, loc="lower right")
+    return {"fig2-vehicle": figure}
+
+
+def rows(found: Found) -> list[Row]:
+    """Return no lines."""
+    return []
