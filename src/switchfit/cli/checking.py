@@ -216,4 +216,3 @@ def _write(plan: Any, folder: Path, figures: str) -> None:
         terminal.write_file(folder / "input.csv", write_rows(zip_rows({"t": knots.times, **plan.inputs})))
     samples = [{"sensor": name, "t": time} for name, times in plan.sample_times.items() for time in times]
     terminal.write_file(folder / "samples.csv", write_rows(samples, ("sensor", "t")))
-    terminal.print_note(f"written to {folder}")

@@ -18,7 +18,10 @@ OtherRun = Annotated[
     argument("LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file."),
 ]
 ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
-SavedPaths = Annotated[list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.")]
+SavedPaths = Annotated[
+    list[Path],
+    argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", exists=True, dir_okay=False),
+]
 ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
 
 
@@ -41,9 +44,6 @@ def validate(
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.user_files import check_saved
-
-        check_saved(saved)
         from switchfit.estimation.estimator import Estimate
         from switchfit.io.command_line import summarize_validation
         from switchfit.io.saved_problem import list_changed_models, load_other_run
@@ -82,10 +82,6 @@ def compare(
     if len(saved) < 2:
         terminal.fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.")
     with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.user_files import check_saved
-
-        for path in saved:
-            check_saved(path)
         import switchfit as sf
         from switchfit.io.command_line import summarize_comparison
         from switchfit.io.logs import name_files
@@ -114,7 +110,6 @@ def _show(found: Any, summary: dict[str, Any], folder: Path | None, name: str, f
     terminal.print_text(found)
     if folder is not None:
         terminal.write_result(found, folder / name, figures)
-        terminal.print_note(f"written to {folder}")
     terminal.print_json(summary)
 
 

@@ -109,5 +109,4 @@ def _write(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path
         else:
             best = folder / "best.toml"
             terminal.write_file(best, text)
-    terminal.print_note(f"written to {folder}")
     return best

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,7 +18,6 @@ from switchfit.cli.terminal import option, output_folder
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
     from switchfit.online.estimator import OnlineEstimator
-    from switchfit.online.log import OnlineLog
     from switchfit.online.state import Now
     from switchfit.problem.experiment import Experiment
     from switchfit.report.html.live import LivePage
@@ -98,6 +97,7 @@ def online(
         loaded = load_problem(problem, replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
+        from switchfit.online.log import build_log
         from switchfit.problem.data import Measurements
         from switchfit.problem.structure import select_kind
         from switchfit.runtime.presentation import format_count
@@ -111,20 +111,20 @@ def online(
         settings |= {"max_switches": max_switches, "budget": budget, "capacity": room} | _read_library(loaded)
         estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
         with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
-            course = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
+            recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
             if estimator.now is None:
                 terminal.fail("there were no samples.")
             if state is not None:
                 estimator.save(state)
-            if out is not None and course.log is not None:
-                _write(course.log, out, figures)
-            if page is not None and not course.interrupted:
+            if out is not None and recorded:
+                terminal.write_result(build_log(loaded.problem, recorded), out / "online", figures)
+            if page is not None and not interrupted:
                 with contextlib.suppress(terminal.CtrlC):
                     terminal.print_note("the samples have ended; Ctrl-C ends the page")
                     page.wait()
         terminal.fail_for_refused(loaded.issues)
-        if course.refused:
-            terminal.fail(f"{format_count(len(course.refused), 'line')} of stdin could not be used.")
+        if refused:
+            terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
         if estimator.now.status.name == "LOST":
             terminal.end_unreliable(f"{estimator.now.status.value}.")
 
@@ -166,30 +166,14 @@ def _start(
     return estimator
 
 
-class Course(NamedTuple):
-    """How a run went.
-
-    Attributes
-    ----------
-    log : OnlineLog or None
-        What was said, if it was recorded and there was any.
-    refused : list of int
-        Numbers of the lines that could not be used.
-    interrupted : bool
-        By Ctrl-C.
-    """
-
-    log: OnlineLog | None
-    refused: list[int]
-    interrupted: bool
-
-
 def _run(
     loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, page: LivePage | None, records: bool
-) -> Course:
-    """Feed all samples, until Ctrl-C, and print what the estimator says."""
+) -> tuple[list[Now], int, bool]:
+    """Feed all samples, until Ctrl-C, and print what the estimator says.
+
+    Return what it said, if that is recorded, how many lines it refused, and whether it was interrupted.
+    """
     from switchfit.io.command_line import summarize_now
-    from switchfit.online.log import build_log
 
     recorded: list[Now] = []
     refused: list[int] = []
@@ -206,7 +190,7 @@ def _run(
                 recorded.append(now)
             if stopped():
                 break
-    return Course(build_log(loaded.problem, recorded) if recorded else None, refused, stopped())
+    return recorded, len(refused), stopped()
 
 
 def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
@@ -259,8 +243,3 @@ def _serve(loaded: ProblemFile, port: int) -> LivePage:
     page = LivePage(loaded.path.name, loaded.problem, port)
     terminal.print_note(f"live at {page.address}")
     return page
-
-
-def _write(log: OnlineLog, folder: Path, figures: str) -> None:
-    terminal.write_result(log, folder / "online", figures)
-    terminal.print_note(f"written to {folder}")

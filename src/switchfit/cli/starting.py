@@ -60,7 +60,9 @@ def _list_examples() -> dict[str, Path]:
     return {path.stem: path for path in found if path.is_dir() or path.suffix == ".py"}
 
 
-ExampleName = Annotated[str | None, argument("NAME", "Example to copy. Left out, all are listed.", _complete_examples)]
+ExampleName = Annotated[
+    str | None, argument("NAME", "Example to copy. Left out, all are listed.", autocompletion=_complete_examples)
+]
 ExampleFolder = Annotated[Path | None, argument("FOLDER", "Folder to create. Default: one of the name.")]
 
 

@@ -47,20 +47,13 @@ _TEXT = Voice()
 _voice: ContextVar[Voice] = ContextVar("what is printed", default=_TEXT)
 
 
-class _NoteHandler(logging.Handler):
-    """Prints the library's log as notes."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print_note(self.format(record))
-
-
 @contextlib.contextmanager
 def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
     """Return a context in which the options --json, --quiet and --verbose hold."""
     if quiet and verbose:
         fail("--quiet and --verbose contradict each other; give one of them.")
     token = _voice.set(Voice(text=not (json or quiet), json=json, notes=not quiet, log=verbose))
-    logger, handler = logging.getLogger("switchfit"), _NoteHandler()
+    logger, handler = logging.getLogger("switchfit"), logging.StreamHandler()
     level = logger.level
     if verbose:
         logger.addHandler(handler)
@@ -236,16 +229,9 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
 
 def make_folder(folder: Path | None) -> None:
     """Create a folder, with those above it, unless it exists or none is asked for."""
-    from switchfit.runtime.errors import InputError
-
-    if folder is None:
-        return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"the folder {folder} cannot be created: {error.strerror}; name another with --out."
-        ) from error
+    if folder is not None:
+        with explain_write_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
 
 
 @contextlib.contextmanager
@@ -276,9 +262,9 @@ def option(*names: str, help: str, metavar: str | None = None) -> Any:
     return typer.Option(*names, metavar=metavar, help=help, show_default=False)
 
 
-def argument(metavar: str, help: str, complete: Callable[[str], list[str]] | None = None) -> Any:
+def argument(metavar: str, help: str, **more: Any) -> Any:
     """Return a positional argument."""
-    return typer.Argument(metavar=metavar, help=help, show_default=False, autocompletion=complete)
+    return typer.Argument(metavar=metavar, help=help, show_default=False, **more)
 
 
 def output_folder(content: str) -> Any:
@@ -287,7 +273,9 @@ def output_folder(content: str) -> Any:
 
 
 ProblemPath = Annotated[Path, argument("PROBLEM.toml", "Problem file.")]
-SavedPath = Annotated[Path, argument("ESTIMATE.json", "Written by switchfit fit --out.")]
+SavedPath = Annotated[
+    Path, argument("ESTIMATE.json", "Written by switchfit fit --out.", exists=True, dir_okay=False, readable=True)
+]
 Folder = Annotated[
     Path | None,
     option(metavar="DIR", help="Where data and models are. Default: where they were, seen from ESTIMATE.json."),
@@ -315,7 +303,7 @@ def print_list(title: str, entries: Sequence[object]) -> None:
 def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) -> None:
     """Write the text of a result, its figure if `figures` names a format, and the result itself if it is to be saved.
 
-    The files differ in their endings.
+    The files differ in their endings. Say where they are.
     """
     write_file(stem.with_suffix(".txt"), f"{result}\n")
     if saved:
@@ -323,6 +311,7 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
             result.save(path)
     if figures:
         write_figure(result, stem.with_suffix(f".{figures}"))
+    print_note(f"written to {stem.parent}")
 
 
 def write_figure(result: Any, path: Path) -> None:

@@ -74,9 +74,6 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["sa
     return np.minimum(t0 + step * np.arange(count + 1), tf)
 
 
-KEYS = ("t", "y", "u")
-"""Of a sample; y and u may be missing."""
-
 EXAMPLE = '{"t": 0.1, "y": [1.2, 0.3]} or {"t": 0.1, "y": {"X": 1.2}, "u": {"force": 4.0}}'
 
 
@@ -98,9 +95,9 @@ def read_sample(line: bytes, run: Experiment) -> tuple[Any, Any, Any]:
         given = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"a sample is one line of JSON, such as {EXAMPLE}; got {_quote(line)} ({error}).") from error
-    if not isinstance(given, dict) or "t" not in given or not set(given) <= set(KEYS):
+    if not isinstance(given, dict) or "t" not in given or not set(given) <= {"t", "y", "u"}:
         raise ValueError(f"a sample has the keys t, y and u, as in {EXAMPLE}; got {_quote(line)}.")
-    t, y, u = (given.get(key) for key in KEYS)
+    t, y, u = (given.get(key) for key in "tyu")
     if isinstance(t, str) and run.origin is not None:
         t = float(run.origin.to_numbers(as_date(t, "t"), run.time_unit, "t"))
     return t, _fill(y), u
@@ -260,6 +257,15 @@ def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None
     )
 
 
+KEYS = {
+    "unknown": "name",
+    "std_error": "standard_error",
+    "naive_std_error": "naive_standard_error",
+    "guess": "first_guess",
+}
+"""What columns of the table of unknowns are called in JSON, where it is another name."""
+
+
 def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
     """Return the verdict, the unknowns with their intervals, and how the fit went.
 
@@ -270,9 +276,6 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
     ----------
     estimate : Estimate
     """
-    held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
-    held |= dict.fromkeys((*estimate.unread, *estimate.absent), "not read")
-    held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
     return {
         **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
@@ -281,7 +284,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
-        "unknowns": [row | {"held": held.get(row["name"])} for row in list_unknowns(estimate)],
+        "unknowns": [{KEYS.get(name, name): cell for name, cell in row.items()} for row in list_unknowns(estimate)],
         "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
         "runs": [
             {

@@ -97,9 +97,6 @@ LARGEST_COPY = 20_000_000
 MOST_CHANNELS = 3
 """Channels that the first model has; the others are named in a comment."""
 
-MOST_POINTS = 4000
-"""Number of samples from which first guesses are computed."""
-
 FEWEST_SAMPLES = 8
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -227,7 +224,7 @@ def write_problem(log: Log, channels: list[str], others: list[str], file: str) -
     """
     time_unit = log.time_unit if log.time_unit in ("s", "min", "h", "d") else "s"
     scale = SECONDS[log.time_unit] / SECONDS[time_unit] if log.time_unit else 1.0
-    picked = np.argsort(log.times, kind="stable")[:: -(-len(log) // MOST_POINTS)]
+    picked = np.argsort(log.times, kind="stable")
     times = log.times[picked] * scale
     values = np.stack([_fill_gaps(log.values[name][picked]) for name in channels], axis=1)
     k, before, after, noise = _guess_levels(values)

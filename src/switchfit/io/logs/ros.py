@@ -11,7 +11,6 @@ import numpy as np
 from switchfit.io.logs import explain_damage, import_library
 from switchfit.io.logs.geodesy import LOCAL, SIGMA
 from switchfit.io.logs.log import Event, Log, Options
-from switchfit.io.logs.tables import stack_records
 from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError, Issue
 
@@ -55,7 +54,7 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
     read = _READERS.get(kind, _flatten)
     start = reader.start_time
     records: list[Record] = []
-    texts: list[tuple[int, str]] = []
+    events: list[Event] = []
     stamps: list[int] = []
     received: list[int] = []
     for connection, time, data in reader.messages(connections=connections):
@@ -64,12 +63,13 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
         stamps.append(_read_stamp(message))
         records.append(read(message))
         if isinstance(getattr(message, "data", None), str):
-            texts.append((time, message.data))
+            events.append(Event((time - start) / SECOND, connection.topic, message.data))
     if not records:
         raise InputError(f"{path}: topic {connections[0].topic} has no messages; there is nothing to read.")
     has_stamps = any(stamps)
     clock, offset = _choose_clock(stamps if has_stamps else received, start)
-    values = stack_records(records)
+    names = dict.fromkeys(name for record in records for name in record)
+    values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
     units = {name: _UNITS.get(_strip(name), "") if kind in _READERS else "" for name in values}
     issues = () if has_stamps else (Issue("log: no stamps", (str(path), connections[0].topic)),)
     return Log(
@@ -79,7 +79,7 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
         time_unit="s",
         source=f"{path} ({connections[0].topic})",
         issues=issues,
-        events=tuple(Event((time - start) / SECOND, connections[0].topic, text) for time, text in texts),
+        events=tuple(events),
         offset=offset,
         place="message",
         time_name="stamp" if has_stamps else "received",

@@ -14,6 +14,7 @@ from switchfit.estimation.saved import make_relative
 from switchfit.io.first_problem import write_table
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.problem_file.tables import StateTable, Table
+from switchfit.io.user_files import replace_files
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.parameter import LogNormal, Normal, Parameter
 from switchfit.problem.system import HybridSystem
@@ -57,11 +58,10 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     if isinstance(durations, Mapping):
         durations = {mode: seconds for mode, seconds in durations.items() if seconds}
     tables["options"] = options | ({"min_duration": durations} if durations else {})
-    _move_paths(tables, loaded.path.absolute().parent, folder)
-    head = (
-        f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses.\n"
-    )
-    return head + "\n".join(write_table(tables)) + "\n"
+    home = loaded.path.absolute().parent
+    moved = replace_files(tables, lambda name: name if Path(name).is_absolute() else make_relative(home / name, folder))
+    head = f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses."
+    return "\n".join([head, *write_table(moved), ""])
 
 
 def _dump(table: Table) -> dict[str, Any]:
@@ -106,25 +106,3 @@ def _make_plain(value: Any) -> Any:
 def _confine(value: Any, lower: Any, upper: Any) -> Any:
     """Return an estimate as numbers of Python; rounding must not take it over a bound."""
     return np.clip(np.asarray(value, dtype=float), lower, upper).tolist()
-
-
-def _move_paths(tables: dict[str, Any], home: Path, folder: Path) -> None:
-    """Make paths relative to another folder: logs, and Python files with their objects."""
-
-    def move(name: str) -> str:
-        return name if Path(name).is_absolute() else make_relative(home / name, folder)
-
-    def move_reference(reference: str) -> str:
-        file, colon, thing = reference.rpartition(":")
-        return f"{move(file)}{colon}{thing}" if file.endswith(".py") else reference
-
-    named = [tables["model"]]
-    for run in tables["experiments"]:
-        for item in (*run.get("data", ()), *([run["inputs"]] if "inputs" in run else ())):
-            if "file" in item:
-                item["file"] = move(item["file"])
-            if isinstance(item.get("observe"), str):
-                item["observe"] = move_reference(item["observe"])
-        named += [jump["map"] for jump in run.get("jumps", ())]
-    for table in named:
-        table["name"] = move_reference(table["name"])
