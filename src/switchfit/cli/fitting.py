@@ -213,7 +213,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         refused = {"verdict": "refused", "message": error}
         shown = refused if estimate is None else summarize_estimate(estimate) | {"out": folder}
         fitted.append({"log": str(path)} | shown)
-        if loaded is not None and estimate is not None and folder is not None:
+        if loaded is not None and folder is not None:
             terminal.make_folder(folder)
             write_estimate(estimate, loaded, loaded.options | overrides, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
@@ -228,18 +228,16 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
 
 
 def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:
-    """Return the problem of a log and its estimate; None in place of each that there is not, and what is wrong."""
+    """Return the problem of a log and its estimate, or None for both, and what is wrong."""
     from switchfit.io.problem_file import load_problem
     from switchfit.io.user_files import describe_error
+    from switchfit.runtime.errors import InputError
 
     try:
         loaded = load_problem(model, log)
-    except (ValueError, OSError) as error:
-        return None, None, str(error)
-    try:
         return loaded, estimate_problem(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
     except Exception as error:
-        return loaded, None, describe_error(error)
+        return None, None, str(error) if isinstance(error, InputError) else describe_error(error)
 
 
 def _import_figures() -> None:

@@ -465,7 +465,7 @@ def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:
-    """Return the unknowns of a problem, the steps of the integrator, and what was checked.
+    """Return the unknowns of a problem, and what was checked.
 
     Parameters
     ----------
@@ -473,31 +473,16 @@ def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: I
     derivatives : DerivativeCheck
     found : Identifiability
     """
-    problem = evaluator.problem
-    names, structures = problem.run_names, evaluator.structures
-    runs = zip(names, problem.experiments, evaluator.meshes, structures, strict=True)
-    unknowns = problem.unknowns
+    problem, unknowns = evaluator.problem, evaluator.problem.unknowns
     columns = {"name": unknowns.names, "unit": unknowns.units, "first_guess": unknowns.initial}
     return {
         "unknowns": zip_rows(columns | _pick(unknowns, "lower", "upper")),
-        "runs": [
-            {
-                "name": name,
-                "modes": list(run.mode_sequence),
-                "implicit_modes": structure.list_implicit_modes(),
-                "t0": run.t0,
-                "tf": run.end,
-                "steps": mesh.cells,
-            }
-            for name, run, mesh, structure in runs
-        ],
+        "runs": problem.run_names,
+        "steps": [mesh.cells for mesh in evaluator.meshes],
         "engine": asdict(evaluator.engine),
         "derivatives": {
             "orders": derivatives.observed_orders,
             **_pick(derivatives, "passed", "gradient_gap", "hessian_gap"),
         },
-        "identifiability": {
-            "without_effect": found.without,
-            **_pick(found, "undetermined", "condition_number"),
-        },
+        "identifiability": {"without_effect": found.without, **_pick(found, "undetermined", "condition_number")},
     }

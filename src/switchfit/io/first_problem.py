@@ -118,35 +118,31 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} exists already, and nothing is overwritten: give another NAME.")
-    files: dict[str, str | Path] = {}
+    texts: dict[str, str] = {}
     if log is None:
-        files |= {name: find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")}
+        copied = [find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")]
     else:
         read = read_log(log)
         channels, others = choose_channels(read)
-        size = log.stat().st_size if log.is_file() else LARGEST_COPY + 1
-        named = log.name if size <= LARGEST_COPY else Path(os.path.relpath(log, folder)).as_posix()
-        files["problem.toml"] = write_problem(read, channels, others, named)
-        files["model.py"] = _fill_template(
+        copied = [log] if log.is_file() and log.stat().st_size <= LARGEST_COPY else []
+        named = log.name if copied else Path(os.path.relpath(log, folder)).as_posix()
+        texts["problem.toml"] = write_problem(read, channels, others, named)
+        texts["model.py"] = _fill_template(
             "model.py.template",
             source=log.name,
             count=len(channels),
             names=tuple(channels),
             units=tuple(read.units.get(name, "") for name in channels),
         )
-        if size <= LARGEST_COPY:
-            files[log.name] = log
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            if isinstance(content, Path):
-                shutil.copyfile(content, folder / name)
-            else:
-                with (folder / name).open("x", encoding="utf-8") as file:
-                    file.write(content)
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        for path in copied:
+            shutil.copy(path, folder)
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {error.strerror}; give another NAME.") from error
-    return [folder / name for name in files]
+    return [folder / name for name in (*texts, *(path.name for path in copied))]
 
 
 def choose_channels(log: Log) -> tuple[list[str], list[str]]:

@@ -252,10 +252,6 @@ class _Run:
         """Return the observation h(t, x, p); None for the whole state."""
         if table.observe is None or isinstance(table.observe, str):
             return None if table.observe is None else self._load_function(f"{place}.observe", table.observe)
-        if len(table.observe) != len(table.columns):
-            raise ValueError(
-                f"observe must name one state for each of the {len(table.columns)} columns; got {table.observe}."
-            )
         if self.system is None:
             return None
         states = self.system.state_names
@@ -310,8 +306,7 @@ def build_parameter(table: ParameterTable) -> Parameter:
 
 def _build_prior(table: PriorTable) -> Prior:
     given = table.model_dump(exclude_none=True)
-    if set(given) == {"mean", "sd"}:
-        return Normal(**given)
-    if set(given) == {"median", "log_sd"}:
-        return LogNormal(**given)
+    kind = {("mean", "sd"): Normal, ("median", "log_sd"): LogNormal}.get(tuple(given))
+    if kind is not None:
+        return kind(**given)
     raise ValueError(f"prior needs mean and sd (normal), or median and log_sd (log-normal); got {given}.")

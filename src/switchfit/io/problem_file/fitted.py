@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,15 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import make_relative
 from switchfit.io.first_problem import write_table
 from switchfit.io.problem_file.building import ProblemFile
-from switchfit.io.problem_file.tables import StateTable, Table
 from switchfit.io.user_files import replace_files
-from switchfit.problem.experiment import Experiment, initial_state_of
-from switchfit.problem.parameter import LogNormal, Normal, Parameter
-from switchfit.problem.system import HybridSystem
+from switchfit.problem.experiment import Experiment
 from switchfit.runtime.errors import InputError
 
 
 def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) -> str:
     """Return the text of a problem file with the mode sequences and the values of an estimate.
+
+    Initial states that the model has, and not the file, stay with the model.
 
     Parameters
     ----------
@@ -43,9 +41,12 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
         raise InputError(
             f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
         )
-    tables = _dump(contents)
+    tables = contents.model_dump(exclude_unset=True, exclude_none=True)
     for e, (table, run) in enumerate(zip(tables["experiments"], problem.experiments, strict=True)):
-        table |= _describe_run(estimate, problem.system, e, run)
+        table |= _describe_run(estimate, e, run)
+        for entry, value in zip(table.get("initial_state", ()), estimate.initial_state[e], strict=False):
+            if not entry.get("fixed"):
+                entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
     parameters = tables.get("parameters", {})
     for name, table in parameters.items():
         parameter = problem.parameters[name]
@@ -64,43 +65,14 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     return "\n".join([head, *write_table(moved), ""])
 
 
-def _dump(table: Table) -> dict[str, Any]:
-    """Return what a file says in a table, without what it leaves out."""
-    return table.model_dump(exclude_unset=True, exclude_none=True)
-
-
-def _describe_run(estimate: Estimate, system: HybridSystem, e: int, run: Experiment) -> dict[str, Any]:
+def _describe_run(estimate: Estimate, e: int, run: Experiment) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
-    times = estimate.transition_times[e].tolist()
-    found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times}
+    found = {"mode_sequence": list(run.mode_sequence), "transition_times": estimate.transition_times[e].tolist()}
     if run.origin is not None:
         found["origin"] = run.origin.date
         if run.time_zone is not None:
             found["time_zone"] = run.time_zone
-    state = initial_state_of(system, run)
-    if not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
-        values = estimate.initial_state[e].tolist()
-        found["initial_state"] = [_describe_entry(entry, value) for entry, value in zip(state, values, strict=True)]
     return found
-
-
-def _describe_entry(entry: Any, value: float) -> Any:
-    """Return an entry of the initial state for a problem file."""
-    if not isinstance(entry, Parameter) or entry.fixed:
-        return float(_make_plain(entry.value if isinstance(entry, Parameter) else entry))
-    found = {"value": _confine(value, entry.lower, entry.upper)}
-    for key in ("lower", "upper", "unit", "scale"):
-        stated = _make_plain(getattr(entry, key))
-        if stated != StateTable.model_fields[key].default:
-            found[key] = stated
-    if isinstance(entry.prior, (Normal, LogNormal)):
-        found["prior"] = {field.name: _make_plain(getattr(entry.prior, field.name)) for field in fields(entry.prior)}
-    return found
-
-
-def _make_plain(value: Any) -> Any:
-    """Return a number of NumPy, an array or text as Python has it."""
-    return np.asarray(value).tolist()
 
 
 def _confine(value: Any, lower: Any, upper: Any) -> Any:
