@@ -13,10 +13,7 @@ import typer
 from switchfit.cli import terminal
 from switchfit.cli.terminal import argument, option, output_folder
 
-OtherRun = Annotated[
-    Path,
-    argument("LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file."),
-]
+OtherRun = Annotated[Path, argument("LOG|PROBLEM.toml", "A log like the one that was fitted, or a problem file.")]
 ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
 SavedPaths = Annotated[
     list[Path],
@@ -116,8 +113,7 @@ def _show(found: Any, summary: dict[str, Any], folder: Path | None, name: str, f
 PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")]
 Part = Annotated[
-    str | None,
-    option(metavar="NAME", help="One part: lti, magic-formula, convergence, noise, trials or horizon."),
+    str | None, option(metavar="NAME", help="One part: lti, magic-formula, convergence, noise, trials or horizon.")
 ]
 
 

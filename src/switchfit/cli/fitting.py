@@ -19,41 +19,28 @@ if TYPE_CHECKING:
 
 
 Problems = Annotated[
-    list[Path],
-    argument("PROBLEM.toml", "Problem file; with --problem, logs, each of which is fitted by itself."),
+    list[Path], argument("PROBLEM.toml", "Problem file; with --problem, logs, each of which is fitted by itself.")
 ]
 OutputFolder = Annotated[
-    Path | None,
-    output_folder(
-        "report.html, report.txt, estimate.json and fit.png; for runs.csv and unknowns.csv where there are many"
-    ),
+    Path | None, output_folder("report.html, report.txt, estimate.json, fit.png, and tables of many runs or unknowns")
 ]
 ProblemForLogs = Annotated[
-    Path | None,
-    option("--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named."),
+    Path | None, option("--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named.")
 ]
 LogTable = Annotated[
-    Path | None,
-    option(metavar="FILE.csv", help="With --problem: a table with a row for each log; FILE.parquet too."),
+    Path | None, option(metavar="FILE.csv", help="With --problem: a table with a row for each log; FILE.parquet too.")
 ]
 Strategy = Annotated[
     Literal["local", "auto", "thorough"] | None,
-    option(
-        help="local: one fit from the guess; auto, the default: more if the verdict is not good; thorough: all "
-        "strategies."
-    ),
+    option(help="local: one fit; auto, the default: more if the verdict is not good; thorough: all strategies."),
 ]
 HessianKind = Annotated[
     Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
     option(help="Quadratic term of the optimizer. Default: auto, the exact Hessian in a trust region."),
 ]
 MaxIterations = Annotated[int | None, option(metavar="COUNT", help="Most iterations of a fit. Default: 200.")]
-NoFigures = Annotated[
-    bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
-]
-WithCertificate = Annotated[
-    bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
-]
+NoFigures = Annotated[bool, typer.Option("--no-figures", help="Write neither fit.png (.pdf, .svg) nor report.html.")]
+WithCertificate = Annotated[bool, typer.Option("--certificate", help="Print the checks, with the paper's equations.")]
 Full = Annotated[bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")]
 
 

@@ -29,8 +29,7 @@ REFUSED = (ValueError, TypeError, OverflowError)
 """Errors of a sample that is not taken; those after it are."""
 
 Replayed = Annotated[
-    Path | None,
-    typer.Option("--replay", metavar="LOG", help="Log to feed. Default: that of the problem file."),
+    Path | None, typer.Option("--replay", metavar="LOG", help="Log to feed. Default: that of the problem file.")
 ]
 Stdin = Annotated[
     bool, typer.Option("--stdin", help='Read samples from stdin, a line {"t": 0.1, "y": [1.2], "u": [0.3]} each.')
@@ -41,24 +40,20 @@ Window = Annotated[
 ]
 FalseAlarms = Annotated[
     float | None,
-    option(metavar="RATE", help="False alarms per time unit: finds the threshold by simulation, for a minute or so."),
+    option(metavar="RATE", help="False alarms per time unit: finds the threshold by simulation, in a minute."),
 ]
 Threshold = Annotated[float | None, option(metavar="NUMBER", help="Statistic at which to alarm. Default: 12.")]
-Budget = Annotated[
-    float | None,
-    option(metavar="SECONDS", help="What an update may take, at most. Default: no limit."),
-]
+Budget = Annotated[float | None, option(metavar="SECONDS", help="Most that an update may take. Default: no limit.")]
 MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most changes in the window, or in all. Default: 8.")]
 StateFile = Annotated[
     Path | None, option("--state", metavar="FILE", help="Go on from this file, if it exists; save to it at the end.")
 ]
 JournalFile = Annotated[
-    Path | None,
-    option("--journal", metavar="FILE", help="Write each sample to this file first, so that a crash loses none."),
+    Path | None, option("--journal", metavar="FILE", help="Write each sample to this file first: a crash loses none.")
 ]
 Live = Annotated[
     int | None,
-    option("--live", metavar="PORT", help="Show a page at http://127.0.0.1:PORT until Ctrl-C; 0 takes a free port."),
+    option("--live", metavar="PORT", help="Show a page at http://127.0.0.1:PORT until Ctrl-C; 0: a free port."),
 ]
 
 

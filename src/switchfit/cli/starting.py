@@ -13,12 +13,7 @@ from switchfit.io import find_examples
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
 FirstLog = Annotated[
-    Path | None,
-    option(
-        "--from",
-        metavar="LOG",
-        help="Log to begin with: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP. Default: an example.",
-    ),
+    Path | None, option("--from", metavar="LOG", help="Log to begin with, of any format. Default: an example.")
 ]
 
 

@@ -28,10 +28,13 @@ from switchfit.report.formats import (
     add_dates,
     describe_origin,
     format_iso,
+    format_span,
     format_table,
     format_time,
+    label_quantity,
     list_dated,
     list_jumps,
+    suffix_time,
 )
 from switchfit.report.sentences import write_reason, write_step
 from switchfit.runtime.errors import InputError
@@ -93,10 +96,11 @@ def read_sample(line: bytes, run: Experiment) -> tuple[Any, Any, Any]:
     """
     try:
         given = json.loads(line)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"a sample is one line of JSON, such as {EXAMPLE}; got {_quote(line)} ({error}).") from error
+    except (ValueError, RecursionError):
+        given = None
     if not isinstance(given, dict) or "t" not in given or not set(given) <= {"t", "y", "u"}:
-        raise ValueError(f"a sample has the keys t, y and u, as in {EXAMPLE}; got {_quote(line)}.")
+        got = shorten(line.decode(errors="replace").strip())
+        raise ValueError(f"a sample is one line of JSON with the keys t, y and u, such as {EXAMPLE}; got {got}.")
     t, y, u = (given.get(key) for key in "tyu")
     if isinstance(t, str) and run.origin is not None:
         t = float(run.origin.to_numbers(as_date(t, "t"), run.time_unit, "t"))
@@ -108,10 +112,6 @@ def _fill(y: Any) -> Any:
     if isinstance(y, dict):
         return {name: np.nan if value is None else value for name, value in y.items()}
     return [np.nan if value is None else value for value in y] if isinstance(y, list) else y
-
-
-def _quote(line: bytes) -> str:
-    return shorten(line.decode(errors="replace").strip())
 
 
 MOST_EXPERIMENTS = 3
@@ -202,8 +202,7 @@ def _describe_method(structure: Structure) -> str:
 
 
 def _describe_experiment(experiment: Experiment) -> list[str]:
-    step_unit = unit_suffix(experiment.time_unit)
-    unit = step_unit if experiment.origin is None else ""
+    step_unit, unit = unit_suffix(experiment.time_unit), suffix_time(experiment)
     ends = experiment.ends_of_modes(experiment.initial_times)
     show = partial(format_time, run=experiment)
     times = ", ".join(map(show, ends[1:-1]))
@@ -222,14 +221,14 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
             missing = item.values.size - item.count
             lines.append(
                 f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}, "
-                f"{show(item.times[0])} to {show(item.times[-1])}{unit}, typically {step:.4g}{step_unit} apart, "
+                f"{format_span(item.times[0], item.times[-1], experiment)}, typically {step:.4g}{step_unit} apart, "
                 f"{missing} values missing{_describe_sensor(item, step_unit)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
             names = _join_channel_names(item.names, item.units, item.signal.channels)
             lines.append(
-                f"reference signal of {names}, {show(knots[0])} to {show(knots[-1])}{unit}, {len(knots)} knots"
+                f"reference signal of {names}, {format_span(knots[0], knots[-1], experiment)}, {len(knots)} knots"
             )
         else:
             lines.append(type(item).__name__)
@@ -252,9 +251,7 @@ def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None
     """Return names with their units, or the number of channels where they have no names."""
     if names is None:
         return f"{channels} channels"
-    return ", ".join(
-        f"{name} ({unit})" if unit else name for name, unit in zip(names, units or ("",) * channels, strict=True)
-    )
+    return ", ".join(map(label_quantity, names, units or ("",) * channels))
 
 
 KEYS = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import os
 import re
 import sys
 import traceback
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from switchfit.runtime.errors import InputError, get_first_line
-from switchfit.runtime.files import is_regular
 
 _REFERENCE = re.compile(r"(.+\.py):(\w+)")
 """How a problem file names an object in a Python file."""
@@ -59,7 +59,7 @@ def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
     if match is None:
         raise InputError(f"{what} must be given as 'file.py:object'; got {reference!r}.")
     path = folder / match[1]
-    if not is_regular(path):
+    if not os.path.isfile(path):
         raise InputError(f"{what} {reference!r}: there is no file {path}.")
     return path, match[2]
 

@@ -6,6 +6,7 @@ What is odd about the times and channels of a log, and the repairs that a user m
 from __future__ import annotations
 
 import importlib
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,7 +22,7 @@ from switchfit.io.logs.log import SECONDS, FloatArray, Log, Options
 from switchfit.problem.dates import NANOSECONDS
 from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
-from switchfit.runtime.files import explain_read_errors, is_regular
+from switchfit.runtime.files import explain_read_errors
 
 REPAIRS = ("sort", "drop-duplicates", "drop-missing-times", "drop-broken-lines")
 """Repairs by name; beside them "unwrap:CHANNEL"."""
@@ -375,7 +376,7 @@ def _read_format(path: Path, options: Options) -> Log:
 
 def _choose_format(path: Path) -> _Format:
     """Return the format of a file, by the end of its name or by how it begins."""
-    if is_regular(path / "metadata.yaml"):
+    if os.path.isfile(path / "metadata.yaml"):
         return _BAG
     ending = Path(path.name.lower().removesuffix(".gz")).suffix
     return _FORMATS.get(ending) or (_NMEA if _is_nmea(path) else _TEXT)
@@ -383,7 +384,7 @@ def _choose_format(path: Path) -> _Format:
 
 def _is_nmea(path: Path) -> bool:
     """Return whether the first line of a file is a sentence of NMEA 0183."""
-    if not is_regular(path):
+    if not os.path.isfile(path):
         return False
     with explain_read_errors(path), path.open("rb") as file:
         return bool(_SENTENCE.match(file.read(400)))

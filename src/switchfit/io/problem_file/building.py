@@ -29,7 +29,6 @@ from switchfit.modes.library import build_library
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError, Issue
-from switchfit.runtime.files import is_regular
 
 
 def describe_sources(
@@ -79,9 +78,7 @@ def _list_files(folder: Path, name: str) -> list[Path]:
         finder.run_script(str(folder / name))
         return [Path(module.__file__) for module in finder.modules.values() if module.__file__]
     paths = [folder / found for found in find_logs(folder, name) or [name]]
-    return [
-        file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if is_regular(file)
-    ]
+    return [file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
 
 
 def digest_file(folder: Path, path: Path) -> FileDigest:
