@@ -119,8 +119,7 @@ def test_a_run_for_which_the_parameters_do_not_hold_is_exit_code_1(project):
 def test_a_model_that_has_changed_since_the_fit_is_named(project):
     Path("room.py").write_text(ROOM + "\n# a comment\n")
     printed = succeed("validate", FIT, "other.csv")
-    assert printed.startswith("Changed since\n  room.py has changed: ")
-    assert "log.csv" not in printed, "that the other log is another file is no change"
+    assert printed.startswith("Changed since\n  room.py has changed\n\n"), "that the log is another is no change"
 
 
 def test_a_model_that_no_longer_suits_the_saved_problem_is_named(project):
@@ -134,12 +133,6 @@ def test_a_model_that_no_longer_suits_the_saved_problem_is_named(project):
     Path("before", "room.py").write_text(ROOM)
     shutil.copy("log.csv", "before")
     succeed("compare", FIT, NEVER, "--folder", "before")
-
-
-def test_validate_finds_the_model_elsewhere(project, tmp_path):
-    moved = shutil.copy(FIT, tmp_path)
-    assert "was made from room.py, which is not in " in refuse("validate", moved, "other.csv")
-    succeed("validate", moved, "other.csv", "--folder", project)
 
 
 # --- compare ----------------------------------------------------------------------------------------------------------
@@ -169,27 +162,20 @@ def test_a_fit_that_did_not_converge_is_exit_code_1(project):
     assert result.stderr == expected
 
 
-def test_data_that_have_changed_since_the_fit_cannot_be_compared(project):
-    shutil.copy("other.csv", "log.csv")
-    said = refuse("compare", FIT, NEVER)
-    assert f"{FIT} was fitted to other values than the files in {project} have now: fit them again." in said
-
-
 # --- what cannot be read ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("validate", "nowhere.json", "other.csv"), "There is no saved estimate nowhere.json; check the name and the"),
-        (("validate", "out", "other.csv"), "out is a folder; name the estimate.json in it."),
+        (("validate", "nowhere.json", "other.csv"), "File 'nowhere.json' does not exist."),
+        (("compare", "out", FIT), "File 'out' is a directory."),
         (("validate", "problem.toml", "other.csv"), "problem.toml is not a saved estimate"),
         (("validate", FIT, "nowhere.csv"), "nowhere.csv; check the name and the folder."),
         (("validate", FIT, "nowhere.toml"), "There is no problem file nowhere.toml"),
         (("validate", FIT), "Missing argument 'LOG|PROBLEM.toml'"),
-        (("validate", "heater.json", "other.csv"), "the script that fitted it: estimate.validate(...)."),
-        (("compare", FIT), "name two saved estimates or more"),
-        (("compare", FIT, "heater.json"), "the script that fitted it: sf.compare([...])."),
+        (("validate", "heater.json", "other.csv"), "in the script that fitted it: estimate.validate(...), sf.compare"),
+        (("compare", FIT), "compare needs two estimates or more; got 1."),
     ],
 )
 def test_what_cannot_be_read(project, arguments, said):

@@ -37,9 +37,7 @@ def pushed(t, x, p, u):
     return p["a"] * (u - x)
 
 system = sf.HybridSystem({"rise": rise, "fall": fall, "drift": drift}, [0.5], state_names=("T",))
-driven = sf.HybridSystem(
-    {"pushed": pushed, "fall": lambda t, x, p, u: -p["b"] * x}, [sf.Parameter(0.4, lower=0.0)], state_names=("T",)
-)
+driven = sf.HybridSystem({"pushed": pushed, "fall": lambda t, x, p, u: -p["b"] * x}, [0.4], state_names=("T",))
 
 def build():
     data = sf.Measurements([0.0, 1.0, 2.0], [[0.5], [1.0], [2.0]], sigma=0.1)
@@ -236,16 +234,11 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
     ("old", "new", "message"),
     [
         ('first = "rise"', 'first = "up"', "changed.toml: library: first names the mode 'up'; the library has the mod"),
-        ('first = "rise"', "first = 3", "'library.first[1]' must be a string; got 3 (mode or modes with which a seque"),
-        ('first = "rise"', 'frist = "rise"', "unknown key 'library.frist'; did you mean 'first'?"),
+        ('first = "rise"', "first = 3", "'library.first[1]' must be a valid string; got 3 (mode or modes with which a"),
         ("min_duration = 0.2", "min_duration = -1", "'library.min_duration' must be greater than or equal to 0; got"),
-        (
-            'first = "rise"',
-            'first = "drift"\nlast = "rise"',
-            "no mode of last (rise) can be reached from first (drift)",
-        ),
+        ('first = "rise"', 'first = "drift"\nlast = "rise"', "no mode of last (rise) can be reached from first (dr"),
         ('first = "rise"', 'first = "fall"\nlast = "drift"', "No succession: first, last, successions and min_du"),
-        ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 entries; got []"),
+        ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 item after validation, not 0; go"),
         ("tf = 8.0", "tf = 8.0\ntransition_times = [2.0]", "transition_times belong to a mode_sequence, which is miss"),
         ("tf = 8.0", "tf = { value = 8.0, lower = 7.96, upper = 9.0 }", "find_modes needs a known tf"),
     ],
@@ -276,8 +269,7 @@ a = { value = 0.7, lower = 0.01, prior = { median = 0.7, log_sd = 0.5 }, scale =
 name = "run \\"A\\""
 mode_sequence = ["pushed", "fall"]
 transition_times = ["2024-05-01T10:00:02Z"]
-parameter_map = { a = "a" }
-
+initial_state = [{ value = 0.4, lower = 0.0 }]
 inputs = { file = "inputs/*.csv", time = "t", epoch = "s", columns = ["u"], kind = "linear" }
 jumps = [{ time = "2024-05-01T10:00:05Z", map = "models/model.py:drop" }]
 
@@ -297,7 +289,7 @@ min_duration = { fall = 0.5 }
 
 
 def test_paths_dates_patterns_and_models_are_kept(tmp_path):
-    """Two logs by a pattern, dates, an input, a jump, a state of the model that is estimated, a prior."""
+    """Two logs by a pattern, dates, an input, a jump, a state that is estimated, a prior."""
     home, out = tmp_path / "home", tmp_path / "elsewhere" / "out"
     for name in ("logs", "inputs", "models"):
         (home / name).mkdir(parents=True)

@@ -147,12 +147,8 @@ def test_changes_of_the_model_are_listed(project):
     given = sf.Estimate.load(path).provenance
     (project / "log.csv").write_text(log_of(3.2) + "\n")
     assert list_changed_models(given, build_again(path)) == []
-    size = (project / "losses.py").stat().st_size
-    (project / "losses.py").write_text("LOSS = 0.06  # more\n")
-    loaded = load_problem(project / "problem.toml")
-    (change,) = list_changed_models(given, loaded)
-    assert change.startswith(f"losses.py has changed: {size} bytes with SHA-256 ")
-    assert change.endswith(f"..., now {size + 8} bytes")
+    (project / "losses.py").write_text("LOSS = 0.06\n")
+    assert list_changed_models(given, load_problem(project / "problem.toml")) == ["losses.py has changed"]
     (project / "losses.py").rename(project / "leaks.py")
     (project / "room.py").write_text((project / "room.py").read_text().replace("from losses", "from leaks"))
     changes = list_changed_models(given, load_problem(project / "problem.toml"))

@@ -76,8 +76,6 @@ def compare(
     Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
     fits to different data.
     """
-    if len(saved) < 2:
-        terminal.fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.")
     with terminal.report_errors(debug, json=json, quiet=quiet):
         import switchfit as sf
         from switchfit.io.command_line import summarize_comparison

@@ -120,7 +120,7 @@ def _find_table(annotation: Any) -> type[Table] | None:
 
 def _rephrase(message: str) -> str:
     """Return pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a valid ...'."""
-    message = re.sub(r"^(Input|List) should", "must", message).replace("dictionary", "table")
+    message = re.sub(r"^\w+ should", "must", message).replace("dictionary", "table")
     return re.sub(r" or instance of \w+$", "", message)
 
 
