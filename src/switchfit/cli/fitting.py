@@ -76,15 +76,11 @@ def fit(
     overrides = terminal.select_given(strategy=strategy, hessian=hessian, max_iterations=max_iterations)
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
-    if model is not None:
-        with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-            code = _fit_logs(problem, model, overrides, output, table)
-        if code != terminal.CONVERGED:
-            raise typer.Exit(code)
-        return
-    if len(problem) != 1 or table is not None:
-        terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        if model is not None:
+            raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
+        if len(problem) != 1 or table is not None:
+            terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
         from switchfit.io.problem_file import load_problem
 
         loaded = load_problem(problem[0])
