@@ -281,12 +281,12 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypat
     monkeypatch.setattr(os, "fsync", full)
     result = run("fit", folder / "problem.toml", "--out", tmp_path)
     assert result.exit_code == 2
-    assert f"{tmp_path / 'report.txt'} cannot be written: No space left on device; name another" in result.stderr
+    assert f"{tmp_path / 'report.txt'} cannot be read or written: No space left on device" in result.stderr
     assert (tmp_path / "report.txt").read_text() == "before"
     assert list(tmp_path.iterdir()) == [tmp_path / "report.txt"]
     result = run("fit", folder / "problem.toml", "--out", tmp_path / "report.txt")
     assert result.exit_code == 2
-    assert f"{tmp_path / 'report.txt'} cannot be written: File exists" in result.stderr
+    assert f"{tmp_path / 'report.txt'} cannot be read or written: File exists" in result.stderr
 
 
 @pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.slow)])
@@ -305,16 +305,6 @@ def test_a_reader_that_is_gone_ends_nothing(stream, folder, tmp_path, quick_proc
 
 
 # --- for scripts, and for those who watch -----------------------------------------------------------------------------
-
-
-def test_many_logs_as_json(folder, tmp_path):
-    (tmp_path / "bad.csv").write_text("t,T\n0,1\nx,2\n")
-    result = run("fit", folder / "log.csv", tmp_path / "bad.csv", "--problem", folder / "problem.toml", "--json")
-    assert result.exit_code == 2
-    good, bad = read_json(result)["logs"]
-    assert (good["log"], good["verdict"]) == (str(folder / "log.csv"), "good")
-    assert bad["verdict"] == "refused"
-    assert "bad.csv" in bad["message"]
 
 
 def test_check_as_json(folder):

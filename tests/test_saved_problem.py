@@ -137,7 +137,7 @@ def test_a_model_that_no_longer_suits_the_saved_problem_is_named(project):
     for said in (refuse("validate", FIT, "other.csv"), refuse("compare", FIT, FIT)):
         assert "estimate.json cannot be built again, since room.py in " in said
         assert "mode_sequence names the unknown mode 'on'" in said
-        assert "Fit again; or put the files as they were into a folder" in said
+        assert "Put the files as they were into a folder, and name it with --folder; or fit again." in said
     Path("before").mkdir()
     Path("before", "room.py").write_text(MODEL)
     for name in ("log.csv", "losses.py"):
@@ -300,12 +300,11 @@ def test_files_that_are_not_there(project, tmp_path):
     path = tmp_path / "sent" / "estimate.json"
     path.parent.mkdir()
     FIT.rename(path)
-    assert (
-        f"{path} was made from room.py, which is not in {tmp_path}: put it there, or name the folder that it is in with"
-    ) in refuse_to_build(path)
+    said = f"{path} cannot be built again, since room.py, losses.py, log.csv in {tmp_path} is missing or has changed: "
+    assert said in refuse_to_build(path)
     build_again(path, project)
     (project / "log.csv").unlink()
-    assert f"{path} was made from log.csv, which is not in {project}" in refuse_to_build(path, project)
+    assert f"{path} cannot be built again, since log.csv in {project} is missing" in refuse_to_build(path, project)
 
 
 DAMAGES = [

@@ -132,8 +132,7 @@ def paper(
 
         terminal.make_folder(out)
         try:
-            with terminal.explain_write_errors(out):
-                run(out, quick=quick, only=only, say=terminal.print_note)
+            run(out, quick=quick, only=only, say=terminal.print_note)
         except KeyboardInterrupt:
             terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
         terminal.print_text((out / TABLE).read_text(encoding="utf-8"))

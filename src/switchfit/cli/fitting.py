@@ -170,8 +170,7 @@ def write_estimate(
     for name, path in tables.items():
         terminal.write_file(path, TABLES[name](estimate))
     provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
-    with terminal.explain_write_errors(folder / "estimate.json") as path:
-        _save(estimate, path, provenance, complete=output.certificate)
+    _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:
         terminal.write_figure(estimate, folder / f"fit.{output.figures}")
         _write_page(estimate, provenance, folder / "report.html")

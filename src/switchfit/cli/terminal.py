@@ -153,6 +153,8 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
 
     if users and not isinstance(error, InputError):
         fail(f"{describe_error(error)}. (--debug shows the full traceback.)")
+    if isinstance(error, OSError) and error.filename is not None:
+        fail(f"{error.filename} cannot be read or written: {error.strerror}.")
     if isinstance(error, (ValueError, OSError)):
         fail(str(error))
     if isinstance(error, MemoryError):
@@ -230,27 +232,14 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
 def make_folder(folder: Path | None) -> None:
     """Create a folder, with those above it, unless it exists or none is asked for."""
     if folder is not None:
-        with explain_write_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-
-
-@contextlib.contextmanager
-def explain_write_errors(path: Path) -> Iterator[Path]:
-    """Return a context that turns an OSError into an InputError with the name of the file and the reason."""
-    from switchfit.runtime.errors import InputError
-
-    try:
-        yield path
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}; name another with --out.") from error
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file atomically."""
     from switchfit.runtime.files import write_atomically
 
-    with explain_write_errors(path):
-        write_atomically(content, path)
+    write_atomically(content, path)
 
 
 DOTS = 150
@@ -307,8 +296,7 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
     """
     write_file(stem.with_suffix(".txt"), f"{result}\n")
     if saved:
-        with explain_write_errors(stem.with_suffix(".json")) as path:
-            result.save(path)
+        result.save(stem.with_suffix(".json"))
     if figures:
         write_figure(result, stem.with_suffix(f".{figures}"))
     print_note(f"written to {stem.parent}")

@@ -114,7 +114,7 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     Raises
     ------
     InputError
-        If the folder has something in it or cannot be created, or the log cannot be used.
+        If the folder has something in it, or the log cannot be used.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} exists already, and nothing is overwritten: give another NAME.")
@@ -134,14 +134,11 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
             names=tuple(channels),
             units=tuple(read.units.get(name, "") for name in channels),
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, text in texts.items():
-            (folder / name).write_text(text, encoding="utf-8")
-        for path in copied:
-            shutil.copy(path, folder)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written: {error.strerror}; give another NAME.") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    for path in copied:
+        shutil.copy(path, folder)
     return [folder / name for name in (*texts, *(path.name for path in copied))]
 
 

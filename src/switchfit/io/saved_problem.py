@@ -66,20 +66,13 @@ def rebuild_problem(
     try:
         return load_problem(where / given.problem_file, own if log is None else log, text=given.text), where
     except InputError as error:
-        needed = [digest.name for digest in given.files if log is None or digest.name.endswith(".py")]
-        missing = [name for name in needed if not (where / name).exists()]
-        if missing:
-            raise InputError(
-                f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it "
-                "is in with --folder."
-            ) from error
-        now = {digest.name: digest_file(where, where / digest.name).sha256 for digest in given.files}
-        changed = [d.name for d in given.files if d.name in needed and now[d.name] not in ("", d.sha256)]
+        needed = [digest for digest in given.files if log is None or digest.name.endswith(".py")]
+        changed = [each.name for each in needed if digest_file(where, where / each.name).sha256 != each.sha256]
         if not changed:
             raise
         raise InputError(
-            f"{path} cannot be built again, since {join_names(changed)} in {where} has changed: {error} Fit again; or "
-            "put the files as they were into a folder, and name it with --folder."
+            f"{path} cannot be built again, since {join_names(changed)} in {where} is missing or has changed: {error} "
+            "Put the files as they were into a folder, and name it with --folder; or fit again."
         ) from error
 
 

@@ -42,9 +42,7 @@ def find_logs(folder: Path, given: str) -> list[str] | None:
     """
     path = folder / given
     if os.path.isdir(path) and given.strip() and not _is_log(path):
-        with explain_read_errors(path):
-            names = os.listdir(path)
-        inside = sorted(name for name in names if not name.startswith(".") and _is_log(path / name))
+        inside = sorted(name for name in os.listdir(path) if not name.startswith(".") and _is_log(path / name))
         if not inside:
             raise InputError(f"{path} has no logs: no file in it ends in {', '.join(ENDINGS)}.")
         return [os.path.join(given, name) for name in inside]

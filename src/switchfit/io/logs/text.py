@@ -34,7 +34,6 @@ DELIMITERS = (";", "\t", ",", "|", " ")
 """What may separate fields; of two that split all lines alike, the first one: commas are decimals then."""
 SNIFFED = 100
 """Lines that are looked at."""
-MOST_HEADER_LINES = 12
 
 MISSING = frozenset({"", "NA", "N/A", "NAN", "NULL", "NONE"})
 """Cells that stand for a missing value, in capitals."""
@@ -127,7 +126,7 @@ def read_header(rows: Sequence[Row], comment: list[str]) -> Header:
     """
     begin = _skip_preamble(rows)
     first = begin
-    while first < min(len(rows), begin + MOST_HEADER_LINES) and _is_header(rows[first][1], first == begin):
+    while first < len(rows) and _is_header(rows[first][1], first == begin):
         first += 1
     lines = [_strip_end(cells) for _, cells in rows[begin:first]]
     if not lines:
