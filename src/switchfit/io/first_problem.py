@@ -138,7 +138,7 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     for path in copied:
-        shutil.copy(path, folder)
+        shutil.copyfile(path, folder / path.name)
     return [folder / name for name in (*texts, *(path.name for path in copied))]
 
 

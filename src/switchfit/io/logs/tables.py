@@ -26,6 +26,7 @@ from switchfit.io.logs.log import (
     normalize_time_unit,
     split_unit,
 )
+from switchfit.problem.dates import NANOSECONDS
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 
@@ -142,7 +143,7 @@ def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple
     second = np.timedelta64(1, "s")
     if column.dtype.kind == "M":
         first = column[~np.isnat(column)][0]
-        return (column - first) / second, "s", float((first - np.datetime64(0, "s")) / second)
+        return (column - first) / second, "s", int(first.astype("datetime64[ns]").astype(np.int64)) / NANOSECONDS["s"]
     if column.dtype.kind == "m":
         return column / second, "s", 0.0
     numbers = np.asarray(column, dtype=np.float64)

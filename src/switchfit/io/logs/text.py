@@ -263,7 +263,9 @@ class _Table:
         except ValueError:
             pass
         found = list(map(_parse_number, cells))
-        return np.array([np.nan if number is None else number for number in found]), np.equal(found, None)
+        return np.array([np.nan if number is None else number for number in found]), np.array(
+            [number is None for number in found]
+        )
 
 
 def _parse_number(cell: str) -> float | None:
@@ -362,7 +364,9 @@ def _read_table(path: Path, drop_broken: bool) -> _Table:
     if not kept:
         raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line per sample.")
     delimiter = find_delimiter(kept[:SNIFFED])
-    comments = [(k, line.strip(" \t#%")) for k, line in lines[: kept[0][0] - 1] if line.lstrip().startswith(COMMENTS)]
+    comments = [
+        (k, line.strip().lstrip("#% \t")) for k, line in lines[: kept[0][0] - 1] if line.lstrip().startswith(COMMENTS)
+    ]
     try:
         rows, notes = split_lines(kept, delimiter), split_lines(comments[-1:], delimiter)
     except ValueError as error:

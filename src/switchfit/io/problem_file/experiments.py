@@ -250,9 +250,9 @@ class _Run:
 
     def _build_observe(self, place: str, table: DataTable) -> Callable[..., Any] | None:
         """Return the observation h(t, x, p); None for the whole state."""
-        if table.observe is None or isinstance(table.observe, str):
-            return None if table.observe is None else self._load_function(f"{place}.observe", table.observe)
-        if self.system is None:
+        if isinstance(table.observe, str):
+            return self._load_function(f"{place}.observe", table.observe)
+        if self.system is None or table.observe is None:
             return None
         states = self.system.state_names
         if states is None:
