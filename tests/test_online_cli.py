@@ -182,7 +182,9 @@ def test_options_are_those_of_the_estimator_and_come_before_the_file(folder, tmp
     result = run("online", folder / "problem.toml", *options)
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
     said = {"window": 2.0, "threshold": 9.0, "false_alarms": None, "max_switches": 3, "budget": 0.1, "capacity": 4096}
-    assert given == said | {"successions": {"rise": ["fall", "drift"], "fall": ["rise"]}, "min_duration": 0.2}
+    durations = dict.fromkeys(("rise", "fall", "drift"), 0.2)
+    successions = {"rise": ("fall", "drift"), "fall": ("rise",), "drift": ()}
+    assert given == said | {"successions": successions, "min_duration": durations}
     for name in ("model.py", "log.csv"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     online = '[online]\nwindow = 3.0\nrenews = { rise = "a" }\ndrift = { c = 0.1 }\n'

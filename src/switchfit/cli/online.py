@@ -92,6 +92,7 @@ def online(
         loaded = load_problem(problem, replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
+        from switchfit.modes.library import build_library
         from switchfit.online.log import build_log
         from switchfit.problem.data import Measurements
         from switchfit.problem.structure import select_kind
@@ -103,7 +104,9 @@ def online(
         sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
         room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
         settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
-        settings |= {"max_switches": max_switches, "budget": budget, "capacity": room} | _read_library(loaded)
+        settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
+        library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
+        settings |= {"successions": library.successions, "min_duration": library.durations}
         estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
         with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
             recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
@@ -122,19 +125,6 @@ def online(
             terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
         if estimator.now.status.name == "LOST":
             terminal.end_unreliable(f"{estimator.now.status.value}.")
-
-
-def _read_library(loaded: ProblemFile) -> dict[str, Any]:
-    """Return successions and durations of the [library] of a problem file; modes that it leaves out never follow."""
-    given = loaded.library
-    found: dict[str, Any] = {key: given[key] for key in ("successions", "min_duration") if key in given}
-    if "library" in given:
-        modes, successions = list(given["library"]), given.get("successions")
-        after = {mode: modes if successions is None else successions.get(mode, ()) for mode in modes}
-        found["successions"] = {
-            mode: [each for each in names if each in modes and each != mode] for mode, names in after.items()
-        }
-    return found
 
 
 def _start(
