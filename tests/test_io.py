@@ -195,7 +195,7 @@ def test_check_says_what_is_odd(folder):
         result = CliRunner().invoke(cli.app, ["check", str(folder / "problem.toml"), *options])
         assert result.exit_code == 0, result.stderr
         assert "7 samples of T, 0 to 5.5 s" in result.stdout
-        assert "log.csv, line 8: a gap of 5 s after 0.5 s, where samples are" in result.stdout
+        assert "log.csv, line 8: a gap of 5 after 0.5, where samples are" in result.stdout
 
 
 def test_loss_delay_priors_and_scales(folder):
@@ -284,7 +284,7 @@ def test_examples_load(path):
         ('time = "t"', 'time = "T"', r"log\.csv, column 'T': the time of sample 3 is missing"),
         ('time = "t"', 'time = "t"\nwindow = [10, 20]', r"no time in column 't' lies in the window \[10\.0, 20\.0\]; "),
         ('observe = ["T"]', 'observe = ["x"]', r"data\[1\]: observe names the unknown state 'x'; the states are T"),
-        ('observe = ["T"]', 'observe = "room.py:seven"', r"observe 'room.py:seven' must be a function h\(t, x, p\);"),
+        ('observe = ["T"]', 'observe = "room.py:seven"', r"data\[1\]: observe must be a function h\(t, x, p\); got int"),
         ('observe = ["T"]', 'observe = "T"', r"data\[1\]\.observe must be given as 'file\.py:object'; got 'T'"),
         ("sigma = 0.1", 'sigma = 0.1\nkind = "reference"', r"sigma does not belong to kind = 'reference': meas"),
         ("sigma = 0.1", 'delay = 0.1\nkind = "reference"', "delay does not belong to kind = 'reference'"),

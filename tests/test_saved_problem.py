@@ -178,8 +178,8 @@ def test_a_fit_that_did_not_converge_is_exit_code_1(project):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("validate", "nowhere.json", "other.csv"), "File 'nowhere.json' does not exist."),
-        (("compare", "out", FIT), "File 'out' is a directory."),
+        (("validate", "nowhere.json", "other.csv"), "file 'nowhere.json' does not exist."),
+        (("compare", "out", FIT), "'out' is a directory."),
         (("validate", "problem.toml", "other.csv"), "problem.toml is not a saved estimate"),
         (("validate", FIT, "nowhere.csv"), "nowhere.csv; check the name and the folder."),
         (("validate", FIT, "nowhere.toml"), "There is no problem file nowhere.toml"),

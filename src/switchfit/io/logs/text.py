@@ -45,8 +45,10 @@ _GERMAN = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")
 _ONE_DIGIT = re.compile(r"(?<=[- ])(\d)(?!\d)")
 """A month, a day or an hour that ISO 8601 has with two digits."""
 
-Line, Row = tuple[int, str], tuple[int, list[str]]
-"""Number of a line, and its text or its cells."""
+Line = tuple[int, str]
+"""Number of a line, and its text."""
+Row = tuple[int, list[str]]
+"""Number of a line, and its cells."""
 
 
 @dataclass(frozen=True)
@@ -248,7 +250,7 @@ class _Table:
     source: str
     header: Header
     lines: NDArray[np.intp]
-    columns: list[Sequence[str]]
+    columns: Sequence[Sequence[str]]
     comma: bool
     broken: list[int]
 

@@ -76,7 +76,8 @@ def _list_files(folder: Path, name: str) -> list[Path]:
     if name.endswith(".py"):
         finder = ModuleFinder([str((folder / name).parent)])
         finder.run_script(str(folder / name))
-        return [Path(module.__file__) for module in finder.modules.values() if module.__file__]
+        files = [getattr(module, "__file__", None) for module in finder.modules.values()]
+        return [Path(file) for file in files if file is not None]
     paths = [folder / found for found in find_logs(folder, name) or [name]]
     return [file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
 

@@ -306,7 +306,8 @@ def build_parameter(table: ParameterTable) -> Parameter:
 
 def _build_prior(table: PriorTable) -> Prior:
     given = table.model_dump(exclude_none=True)
-    kind = {("mean", "sd"): Normal, ("median", "log_sd"): LogNormal}.get(tuple(given))
-    if kind is not None:
-        return kind(**given)
+    if set(given) == {"mean", "sd"}:
+        return Normal(**given)
+    if set(given) == {"median", "log_sd"}:
+        return LogNormal(**given)
     raise ValueError(f"prior needs mean and sd (normal), or median and log_sd (log-normal); got {given}.")
