@@ -37,7 +37,9 @@ def pushed(t, x, p, u):
     return p["a"] * (u - x)
 
 system = sf.HybridSystem({"rise": rise, "fall": fall, "drift": drift}, [0.5], state_names=("T",))
-driven = sf.HybridSystem({"pushed": pushed, "fall": lambda t, x, p, u: -p["b"] * x}, [0.4], state_names=("T",))
+driven = sf.HybridSystem(
+    {"pushed": pushed, "fall": lambda t, x, p, u: -p["b"] * x}, [sf.Parameter(0.4, lower=0.0)], state_names=("T",)
+)
 
 def build():
     data = sf.Measurements([0.0, 1.0, 2.0], [[0.5], [1.0], [2.0]], sigma=0.1)

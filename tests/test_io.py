@@ -284,7 +284,7 @@ def test_examples_load(path):
         ('time = "t"', 'time = "T"', r"log\.csv, column 'T': the time of sample 3 is missing"),
         ('time = "t"', 'time = "t"\nwindow = [10, 20]', r"no time in column 't' lies in the window \[10\.0, 20\.0\]; "),
         ('observe = ["T"]', 'observe = ["x"]', r"data\[1\]: observe names the unknown state 'x'; the states are T"),
-        ('observe = ["T"]', 'observe = "room.py:seven"', r"data\[1\]: observe must be a function h\(t, x, p\); got int"),
+        ('observe = ["T"]', 'observe = "room.py:seven"', r"data\[1\]: observe must be a function h\(t, x, p\); got"),
         ('observe = ["T"]', 'observe = "T"', r"data\[1\]\.observe must be given as 'file\.py:object'; got 'T'"),
         ("sigma = 0.1", 'sigma = 0.1\nkind = "reference"', r"sigma does not belong to kind = 'reference': meas"),
         ("sigma = 0.1", 'delay = 0.1\nkind = "reference"', "delay does not belong to kind = 'reference'"),

@@ -297,8 +297,8 @@ def test_changes_of_the_model_are_listed(project):
 
 
 def test_files_that_are_not_there(project, tmp_path):
-    path = tmp_path / "sent" / "estimate.json"
-    path.parent.mkdir()
+    path = tmp_path / "sent" / "problem" / "estimate.json"
+    path.parent.mkdir(parents=True)
     FIT.rename(path)
     said = f"{path} cannot be built again, since room.py, losses.py, log.csv in {tmp_path} is missing or has changed: "
     assert said in refuse_to_build(path)
