@@ -233,7 +233,7 @@ def test_names_in_a_problem_file(folder):
     [
         ('right = "wheel 2"', 'right = "wheel 3"', "has no column 'wheel 3'; its columns are t, x, wheel 1, wheel 2"),
         ('right = "wheel 2"', 'rigth = "wheel 2"', r"reads 'right', which is neither .* nor an input \(left, rigth\)"),
-        ('right = "wheel 2"', "right = 2", "'experiments.1..inputs.columns' must be a valid string; got 2"),
+        ('right = "wheel 2"', "right = 2", "'experiments.1..inputs.columns' must be a string; got 2"),
         (COLUMNS, "{}", "'experiments.1..inputs.columns' must have at least 1 item"),
     ],
 )

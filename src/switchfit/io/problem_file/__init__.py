@@ -119,8 +119,8 @@ def _find_table(annotation: Any) -> type[Table] | None:
 
 
 def _rephrase(message: str) -> str:
-    """Return pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a valid ...'."""
-    message = re.sub(r"^\w+ should", "must", message).replace("dictionary", "table")
+    """Return pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
+    message = re.sub(r"^\w+ should", "must", message).replace("dictionary", "table").replace("a valid ", "a ")
     return re.sub(r" or instance of \w+$", "", message)
 
 
