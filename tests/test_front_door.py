@@ -97,7 +97,7 @@ COMPLETION = {"_SWITCHFIT_COMPLETE": "complete_bash", "COMP_WORDS": "switchfit f
         (["fitt", "problem.toml"], {}, "No such command 'fitt'"),
         (["fit", "--strategi", "auto"], {}, "No such option: --strategi"),
         (["fit", "nothing.toml"], {}, "There is no problem file nothing.toml"),
-        (["compare", "nothing.json", "other.json"], {}, "There is no saved estimate nothing.json"),
+        (["compare", "nothing.json", "other.json"], {}, "file 'nothing.json' does not exist"),
     ],
 )
 def test_what_needs_no_numbers_imports_no_numerical_library(arguments, variables, message):

@@ -219,7 +219,7 @@ def test_names_in_a_problem_file(folder):
         ('right = "wheel 2"', 'right = "wheel 3"', "has no column 'wheel 3'; its columns are t, x, wheel 1, wheel 2"),
         ('right = "wheel 2"', 'rigth = "wheel 2"', "reads 'right', which is not there: .*; u has left, rigth"),
         ('right = "wheel 2"', "right = 2", "'experiments.1..inputs.columns' must be a string; got 2"),
-        (COLUMNS, "{}", "'experiments.1..inputs.columns' must have at least 1 entries"),
+        (COLUMNS, "{}", "'experiments.1..inputs.columns' must have at least 1 item"),
     ],
 )
 def test_names_in_a_problem_file_that_are_wrong(folder, old, new, message):

@@ -366,7 +366,7 @@ def test_problem_file_with_dates(folder, values):
     ("old", "new", "message"),
     [
         ('"model.py:dose"', '"model.py:doze"', "jumps\\[1\\].map .*defines no 'doze'"),
-        ('"model.py:dose"', '"dose"', "jumps\\[1\\]: map must name a function of a Python file"),
+        ('"model.py:dose"', '"dose"', "jumps\\[1\\].map must be given as 'file.py:object'; got 'dose'"),
         ("amount = 100.0", "size = 100.0", "jumps\\[2\\].map .*amount"),
         ("time = 24", "tim = 24", "tim"),
         ("time = 24", "time = 'noon'", "jumps\\[2\\].time.* must be a number or a date such as 2024-05-01"),

@@ -1,6 +1,7 @@
 """Many logs: patterns and folders in problem files, and `switchfit fit LOG ... --problem FILE`."""
 
 import csv
+import json
 import re
 from pathlib import Path
 
@@ -155,8 +156,8 @@ def test_a_bad_log_does_not_end_the_run(folder):
     rows = "".join(f"{t:g};{5 * np.sin(3 * t):.6g}\n" for t in times)
     (folder / "logs" / "friday.csv").write_text("t;T\n" + rows)
     (folder / "logs" / "short.csv").write_text("t;U\n0;1\n")
-    table = folder / "table.csv"
-    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", table)
+    table, problem = folder / "table.csv", ("--problem", folder / "problem.toml")
+    result = run("fit", folder / "logs", *problem, "--table", table)
     assert result.exit_code == 2
     rows = {row["log"].rpartition("/")[2]: row for row in read(table)}
     assert [row["verdict"] for row in rows.values()] == ["bad", "good", "refused", "refused", "good"]
@@ -167,6 +168,10 @@ def test_a_bad_log_does_not_end_the_run(folder):
     assert float(rows["tuesday.csv"]["tau_1 (s)"]) == pytest.approx(2.1, rel=1e-5)
     assert rows["sunday.csv"]["tau_1 (s)"] == ""
     assert "5 logs: 2 fitted, 1 not, 2 refused" in result.stderr
+    result = run("fit", *((folder / "logs" / f"{name}.csv") for name in ("monday", "sunday")), "--json", *problem)
+    monday, sunday = json.loads(result.stdout)["logs"]
+    assert (monday["log"], monday["verdict"]) == (str(folder / "logs" / "monday.csv"), "good")
+    assert (sunday["verdict"], sunday["message"]) == ("refused", rows["sunday.csv"]["message"])
 
 
 def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):

@@ -1,13 +1,15 @@
-"""What a saved estimate was made from, and its problem, built again from that."""
+"""Saved estimates: what they were made from, built again from that, for `switchfit validate` and `compare`."""
 
 import hashlib
 import json
 import re
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from models import temperature
 from test_cli import PROBLEM, ROOM
 from test_many_logs import log_of, run
 
@@ -18,43 +20,179 @@ from switchfit.io.saved_problem import list_changed_models, load_with_problem
 from switchfit.models import heater_problem
 from switchfit.runtime.errors import InputError
 
+MODEL = ROOM.replace("0.05", "LOSS").replace("import", "from losses import LOSS\nimport", 1)
 LOCAL = '\n[options]\nstrategy = "local"\n'
 
 
-def save(folder, *arguments):
-    """The saved estimate of a problem file, in the folder `out` beside it."""
-    result = run("fit", folder / "problem.toml", "--out", folder / "out", "--no-figures", *arguments)
-    assert result.exit_code in (0, 1), result.stderr
-    return folder / "out" / "estimate.json"
-
-
-def write_project(folder):
-    folder.mkdir()
-    (folder / "problem.toml").write_text(PROBLEM + LOCAL)
-    (folder / "room.py").write_text(
-        ROOM.replace("0.05", "LOSS").replace("import", "from losses import LOSS\nimport", 1)
-    )
-    (folder / "losses.py").write_text("LOSS = 0.05\n")
-    (folder / "log.csv").write_text(log_of(3.2))
-    return folder
+def write_log(path, switch, heating=0.5, seed=0):
+    """A room that is heated until it is switched off, with noise of 0.1."""
+    times = np.arange(0.25, 6.0, 0.25)
+    values = temperature(times, switch, heating, 0.05, start=0.0)
+    values += 0.1 * np.random.default_rng(seed).normal(size=len(times))
+    np.savetxt(path, np.stack([times, values], axis=1), delimiter=",", header="t,T", comments="", fmt="%.17g")
 
 
 @pytest.fixture(scope="module")
 def saved_project(tmp_path_factory):
-    """A project with a saved estimate: a problem file, its log, a model in two files."""
-    project = write_project(tmp_path_factory.mktemp("saved") / "project")
-    save(project)
-    return project
+    """Two models fitted to one log, both saved; another log; one that the parameters do not hold for."""
+    folder = tmp_path_factory.mktemp("comparison") / "project"
+    folder.mkdir()
+    (folder / "room.py").write_text(MODEL)
+    (folder / "losses.py").write_text("LOSS = 0.05\n")
+    write_log(folder / "log.csv", 3.2, seed=1)
+    write_log(folder / "other.csv", 2.4, seed=2)
+    write_log(folder / "weaker.csv", 3.0, heating=0.3, seed=3)
+    (folder / "problem.toml").write_text(PROBLEM + LOCAL)
+    never = PROBLEM.replace('["on", "off"]', '["on"]').replace("transition_times = [2.0]\n", "")
+    (folder / "never.toml").write_text(never + LOCAL)
+    for name in ("problem", "never"):
+        result = run("fit", folder / f"{name}.toml", "--out", folder / "out" / name, "--no-figures", "--full")
+        assert result.exit_code == 0, result.stderr  # of a doubtful fit too
+        assert "KKT residual" in result.stdout
+    assert result.stdout.startswith("Doubtful: ")
+    sf.estimate(heater_problem(), strategy="local").save(folder / "heater.json")
+    return folder
 
 
 @pytest.fixture
-def project(saved_project, tmp_path):
-    """A copy to work in; its model is imported anew."""
-    yield shutil.copytree(saved_project, tmp_path / "project", ignore=shutil.ignore_patterns("__pycache__"))
-    sys.modules.pop("losses", None)
+def project(saved_project, tmp_path, monkeypatch):
+    """A copy to work in, as the current folder."""
+    copied = shutil.copytree(saved_project, tmp_path / "project", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.chdir(copied)
+    yield copied
+    for name in ("losses", "leaks"):
+        sys.modules.pop(name, None)
 
 
-def refuse(path, folder=None):
+FIT = Path("out/problem/estimate.json")
+NEVER = Path("out/never/estimate.json")
+
+
+def succeed(*arguments):
+    """What a command prints."""
+    result = run(*arguments)
+    assert result.exit_code == 0, result.stderr
+    return result.stdout
+
+
+def refuse(*arguments):
+    """What a command says that ends with code 2 and prints nothing."""
+    result = run(*arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    return result.stderr
+
+
+# --- validate ---------------------------------------------------------------------------------------------------------
+
+
+def test_validate_says_what_validate_of_the_estimate_says(project):
+    """From the saved estimate alone: the log that was fitted is not even there."""
+    (project / "log.csv").unlink()
+    result = run("validate", FIT, "other.csv", "--out", "val")
+    expected = sf.Estimate.load(FIT).validate(load_problem("problem.toml", "other.csv").problem)
+    assert (result.exit_code, result.stdout) == (0, f"{expected}\n")
+    assert result.stdout.startswith("Good: the fitted parameters predict ")
+    assert (project / "val" / "validation.txt").read_text() == result.stdout
+    assert (project / "val" / "validation.png").read_bytes().startswith(b"\x89PNG")
+    assert result.stderr == "written to val\n"
+    found = json.loads(succeed("validate", FIT, "other.csv", "--json"))
+    rows = {row["name"]: row for row in found["unknowns"]}
+    assert (found["verdict"], rows["heating"]["from"], rows["tau_1"]["from"]) == ("good", "fit", "run")
+    assert rows["heating"]["value"] == sf.Estimate.load(FIT).parameters["heating"]
+    assert abs(rows["tau_1"]["value"] - 2.4) < 4 * rows["tau_1"]["standard_error"]
+    assert found["channels"][0]["name"] == "T"
+    assert found["channels"][0]["fit_percent"] == found["fit_percent"] == expected.percent
+    assert found["chi_square"] == expected.chi_square
+    assert (found["changes"], found["out"]) == ([], None)
+
+
+def test_validate_with_a_problem_file_for_a_run_that_differs(project):
+    """Another first guess, and a file of its own."""
+    text = PROBLEM.replace("log.csv", "other.csv").replace("[2.0]", "[2.5]").replace("heating = 0.4", "heating = 7.0")
+    Path("other.toml").write_text(text + LOCAL)
+    printed = succeed("validate", FIT, "other.toml", "--figures", "svg", "--out", "val")
+    row = next(line for line in printed.splitlines() if line.startswith("  heating"))
+    assert row.split()[1] == f"{sf.Estimate.load(FIT).parameters['heating']:.3f}"
+    assert sorted(path.name for path in Path("val").iterdir()) == ["validation.svg", "validation.txt"]
+
+
+def test_a_run_for_which_the_parameters_do_not_hold_is_exit_code_1(project):
+    result = run("validate", FIT, "weaker.csv")
+    assert result.exit_code == 1
+    assert result.stdout.startswith("Bad: the fitted parameters do not predict this run")
+    assert result.stderr.startswith("switchfit: the parameters do not hold for this run")
+    quiet = run("validate", FIT, "weaker.csv", "--quiet")
+    assert (quiet.exit_code, quiet.stdout, quiet.stderr) == (1, "", "")
+
+
+def test_a_model_that_has_changed_since_the_fit_is_named(project):
+    Path("room.py").write_text(MODEL + "\n# a comment\n")
+    printed = succeed("validate", FIT, "other.csv")
+    assert printed.startswith("Changed since\n  room.py has changed\n\n"), "that the log is another is no change"
+
+
+def test_a_model_that_no_longer_suits_the_saved_problem_is_named(project):
+    """As where a model is written over the one that was fitted, and both fits are then to be compared."""
+    Path("room.py").write_text(MODEL.replace('"on"', '"heating"'))
+    for said in (refuse("validate", FIT, "other.csv"), refuse("compare", FIT, FIT)):
+        assert "estimate.json cannot be built again, since room.py in " in said
+        assert "mode_sequence names the unknown mode 'on'" in said
+        assert "Put the files as they were into a folder, and name it with --folder; or fit again." in said
+    Path("before").mkdir()
+    Path("before", "room.py").write_text(MODEL)
+    for name in ("log.csv", "losses.py"):
+        shutil.copy(name, "before")
+    succeed("compare", FIT, NEVER, "--folder", "before")
+
+
+# --- compare ----------------------------------------------------------------------------------------------------------
+
+
+def test_compare_says_what_compare_of_the_estimates_says(project):
+    result = run("compare", FIT, NEVER, "--out", "cmp")
+    names = ("problem", "never")
+    problems = [load_problem(f"{name}.toml").problem for name in names]
+    fits = [sf.Estimate.load(path, problem=each) for path, each in zip((FIT, NEVER), problems, strict=True)]
+    expected = sf.compare(fits, names=names)
+    assert (result.exit_code, result.stdout) == (0, f"{expected}\n")
+    assert result.stdout.startswith("problem has the smallest BIC")
+    assert (project / "cmp" / "comparison.txt").read_text() == result.stdout
+    assert (project / "cmp" / "comparison.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(succeed("compare", NEVER, FIT, "--json"))  # the best model comes first
+    assert [(row["name"], row["bic"]) for row in found["models"]] == list(zip(names, expected.bic, strict=True))
+    assert (found["best"], found["values"]) == ("problem", 23)
+
+
+def test_a_fit_that_did_not_converge_is_exit_code_1(project):
+    run("fit", "problem.toml", "--out", "stopped", "--no-figures", "--max-iterations", 1)
+    result = run("compare", NEVER, "stopped/estimate.json")
+    assert result.exit_code == 1
+    assert "Not converged: stopped." in result.stdout
+    expected = "switchfit: not converged: stopped; fit these again, their likelihoods may be too small.\n"
+    assert result.stderr == expected
+
+
+# --- what cannot be read ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("validate", "nowhere.json", "other.csv"), "file 'nowhere.json' does not exist."),
+        (("compare", "out", FIT), "'out' is a directory."),
+        (("validate", "problem.toml", "other.csv"), "problem.toml is not a saved estimate"),
+        (("validate", FIT, "nowhere.csv"), "nowhere.csv; check the name and the folder."),
+        (("validate", FIT, "nowhere.toml"), "There is no problem file nowhere.toml"),
+        (("validate", FIT), "Missing argument 'LOG|PROBLEM.toml'"),
+        (("validate", "heater.json", "other.csv"), "in the script that fitted it: estimate.validate(...), sf.compare"),
+        (("compare", FIT), "compare needs two estimates or more; got 1."),
+    ],
+)
+def test_what_cannot_be_read(project, arguments, said):
+    assert said in refuse(*arguments)
+
+
+def refuse_to_build(path, folder=None):
     """The message of a problem that cannot be built again."""
     with pytest.raises(InputError) as error:
         build_again(path, folder)
@@ -73,9 +211,9 @@ def build_again(path, folder=None):
 
 
 def test_the_file_holds_the_problem_hashes_and_versions(project):
-    content = json.loads((project / "out" / "estimate.json").read_text())["provenance"]
+    content = json.loads(FIT.read_text())["provenance"]
     assert content["text"] == PROBLEM + LOCAL
-    assert (content["problem_file"], content["folder"], content["log"]) == ("problem.toml", "..", "")
+    assert (content["problem_file"], content["folder"], content["log"]) == ("problem.toml", "../..", "")
     digests = {digest["name"]: digest["sha256"] for digest in content["files"]}
     assert digests == {
         name: hashlib.sha256((project / name).read_bytes()).hexdigest() for name in ("room.py", "losses.py", "log.csv")
@@ -83,21 +221,21 @@ def test_the_file_holds_the_problem_hashes_and_versions(project):
     assert content["options"] == {"strategy": "local"}
     assert content["versions"]["switchfit"] == sf.__version__
     assert content["versions"]["Python"].count(".") == 2
-    found = sf.Estimate.load(project / "out" / "estimate.json")
+    found = sf.Estimate.load(FIT)
     values = found.comparisons[0][0]
     raw = np.column_stack([values.times, values.measured]).astype("<f8").tobytes()
     assert [digest.sha256 for digest in found.provenance.data] == [hashlib.sha256(raw).hexdigest()]
 
 
-def test_an_estimate_of_python_keeps_the_hash_of_its_data_and_versions(tmp_path):
-    fit = sf.estimate(heater_problem(), strategy="local")
-    fit.save(tmp_path / "fit.json")
-    found = sf.Estimate.load(tmp_path / "fit.json").provenance
+def test_an_estimate_of_python_keeps_the_hash_of_its_data_and_versions(project):
+    fit = sf.Estimate.load("heater.json")
+    found = fit.provenance
     assert (found.problem_file, found.text, found.files) == ("", "", ())
     assert [digest.name for digest in found.data] == ["thermometer"]
     assert found == describe_python_problem(fit)
-    said = refuse(tmp_path / "fit.json")
-    assert "does not have its problem, which was built in Python: functions are not saved" in said
+    assert "does not have its problem, which was built in Python: functions are not saved" in refuse_to_build(
+        "heater.json"
+    )
 
 
 def test_an_estimate_of_python_can_say_which_problem_file_it_is_of(project, tmp_path):
@@ -116,63 +254,57 @@ def test_an_estimate_of_python_can_say_which_problem_file_it_is_of(project, tmp_
 # --- the problem again ------------------------------------------------------------------------------------------------
 
 
-def test_the_folder_has_moved(project, tmp_path):
-    build_again(project / "out" / "estimate.json")
-    project.rename(tmp_path / "moved")
-    (tmp_path / "moved" / "problem.toml").unlink()  # the text that was saved is enough
-    build_again(tmp_path / "moved" / "out" / "estimate.json")
-    for other in (log_of(3.5), log_of(3.2).replace("0.25;", "0.3;")):  # other values, another time
-        (tmp_path / "moved" / "log.csv").write_text(other)
-        said = refuse(tmp_path / "moved" / "out" / "estimate.json")  # read where it is now, not where it was
-        assert f"was fitted to other values than the files in {tmp_path / 'moved'} have now: fit them again." in said
+def test_the_folder_has_moved(project, tmp_path, monkeypatch):
+    build_again(FIT)
+    monkeypatch.chdir(tmp_path)
+    project.rename("moved")
+    Path("moved", "problem.toml").unlink()  # the text that was saved is enough
+    build_again("moved" / FIT)
+    Path("moved", "log.csv").write_text(log_of(3.5))  # read where it is now, not where it was
+    said = f"was fitted to other values than the files in {tmp_path / 'moved'} have now: fit them again."
+    assert said in refuse_to_build("moved" / FIT)
 
 
 def test_a_log_that_was_given_on_the_command_line(project):
     (project / "logs").mkdir()
     for name, switch in (("monday", 3.0), ("tuesday", 2.1)):
         (project / "logs" / f"{name}.csv").write_text(log_of(switch))
-    logs, out = project / "logs", project / "out"
-    result = run("fit", logs, "--problem", project / "problem.toml", "--out", out, "--no-figures", "--hessian", "exact")
+    result = run("fit", "logs", "--problem", "problem.toml", "--out", "many", "--no-figures", "--hessian", "exact")
     assert result.exit_code == 0, result.stderr
-    content = json.loads((out / "tuesday" / "estimate.json").read_text())["provenance"]
+    saved = Path("many", "tuesday", "estimate.json")
+    content = json.loads(saved.read_text())["provenance"]
     assert (content["log"], content["folder"]) == ("logs/tuesday.csv", "../..")
     assert "log.csv" not in [digest["name"] for digest in content["files"]]
     assert content["options"] == {"strategy": "local", "hessian": "exact"}
-    build_again(out / "tuesday" / "estimate.json")
+    build_again(saved)
 
 
 def test_changes_of_the_model_are_listed(project):
     """Also those of a file that only the model's file imports; not those of data, whose values are compared."""
-    path = project / "out" / "estimate.json"
-    given = sf.Estimate.load(path).provenance
-    (project / "log.csv").write_text(log_of(3.2) + "\n")
-    assert list_changed_models(given, build_again(path)) == []
-    size = (project / "losses.py").stat().st_size
-    (project / "losses.py").write_text("LOSS = 0.06  # more\n")
-    loaded = load_problem(project / "problem.toml")
-    (change,) = list_changed_models(given, loaded)
-    assert change.startswith(f"losses.py has changed: {size} bytes with SHA-256 ")
-    assert change.endswith(f"..., now {size + 8} bytes")
+    given = sf.Estimate.load(FIT).provenance
+    with (project / "log.csv").open("a") as log:
+        log.write("\n")
+    assert list_changed_models(given, build_again(FIT)) == []
+    (project / "losses.py").write_text("LOSS = 0.06\n")
+    assert list_changed_models(given, load_problem(project / "problem.toml")) == ["losses.py has changed"]
     (project / "losses.py").rename(project / "leaks.py")
     (project / "room.py").write_text((project / "room.py").read_text().replace("from losses", "from leaks"))
     changes = list_changed_models(given, load_problem(project / "problem.toml"))
     assert changes[1:] == ["losses.py is no longer there", "leaks.py is new"]
-    sys.modules.pop("leaks", None)
 
 
 # --- what cannot be built again -------------------------------------------------------------------------------------
 
 
 def test_files_that_are_not_there(project, tmp_path):
-    path = tmp_path / "sent" / "estimate.json"
-    path.parent.mkdir()
-    (project / "out" / "estimate.json").rename(path)
-    assert (
-        f"{path} was made from room.py, which is not in {tmp_path}: put it there, or name the folder that it is in with"
-    ) in refuse(path)
+    path = tmp_path / "sent" / "problem" / "estimate.json"
+    path.parent.mkdir(parents=True)
+    FIT.rename(path)
+    said = f"{path} cannot be built again, since room.py, losses.py, log.csv in {tmp_path} is missing or has changed: "
+    assert said in refuse_to_build(path)
     build_again(path, project)
     (project / "log.csv").unlink()
-    assert f"{path} was made from log.csv, which is not in {project}" in refuse(path, project)
+    assert f"{path} cannot be built again, since log.csv in {project} is missing" in refuse_to_build(path, project)
 
 
 DAMAGES = [
@@ -185,9 +317,8 @@ DAMAGES = [
 
 @pytest.mark.parametrize(("edit", "message"), DAMAGES)
 def test_provenance_that_is_damaged(project, edit, message):
-    path = project / "out" / "estimate.json"
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = json.loads(FIT.read_text())
     edit(content["provenance"])
-    path.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(ValueError, match=re.escape(f"{path} is damaged: {message}")):
-        sf.Estimate.load(path)
+    FIT.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=re.escape(f"{FIT} is damaged: {message}")):
+        sf.Estimate.load(FIT)

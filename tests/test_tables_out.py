@@ -439,28 +439,18 @@ def test_unknowns_are_all_there_to_the_last_digit(estimate):
     assert rows[0]["transition"] == "on -> off"
 
 
-def test_runs_have_their_own_unknowns_under_the_names_of_the_model(estimate):
+def test_runs_have_how_well_they_fit(estimate):
     rows = read(write_runs(estimate))
     assert [row["run"] for row in rows] == [f"room{e}" for e in range(5)]
-    place = estimate.theta_names.index
-    for e, row in enumerate(rows):
-        assert float(row["power (K/h)"]) == estimate.theta[place(f"power_{e}")]
-        assert float(row["power (K/h) std. error"]) == estimate.corrected_standard_errors[place(f"power_{e}")]
-        if e != 2:
-            assert float(row["tau_1 (h)"]) == estimate.theta[place(f"room{e}.tau_1")]
+    for row, (comparison,) in zip(rows, estimate.comparisons, strict=True):
         assert (row["modes"], row["time unit"], row["values"]) == ("on -> off", "h", "24")
-        residuals = estimate.comparisons[e][0].residuals
+        residuals, measured = comparison.residuals, comparison.measured
         assert float(row["chi2"]) == pytest.approx(np.sum((residuals / 0.02) ** 2))
-        measured = estimate.comparisons[e][0].measured
-        assert float(row["explained"]) == pytest.approx(
-            1 - np.sum(residuals**2) / np.sum((measured - measured.mean()) ** 2)
-        )
-    assert rows[2]["tau_1 (h)"] == ""
-    assert "k" not in rows[0]  # which all share
+        total = np.sum((measured - measured.mean()) ** 2)
+        assert float(row["explained"]) == pytest.approx(1 - np.sum(residuals**2) / total)
     assert sum(float(row["chi2"]) for row in rows) == pytest.approx(2 * estimate.cost)
     flags = [row["flags"] for row in rows]
-    assert "residuals of room3 T correlated; chi2 of room3 T too large" in flags[3]
-    assert "power (K/h) at upper bound" in flags[4]
+    assert flags[3] == "residuals of room3 T correlated; chi2 of room3 T too large"
     assert all("room3" not in flags[e] for e in (0, 1, 2, 4))
 
 

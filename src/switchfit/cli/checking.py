@@ -88,11 +88,7 @@ def _check_files(problem: Path, full: bool) -> None:
 OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
 Times = Annotated[
     str,
-    option(
-        metavar="STEP",
-        help="A step, such as 0.1: a grid from t0 to tf; or 'samples': the times of the data. Default: the "
-        "integrator's steps.",
-    ),
+    option(metavar="STEP", help="A step, such as 0.1, or 'samples': times of the data. Default: the integrator's."),
 ]
 
 
@@ -152,15 +148,11 @@ def _write_table(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
 
 
 OutputFolder = Annotated[
-    Path | None,
-    output_folder("design.txt, design.json, design.png, and the designed input and sample times as CSV"),
+    Path | None, output_folder("design.txt, design.json, design.png, and the designed input and sample times as CSV")
 ]
 Criterion = Annotated[
     Literal["D", "A", "E"] | None,
-    option(
-        help="What of the covariance is made small: D, its determinant, the default; A, its trace; E, its largest "
-        "eigenvalue."
-    ),
+    option(help="What is made small of the covariance: D, the determinant; A, the trace; E, the largest eigenvalue."),
 ]
 Samples = Annotated[int | None, option(metavar="COUNT", help="Most samples of each sensor. Default: all of the file.")]
 
@@ -216,4 +208,3 @@ def _write(plan: Any, folder: Path, figures: str) -> None:
         terminal.write_file(folder / "input.csv", write_rows(zip_rows({"t": knots.times, **plan.inputs})))
     samples = [{"sensor": name, "t": time} for name, times in plan.sample_times.items() for time in times]
     terminal.write_file(folder / "samples.csv", write_rows(samples, ("sensor", "t")))
-    terminal.print_note(f"written to {folder}")

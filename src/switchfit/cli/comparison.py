@@ -13,12 +13,12 @@ import typer
 from switchfit.cli import terminal
 from switchfit.cli.terminal import argument, option, output_folder
 
-OtherRun = Annotated[
-    Path,
-    argument("LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file."),
-]
+OtherRun = Annotated[Path, argument("LOG|PROBLEM.toml", "A log like the one that was fitted, or a problem file.")]
 ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
-SavedPaths = Annotated[list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.")]
+SavedPaths = Annotated[
+    list[Path],
+    argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", exists=True, dir_okay=False),
+]
 ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
 
 
@@ -41,9 +41,6 @@ def validate(
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.user_files import check_saved
-
-        check_saved(saved)
         from switchfit.estimation.estimator import Estimate
         from switchfit.io.command_line import summarize_validation
         from switchfit.io.saved_problem import list_changed_models, load_other_run
@@ -79,13 +76,7 @@ def compare(
     Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
     fits to different data.
     """
-    if len(saved) < 2:
-        terminal.fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.")
     with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.user_files import check_saved
-
-        for path in saved:
-            check_saved(path)
         import switchfit as sf
         from switchfit.io.command_line import summarize_comparison
         from switchfit.io.logs import name_files
@@ -114,15 +105,13 @@ def _show(found: Any, summary: dict[str, Any], folder: Path | None, name: str, f
     terminal.print_text(found)
     if folder is not None:
         terminal.write_result(found, folder / name, figures)
-        terminal.print_note(f"written to {folder}")
     terminal.print_json(summary)
 
 
 PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")]
 Part = Annotated[
-    str | None,
-    option(metavar="NAME", help="One part: lti, magic-formula, convergence, noise, trials or horizon."),
+    str | None, option(metavar="NAME", help="One part: lti, magic-formula, convergence, noise, trials or horizon.")
 ]
 
 
@@ -143,8 +132,7 @@ def paper(
 
         terminal.make_folder(out)
         try:
-            with terminal.explain_write_errors(out):
-                run(out, quick=quick, only=only, say=terminal.print_note)
+            run(out, quick=quick, only=only, say=terminal.print_note)
         except KeyboardInterrupt:
             terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
         terminal.print_text((out / TABLE).read_text(encoding="utf-8"))

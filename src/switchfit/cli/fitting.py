@@ -19,41 +19,28 @@ if TYPE_CHECKING:
 
 
 Problems = Annotated[
-    list[Path],
-    argument("PROBLEM.toml", "Problem file; with --problem, logs, each of which is fitted by itself."),
+    list[Path], argument("PROBLEM.toml", "Problem file; with --problem, logs, each of which is fitted by itself.")
 ]
 OutputFolder = Annotated[
-    Path | None,
-    output_folder(
-        "report.html, report.txt, estimate.json and fit.png; for runs.csv and unknowns.csv where there are many"
-    ),
+    Path | None, output_folder("report.html, report.txt, estimate.json, fit.png, and tables of many runs or unknowns")
 ]
 ProblemForLogs = Annotated[
-    Path | None,
-    option("--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named."),
+    Path | None, option("--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named.")
 ]
 LogTable = Annotated[
-    Path | None,
-    option(metavar="FILE.csv", help="With --problem: a table with a row for each log; FILE.parquet too."),
+    Path | None, option(metavar="FILE.csv", help="With --problem: a table with a row for each log; FILE.parquet too.")
 ]
 Strategy = Annotated[
     Literal["local", "auto", "thorough"] | None,
-    option(
-        help="local: one fit from the guess; auto, the default: more if the verdict is not good; thorough: all "
-        "strategies."
-    ),
+    option(help="local: one fit; auto, the default: more if the verdict is not good; thorough: all strategies."),
 ]
 HessianKind = Annotated[
     Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
     option(help="Quadratic term of the optimizer. Default: auto, the exact Hessian in a trust region."),
 ]
 MaxIterations = Annotated[int | None, option(metavar="COUNT", help="Most iterations of a fit. Default: 200.")]
-NoFigures = Annotated[
-    bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
-]
-WithCertificate = Annotated[
-    bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
-]
+NoFigures = Annotated[bool, typer.Option("--no-figures", help="Write neither fit.png (.pdf, .svg) nor report.html.")]
+WithCertificate = Annotated[bool, typer.Option("--certificate", help="Print the checks, with the paper's equations.")]
 Full = Annotated[bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")]
 
 
@@ -89,15 +76,11 @@ def fit(
     overrides = terminal.select_given(strategy=strategy, hessian=hessian, max_iterations=max_iterations)
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
-    if model is not None:
-        with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-            code = _fit_logs(problem, model, overrides, output, table)
-        if code != terminal.CONVERGED:
-            raise typer.Exit(code)
-        return
-    if len(problem) != 1 or table is not None:
-        terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        if model is not None:
+            raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
+        if len(problem) != 1 or table is not None:
+            terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
         from switchfit.io.problem_file import load_problem
 
         loaded = load_problem(problem[0])
@@ -187,8 +170,7 @@ def write_estimate(
     for name, path in tables.items():
         terminal.write_file(path, TABLES[name](estimate))
     provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
-    with terminal.explain_write_errors(folder / "estimate.json") as path:
-        _save(estimate, path, provenance, complete=output.certificate)
+    _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:
         terminal.write_figure(estimate, folder / f"fit.{output.figures}")
         _write_page(estimate, provenance, folder / "report.html")
@@ -213,7 +195,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         refused = {"verdict": "refused", "message": error}
         shown = refused if estimate is None else summarize_estimate(estimate) | {"out": folder}
         fitted.append({"log": str(path)} | shown)
-        if loaded is not None and estimate is not None and folder is not None:
+        if loaded is not None and folder is not None:
             terminal.make_folder(folder)
             write_estimate(estimate, loaded, loaded.options | overrides, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
@@ -228,18 +210,16 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
 
 
 def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:
-    """Return the problem of a log and its estimate; None in place of each that there is not, and what is wrong."""
+    """Return the problem of a log and its estimate, or None for both, and what is wrong."""
     from switchfit.io.problem_file import load_problem
     from switchfit.io.user_files import describe_error
+    from switchfit.runtime.errors import InputError
 
     try:
         loaded = load_problem(model, log)
-    except (ValueError, OSError) as error:
-        return None, None, str(error)
-    try:
         return loaded, estimate_problem(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
     except Exception as error:
-        return loaded, None, describe_error(error)
+        return None, None, str(error) if isinstance(error, InputError) else describe_error(error)
 
 
 def _import_figures() -> None:

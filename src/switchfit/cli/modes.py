@@ -21,10 +21,7 @@ OutputFolder = Annotated[
 MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most switches of a run. Default: 8.")]
 Criterion = Annotated[
     Literal["bic", "mbic", "aicc", "cost"],
-    option(
-        help="What decides on the number of switches. bic, the default: log n for a switch; mbic: twice as much; "
-        "cost: J and --switch-cost for a switch; cv: leaves each run out."
-    ),
+    option(help="Price of a switch. bic, the default: log n; mbic: twice as much; cost: --switch-cost."),
 ]
 SwitchCost = Annotated[
     float | None, option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost.")
@@ -109,5 +106,4 @@ def _write(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path
         else:
             best = folder / "best.toml"
             terminal.write_file(best, text)
-    terminal.print_note(f"written to {folder}")
     return best

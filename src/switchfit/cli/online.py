@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,7 +18,6 @@ from switchfit.cli.terminal import option, output_folder
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
     from switchfit.online.estimator import OnlineEstimator
-    from switchfit.online.log import OnlineLog
     from switchfit.online.state import Now
     from switchfit.problem.experiment import Experiment
     from switchfit.report.html.live import LivePage
@@ -30,8 +29,7 @@ REFUSED = (ValueError, TypeError, OverflowError)
 """Errors of a sample that is not taken; those after it are."""
 
 Replayed = Annotated[
-    Path | None,
-    typer.Option("--replay", metavar="LOG", help="Log to feed. Default: that of the problem file."),
+    Path | None, typer.Option("--replay", metavar="LOG", help="Log to feed. Default: that of the problem file.")
 ]
 Stdin = Annotated[
     bool, typer.Option("--stdin", help='Read samples from stdin, a line {"t": 0.1, "y": [1.2], "u": [0.3]} each.')
@@ -42,24 +40,20 @@ Window = Annotated[
 ]
 FalseAlarms = Annotated[
     float | None,
-    option(metavar="RATE", help="False alarms per time unit: finds the threshold by simulation, for a minute or so."),
+    option(metavar="RATE", help="False alarms per time unit: finds the threshold by simulation, in a minute."),
 ]
 Threshold = Annotated[float | None, option(metavar="NUMBER", help="Statistic at which to alarm. Default: 12.")]
-Budget = Annotated[
-    float | None,
-    option(metavar="SECONDS", help="What an update may take, at most. Default: no limit."),
-]
+Budget = Annotated[float | None, option(metavar="SECONDS", help="Most that an update may take. Default: no limit.")]
 MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most changes in the window, or in all. Default: 8.")]
 StateFile = Annotated[
     Path | None, option("--state", metavar="FILE", help="Go on from this file, if it exists; save to it at the end.")
 ]
 JournalFile = Annotated[
-    Path | None,
-    option("--journal", metavar="FILE", help="Write each sample to this file first, so that a crash loses none."),
+    Path | None, option("--journal", metavar="FILE", help="Write each sample to this file first: a crash loses none.")
 ]
 Live = Annotated[
     int | None,
-    option("--live", metavar="PORT", help="Show a page at http://127.0.0.1:PORT until Ctrl-C; 0 takes a free port."),
+    option("--live", metavar="PORT", help="Show a page at http://127.0.0.1:PORT until Ctrl-C; 0: a free port."),
 ]
 
 
@@ -98,6 +92,8 @@ def online(
         loaded = load_problem(problem, replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
+        from switchfit.modes.library import build_library
+        from switchfit.online.log import build_log
         from switchfit.problem.data import Measurements
         from switchfit.problem.structure import select_kind
         from switchfit.runtime.presentation import format_count
@@ -108,38 +104,27 @@ def online(
         sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
         room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
         settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
-        settings |= {"max_switches": max_switches, "budget": budget, "capacity": room} | _read_library(loaded)
+        settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
+        library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
+        settings |= {"successions": library.successions, "min_duration": library.durations}
         estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
         with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
-            course = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
+            recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
             if estimator.now is None:
                 terminal.fail("there were no samples.")
             if state is not None:
                 estimator.save(state)
-            if out is not None and course.log is not None:
-                _write(course.log, out, figures)
-            if page is not None and not course.interrupted:
+            if out is not None and recorded:
+                terminal.write_result(build_log(loaded.problem, recorded), out / "online", figures)
+            if page is not None and not interrupted:
                 with contextlib.suppress(terminal.CtrlC):
                     terminal.print_note("the samples have ended; Ctrl-C ends the page")
                     page.wait()
         terminal.fail_for_refused(loaded.issues)
-        if course.refused:
-            terminal.fail(f"{format_count(len(course.refused), 'line')} of stdin could not be used.")
+        if refused:
+            terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
         if estimator.now.status.name == "LOST":
             terminal.end_unreliable(f"{estimator.now.status.value}.")
-
-
-def _read_library(loaded: ProblemFile) -> dict[str, Any]:
-    """Return successions and durations of the [library] of a problem file; modes that it leaves out never follow."""
-    given = loaded.library
-    found: dict[str, Any] = {key: given[key] for key in ("successions", "min_duration") if key in given}
-    if "library" in given:
-        modes, successions = list(given["library"]), given.get("successions")
-        after = {mode: modes if successions is None else successions.get(mode, ()) for mode in modes}
-        found["successions"] = {
-            mode: [each for each in names if each in modes and each != mode] for mode, names in after.items()
-        }
-    return found
 
 
 def _start(
@@ -166,30 +151,14 @@ def _start(
     return estimator
 
 
-class Course(NamedTuple):
-    """How a run went.
-
-    Attributes
-    ----------
-    log : OnlineLog or None
-        What was said, if it was recorded and there was any.
-    refused : list of int
-        Numbers of the lines that could not be used.
-    interrupted : bool
-        By Ctrl-C.
-    """
-
-    log: OnlineLog | None
-    refused: list[int]
-    interrupted: bool
-
-
 def _run(
     loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, page: LivePage | None, records: bool
-) -> Course:
-    """Feed all samples, until Ctrl-C, and print what the estimator says."""
+) -> tuple[list[Now], int, bool]:
+    """Feed all samples, until Ctrl-C, and print what the estimator says.
+
+    Return what it said, if that is recorded, how many lines it refused, and whether it was interrupted.
+    """
     from switchfit.io.command_line import summarize_now
-    from switchfit.online.log import build_log
 
     recorded: list[Now] = []
     refused: list[int] = []
@@ -206,7 +175,7 @@ def _run(
                 recorded.append(now)
             if stopped():
                 break
-    return Course(build_log(loaded.problem, recorded) if recorded else None, refused, stopped())
+    return recorded, len(refused), stopped()
 
 
 def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
@@ -259,8 +228,3 @@ def _serve(loaded: ProblemFile, port: int) -> LivePage:
     page = LivePage(loaded.path.name, loaded.problem, port)
     terminal.print_note(f"live at {page.address}")
     return page
-
-
-def _write(log: OnlineLog, folder: Path, figures: str) -> None:
-    terminal.write_result(log, folder / "online", figures)
-    terminal.print_note(f"written to {folder}")

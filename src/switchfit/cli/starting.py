@@ -13,12 +13,7 @@ from switchfit.io import find_examples
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
 FirstLog = Annotated[
-    Path | None,
-    option(
-        "--from",
-        metavar="LOG",
-        help="Log to begin with: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP. Default: an example.",
-    ),
+    Path | None, option("--from", metavar="LOG", help="Log to begin with, of any format. Default: an example.")
 ]
 
 
@@ -60,7 +55,9 @@ def _list_examples() -> dict[str, Path]:
     return {path.stem: path for path in found if path.is_dir() or path.suffix == ".py"}
 
 
-ExampleName = Annotated[str | None, argument("NAME", "Example to copy. Left out, all are listed.", _complete_examples)]
+ExampleName = Annotated[
+    str | None, argument("NAME", "Example to copy. Left out, all are listed.", autocompletion=_complete_examples)
+]
 ExampleFolder = Annotated[Path | None, argument("FOLDER", "Folder to create. Default: one of the name.")]
 
 

@@ -47,20 +47,13 @@ _TEXT = Voice()
 _voice: ContextVar[Voice] = ContextVar("what is printed", default=_TEXT)
 
 
-class _NoteHandler(logging.Handler):
-    """Prints the library's log as notes."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print_note(self.format(record))
-
-
 @contextlib.contextmanager
 def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
     """Return a context in which the options --json, --quiet and --verbose hold."""
     if quiet and verbose:
         fail("--quiet and --verbose contradict each other; give one of them.")
     token = _voice.set(Voice(text=not (json or quiet), json=json, notes=not quiet, log=verbose))
-    logger, handler = logging.getLogger("switchfit"), _NoteHandler()
+    logger, handler = logging.getLogger("switchfit"), logging.StreamHandler()
     level = logger.level
     if verbose:
         logger.addHandler(handler)
@@ -160,6 +153,8 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
 
     if users and not isinstance(error, InputError):
         fail(f"{describe_error(error)}. (--debug shows the full traceback.)")
+    if isinstance(error, OSError) and error.filename is not None:
+        fail(f"{error.filename} cannot be read or written: {error.strerror}.")
     if isinstance(error, (ValueError, OSError)):
         fail(str(error))
     if isinstance(error, MemoryError):
@@ -236,35 +231,15 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
 
 def make_folder(folder: Path | None) -> None:
     """Create a folder, with those above it, unless it exists or none is asked for."""
-    from switchfit.runtime.errors import InputError
-
-    if folder is None:
-        return
-    try:
+    if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"the folder {folder} cannot be created: {error.strerror}; name another with --out."
-        ) from error
-
-
-@contextlib.contextmanager
-def explain_write_errors(path: Path) -> Iterator[Path]:
-    """Return a context that turns an OSError into an InputError with the name of the file and the reason."""
-    from switchfit.runtime.errors import InputError
-
-    try:
-        yield path
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}; name another with --out.") from error
 
 
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file atomically."""
     from switchfit.runtime.files import write_atomically
 
-    with explain_write_errors(path):
-        write_atomically(content, path)
+    write_atomically(content, path)
 
 
 DOTS = 150
@@ -276,9 +251,9 @@ def option(*names: str, help: str, metavar: str | None = None) -> Any:
     return typer.Option(*names, metavar=metavar, help=help, show_default=False)
 
 
-def argument(metavar: str, help: str, complete: Callable[[str], list[str]] | None = None) -> Any:
+def argument(metavar: str, help: str, **more: Any) -> Any:
     """Return a positional argument."""
-    return typer.Argument(metavar=metavar, help=help, show_default=False, autocompletion=complete)
+    return typer.Argument(metavar=metavar, help=help, show_default=False, **more)
 
 
 def output_folder(content: str) -> Any:
@@ -287,7 +262,9 @@ def output_folder(content: str) -> Any:
 
 
 ProblemPath = Annotated[Path, argument("PROBLEM.toml", "Problem file.")]
-SavedPath = Annotated[Path, argument("ESTIMATE.json", "Written by switchfit fit --out.")]
+SavedPath = Annotated[
+    Path, argument("ESTIMATE.json", "Written by switchfit fit --out.", exists=True, dir_okay=False, readable=True)
+]
 Folder = Annotated[
     Path | None,
     option(metavar="DIR", help="Where data and models are. Default: where they were, seen from ESTIMATE.json."),
@@ -315,14 +292,14 @@ def print_list(title: str, entries: Sequence[object]) -> None:
 def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) -> None:
     """Write the text of a result, its figure if `figures` names a format, and the result itself if it is to be saved.
 
-    The files differ in their endings.
+    The files differ in their endings. Say where they are.
     """
     write_file(stem.with_suffix(".txt"), f"{result}\n")
     if saved:
-        with explain_write_errors(stem.with_suffix(".json")) as path:
-            result.save(path)
+        result.save(stem.with_suffix(".json"))
     if figures:
         write_figure(result, stem.with_suffix(f".{figures}"))
+    print_note(f"written to {stem.parent}")
 
 
 def write_figure(result: Any, path: Path) -> None:

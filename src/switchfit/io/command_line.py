@@ -28,10 +28,13 @@ from switchfit.report.formats import (
     add_dates,
     describe_origin,
     format_iso,
+    format_span,
     format_table,
     format_time,
+    label_quantity,
     list_dated,
     list_jumps,
+    suffix_time,
 )
 from switchfit.report.sentences import write_reason, write_step
 from switchfit.runtime.errors import InputError
@@ -74,9 +77,6 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["sa
     return np.minimum(t0 + step * np.arange(count + 1), tf)
 
 
-KEYS = ("t", "y", "u")
-"""Of a sample; y and u may be missing."""
-
 EXAMPLE = '{"t": 0.1, "y": [1.2, 0.3]} or {"t": 0.1, "y": {"X": 1.2}, "u": {"force": 4.0}}'
 
 
@@ -96,11 +96,12 @@ def read_sample(line: bytes, run: Experiment) -> tuple[Any, Any, Any]:
     """
     try:
         given = json.loads(line)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"a sample is one line of JSON, such as {EXAMPLE}; got {_quote(line)} ({error}).") from error
-    if not isinstance(given, dict) or "t" not in given or not set(given) <= set(KEYS):
-        raise ValueError(f"a sample has the keys t, y and u, as in {EXAMPLE}; got {_quote(line)}.")
-    t, y, u = (given.get(key) for key in KEYS)
+    except (ValueError, RecursionError):
+        given = None
+    if not isinstance(given, dict) or "t" not in given or not set(given) <= {"t", "y", "u"}:
+        got = shorten(line.decode(errors="replace").strip())
+        raise ValueError(f"a sample is one line of JSON with the keys t, y and u, such as {EXAMPLE}; got {got}.")
+    t, y, u = (given.get(key) for key in "tyu")
     if isinstance(t, str) and run.origin is not None:
         t = float(run.origin.to_numbers(as_date(t, "t"), run.time_unit, "t"))
     return t, _fill(y), u
@@ -111,10 +112,6 @@ def _fill(y: Any) -> Any:
     if isinstance(y, dict):
         return {name: np.nan if value is None else value for name, value in y.items()}
     return [np.nan if value is None else value for value in y] if isinstance(y, list) else y
-
-
-def _quote(line: bytes) -> str:
-    return shorten(line.decode(errors="replace").strip())
 
 
 MOST_EXPERIMENTS = 3
@@ -205,8 +202,7 @@ def _describe_method(structure: Structure) -> str:
 
 
 def _describe_experiment(experiment: Experiment) -> list[str]:
-    step_unit = unit_suffix(experiment.time_unit)
-    unit = step_unit if experiment.origin is None else ""
+    step_unit, unit = unit_suffix(experiment.time_unit), suffix_time(experiment)
     ends = experiment.ends_of_modes(experiment.initial_times)
     show = partial(format_time, run=experiment)
     times = ", ".join(map(show, ends[1:-1]))
@@ -225,14 +221,14 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
             missing = item.values.size - item.count
             lines.append(
                 f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}, "
-                f"{show(item.times[0])} to {show(item.times[-1])}{unit}, typically {step:.4g}{step_unit} apart, "
+                f"{format_span(item.times[0], item.times[-1], experiment)}, typically {step:.4g}{step_unit} apart, "
                 f"{missing} values missing{_describe_sensor(item, step_unit)}"
             )
         elif isinstance(item, ReferenceSignal):
             knots = item.signal.knots
             names = _join_channel_names(item.names, item.units, item.signal.channels)
             lines.append(
-                f"reference signal of {names}, {show(knots[0])} to {show(knots[-1])}{unit}, {len(knots)} knots"
+                f"reference signal of {names}, {format_span(knots[0], knots[-1], experiment)}, {len(knots)} knots"
             )
         else:
             lines.append(type(item).__name__)
@@ -255,9 +251,16 @@ def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None
     """Return names with their units, or the number of channels where they have no names."""
     if names is None:
         return f"{channels} channels"
-    return ", ".join(
-        f"{name} ({unit})" if unit else name for name, unit in zip(names, units or ("",) * channels, strict=True)
-    )
+    return ", ".join(map(label_quantity, names, units or ("",) * channels))
+
+
+KEYS = {
+    "unknown": "name",
+    "std_error": "standard_error",
+    "naive_std_error": "naive_standard_error",
+    "guess": "first_guess",
+}
+"""What columns of the table of unknowns are called in JSON, where it is another name."""
 
 
 def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
@@ -270,9 +273,6 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
     ----------
     estimate : Estimate
     """
-    held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
-    held |= dict.fromkeys((*estimate.unread, *estimate.absent), "not read")
-    held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
     return {
         **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
@@ -281,7 +281,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
-        "unknowns": [row | {"held": held.get(row["name"])} for row in list_unknowns(estimate)],
+        "unknowns": [{KEYS.get(name, name): cell for name, cell in row.items()} for row in list_unknowns(estimate)],
         "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
         "runs": [
             {
@@ -462,7 +462,7 @@ def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:
-    """Return the unknowns of a problem, the steps of the integrator, and what was checked.
+    """Return the unknowns of a problem, and what was checked.
 
     Parameters
     ----------
@@ -470,31 +470,16 @@ def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: I
     derivatives : DerivativeCheck
     found : Identifiability
     """
-    problem = evaluator.problem
-    names, structures = problem.run_names, evaluator.structures
-    runs = zip(names, problem.experiments, evaluator.meshes, structures, strict=True)
-    unknowns = problem.unknowns
+    problem, unknowns = evaluator.problem, evaluator.problem.unknowns
     columns = {"name": unknowns.names, "unit": unknowns.units, "first_guess": unknowns.initial}
     return {
         "unknowns": zip_rows(columns | _pick(unknowns, "lower", "upper")),
-        "runs": [
-            {
-                "name": name,
-                "modes": list(run.mode_sequence),
-                "implicit_modes": structure.list_implicit_modes(),
-                "t0": run.t0,
-                "tf": run.end,
-                "steps": mesh.cells,
-            }
-            for name, run, mesh, structure in runs
-        ],
+        "runs": problem.run_names,
+        "steps": [mesh.cells for mesh in evaluator.meshes],
         "engine": asdict(evaluator.engine),
         "derivatives": {
             "orders": derivatives.observed_orders,
             **_pick(derivatives, "passed", "gradient_gap", "hessian_gap"),
         },
-        "identifiability": {
-            "without_effect": found.without,
-            **_pick(found, "undetermined", "condition_number"),
-        },
+        "identifiability": {"without_effect": found.without, **_pick(found, "undetermined", "condition_number")},
     }

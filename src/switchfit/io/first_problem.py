@@ -97,9 +97,6 @@ LARGEST_COPY = 20_000_000
 MOST_CHANNELS = 3
 """Channels that the first model has; the others are named in a comment."""
 
-MOST_POINTS = 4000
-"""Number of samples from which first guesses are computed."""
-
 FEWEST_SAMPLES = 8
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -117,39 +114,32 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     Raises
     ------
     InputError
-        If the folder has something in it or cannot be created, or the log cannot be used.
+        If the folder has something in it, or the log cannot be used.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} exists already, and nothing is overwritten: give another NAME.")
-    files: dict[str, str | Path] = {}
+    texts: dict[str, str] = {}
     if log is None:
-        files |= {name: find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")}
+        copied = [find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")]
     else:
         read = read_log(log)
         channels, others = choose_channels(read)
-        size = log.stat().st_size if log.is_file() else LARGEST_COPY + 1
-        named = log.name if size <= LARGEST_COPY else Path(os.path.relpath(log, folder)).as_posix()
-        files["problem.toml"] = write_problem(read, channels, others, named)
-        files["model.py"] = _fill_template(
+        copied = [log] if log.is_file() and log.stat().st_size <= LARGEST_COPY else []
+        named = log.name if copied else Path(os.path.relpath(log, folder)).as_posix()
+        texts["problem.toml"] = write_problem(read, channels, others, named)
+        texts["model.py"] = _fill_template(
             "model.py.template",
             source=log.name,
             count=len(channels),
             names=tuple(channels),
             units=tuple(read.units.get(name, "") for name in channels),
         )
-        if size <= LARGEST_COPY:
-            files[log.name] = log
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            if isinstance(content, Path):
-                shutil.copyfile(content, folder / name)
-            else:
-                with (folder / name).open("x", encoding="utf-8") as file:
-                    file.write(content)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written: {error.strerror}; give another NAME.") from error
-    return [folder / name for name in files]
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    for path in copied:
+        shutil.copyfile(path, folder / path.name)
+    return [folder / name for name in (*texts, *(path.name for path in copied))]
 
 
 def choose_channels(log: Log) -> tuple[list[str], list[str]]:
@@ -227,7 +217,7 @@ def write_problem(log: Log, channels: list[str], others: list[str], file: str) -
     """
     time_unit = log.time_unit if log.time_unit in ("s", "min", "h", "d") else "s"
     scale = SECONDS[log.time_unit] / SECONDS[time_unit] if log.time_unit else 1.0
-    picked = np.argsort(log.times, kind="stable")[:: -(-len(log) // MOST_POINTS)]
+    picked = np.argsort(log.times, kind="stable")
     times = log.times[picked] * scale
     values = np.stack([_fill_gaps(log.values[name][picked]) for name in channels], axis=1)
     k, before, after, noise = _guess_levels(values)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,42 +17,25 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.io.logs import find_logs, import_library, name_files
-from switchfit.optimize.arrow import ArrowLayout
-from switchfit.problem.problem import Problem
-from switchfit.report.formats import add_dates, format_iso, format_rounded, label_quantity, list_dated
-from switchfit.report.frames import ERROR, list_holds
+from switchfit.report.formats import add_dates, format_rounded, label_quantity
+from switchfit.report.frames import ERROR
 from switchfit.report.sentences import write_reason
 from switchfit.runtime.frames import describe_frame
 from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.answers import UNLIKELY
-from switchfit.uncertainty.residuals import ChannelQuality, correct_errors, correct_intervals, measure_quality
+from switchfit.uncertainty.residuals import ChannelQuality, measure_quality
 
 
-def list_unknowns(fit: Fit) -> list[dict[str, Any]]:
-    """Return the numbers of each unknown: value, standard error, 95 % interval, first guess, and dates of a time.
-
-    Standard errors and intervals are those of the report, which allow for correlated residuals; the naive standard
-    errors stand beside them. Dates are in ISO 8601.
+def list_unknowns(estimate: Estimate) -> list[dict[str, Any]]:
+    """Return a row for each unknown, with the columns of `Estimate.to_pandas`.
 
     Parameters
     ----------
-    fit : Fit
+    estimate : Estimate
     """
-    columns = {
-        "name": fit.theta_names,
-        "unit": fit.theta_units,
-        "value": fit.theta,
-        "standard_error": correct_errors(fit),
-        "naive_standard_error": fit.standard_errors,
-        "low": correct_intervals(fit)[:, 0],
-        "high": correct_intervals(fit)[:, 1],
-        "first_guess": fit.initial_theta,
-    }
-    rows = zip_rows(columns)
-    ends = {"date": "value", "date_low": "low", "date_high": "high"}
-    for row, run in zip(rows, list_dated(fit), strict=True):
-        row |= {} if run is None else {date: format_iso(row[end], run) or None for date, end in ends.items()}
-    return rows
+    frame = describe_frame(estimate)
+    columns = (*frame.index, *(each for each in frame.variables if each.dimensions == (frame.rows,)))
+    return zip_rows({each.name: each.values.tolist() for each in columns})
 
 
 def zip_rows(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
@@ -74,30 +56,23 @@ def write_unknowns(estimate: Estimate) -> str:
     ----------
     estimate : Estimate
     """
-    frame = describe_frame(estimate)
-    columns = (*frame.index, *(each for each in frame.variables if each.dimensions == (frame.rows,)))
-    return write_rows(zip_rows({each.name: each.values.tolist() for each in columns}))
+    return write_rows(list_unknowns(estimate))
 
 
 def write_runs(estimate: Estimate) -> str:
-    """Return a CSV table with a line for each run: modes, data, how well it fits, its own unknowns and their errors.
-
-    An unknown is called as the model calls it, so that those of all runs share a column.
+    """Return a CSV table with a line for each run: modes, data, how well it fits, and what is wrong with it.
 
     Parameters
     ----------
     estimate : Estimate
-        With its problem.
     """
-    problem = estimate.evaluator_at_solution().problem
-    errors, quality = correct_errors(estimate), measure_quality(estimate)
+    quality = measure_quality(estimate)
     any_dated = any(trajectory.origin is not None for trajectory in estimate.trajectories)
     rows = []
-    for e, own in enumerate(_name_own_unknowns(problem, estimate)):
-        trajectory = estimate.trajectories[e]
+    for e, (name, trajectory) in enumerate(zip(estimate.run_names, estimate.trajectories, strict=True)):
         here = [channel for channel in quality.channels if channel.experiment == e]
         row = {
-            "run": estimate.run_names[e],
+            "run": name,
             "modes": " -> ".join(mode for mode, _, _ in trajectory.mode_spans),
             "t0": trajectory.times[0],
             "tf": trajectory.times[-1],
@@ -105,58 +80,24 @@ def write_runs(estimate: Estimate) -> str:
             "values": sum(channel.count for channel in here),
             "chi2": sum(channel.chi_square for channel in here) if here else np.nan,
             "explained": min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan),
-            "flags": "; ".join(_list_flags(estimate, e, here, own, len(quality.channels))),
+            "flags": "; ".join(_list_flags(estimate, name, here, len(quality.channels))),
         }
         if any_dated:
             row["origin"] = "" if trajectory.origin is None else trajectory.origin.date
-        for column, place in own.items():
-            row |= {column: estimate.theta[place], ERROR.format(column): errors[place]}
         rows.append(row)
     return write_rows(rows)
 
 
-def _name_own_unknowns(problem: Problem, fit: Fit) -> Iterator[dict[str, int]]:
-    """Yield where in theta the unknowns of each run alone stand, by the model's names, transition times first."""
-    unknowns, ends = problem.unknowns, fit.final_places
-    layout = ArrowLayout.of(len(fit.theta), problem.places)
-    spans = {i: name for name, span in unknowns.parameters.items() for i in range(span.start, span.stop)}
-    named = [
-        {experiment.parameter_map.get(name, name): name for name, _, _ in structure.parameters}
-        for experiment, structure in zip(problem.experiments, problem.structures, strict=True)
-    ]
-    readers = Counter(target for inside in named for target in inside)  # an array may be shared, and its entries not
-    for e, inside in enumerate(named):
-        times = {int(place): f"tau_{k + 1}" for k, place in enumerate(fit.transition_places[e])} | {ends[e]: "tf"}
-        found = {}
-        for i in (int(place) for place in layout.own[e] if place < layout.size):
-            name = fit.theta_names[i]
-            if i in times:
-                column = times[i]
-            elif i in spans and readers[spans[i]] == 1:
-                column = name.replace(spans[i], inside[spans[i]], 1)
-            elif i in spans:
-                continue
-            else:
-                column = name.removeprefix(f"{fit.run_names[e]}.")
-            found[label_quantity(column, fit.theta_units[i])] = i
-        yield found
-
-
-def _list_flags(
-    fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, int], tested: int
-) -> Iterator[str]:
+def _list_flags(fit: Fit, run: str, channels: Sequence[ChannelQuality], tested: int) -> Iterator[str]:
     """Yield the flags of a run; the false alarms of chi-square are shared among all channels `tested`."""
     words = {"model": "residuals of {} correlated", "outliers": "outliers in {}", "sigma": "chi2 of {} too large"}
     for channel in channels:
         failed = [name for name, probability in channel.tests.items() if probability * tested < UNLIKELY]
         yield from (words[name].format(channel.label) for name in failed)
     for constraint in fit.active:
-        if constraint.position is not None and constraint.run == fit.run_names[e]:
+        if constraint.position is not None and constraint.run == run:
             state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
             yield f"mode {constraint.mode} {state}"
-    for column, i in own.items():
-        for hold in list_holds(fit, fit.theta_names[i]):
-            yield f"{column} {hold}"
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], columns: Iterable[str] = ()) -> str:
@@ -288,10 +229,10 @@ class ResultTable:
         }
         unknowns = list_unknowns(estimate)
         for unknown in unknowns:
-            shown = label_quantity(unknown["name"], unknown["unit"])
+            shown = label_quantity(unknown["unknown"], unknown["unit"])
             self.unknowns[shown] = unknown["unit"]
-            row |= {shown: float(unknown["value"]), ERROR.format(shown): float(unknown["standard_error"])}
-        row |= {f"{unknown['name']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
+            row |= {shown: unknown["value"], ERROR.format(shown): unknown["std_error"]}
+        row |= {f"{unknown['unknown']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
         self.rows.append({**row, "message": message})
 
     def describe_last(self) -> str:

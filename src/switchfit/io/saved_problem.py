@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import FileDigest, Provenance, load_saved
+from switchfit.estimation.saved import Provenance, load_saved
 from switchfit.io.problem_file import load_problem
 from switchfit.io.problem_file.building import ProblemFile, digest_file
 from switchfit.problem.data import Measurements
@@ -16,15 +16,13 @@ from switchfit.problem.validation import join_names
 from switchfit.runtime.errors import InputError
 
 
-def check_provenance(path: Path, given: Provenance | None, python: str) -> Provenance:
+def check_provenance(path: Path, given: Provenance | None) -> Provenance:
     """Return the provenance of a saved estimate, whose problem can be built again.
 
     Parameters
     ----------
     path : Path
     given : Provenance or None
-    python : str
-        What to do with a problem that was built in Python, for the message.
 
     Raises
     ------
@@ -36,7 +34,8 @@ def check_provenance(path: Path, given: Provenance | None, python: str) -> Prove
     if not given.problem_file:
         raise InputError(
             f"{path} does not have its problem, which was built in Python: functions are not saved, only hashes of the "
-            f"data. {python} switchfit fit PROBLEM.toml --out DIR saves what is needed."
+            "data. Validate and compare in the script that fitted it: estimate.validate(...), sf.compare([...]). "
+            "switchfit fit PROBLEM.toml --out DIR saves what is needed."
         )
     return given
 
@@ -67,25 +66,14 @@ def rebuild_problem(
     try:
         return load_problem(where / given.problem_file, own if log is None else log, text=given.text), where
     except InputError as error:
-        needed = [digest.name for digest in given.files if log is None or digest.name.endswith(".py")]
-        missing = [name for name in needed if not (where / name).exists()]
-        if missing:
-            raise InputError(
-                f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it "
-                "is in with --folder."
-            ) from error
-        now = {digest.name: digest_file(where, where / digest.name).sha256 for digest in given.files}
-        changed = [d.name for d in given.files if d.name in needed and now[d.name] not in ("", d.sha256)]
+        needed = [digest for digest in given.files if log is None or digest.name.endswith(".py")]
+        changed = [each.name for each in needed if digest_file(where, where / each.name).sha256 != each.sha256]
         if not changed:
             raise
         raise InputError(
-            f"{path} cannot be built again, since {join_names(changed)} in {where} has changed: {error} Fit again; or "
-            "put the files as they were into a folder, and name it with --folder."
+            f"{path} cannot be built again, since {join_names(changed)} in {where} is missing or has changed: {error} "
+            "Put the files as they were into a folder, and name it with --folder; or fit again."
         ) from error
-
-
-PYTHON_VALIDATE = "Validate in the script that fitted it: estimate.validate(...)."
-PYTHON_COMPARE = "Compare in the script that fitted it: sf.compare([...])."
 
 
 def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Path | None) -> ProblemFile:
@@ -104,7 +92,7 @@ def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Pa
     """
     if other.suffix.lower() == ".toml":
         return load_problem(other)
-    return rebuild_problem(path, check_provenance(path, given, PYTHON_VALIDATE), folder, other)[0]
+    return rebuild_problem(path, check_provenance(path, given), folder, other)[0]
 
 
 def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, ProblemFile]:
@@ -122,7 +110,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     InputError
         If the problem cannot be built again, or its data are no longer those that were fitted.
     """
-    given = check_provenance(path, load_saved(path).provenance, PYTHON_COMPARE)
+    given = check_provenance(path, load_saved(path).provenance)
     loaded, where = rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):
@@ -151,17 +139,11 @@ def list_changed_models(given: Provenance, loaded: ProblemFile) -> list[str]:
         The problem that was built again.
     """
     before, now = (
-        {digest.name: digest for digest in each.files if digest.name.endswith(".py")}
+        {digest.name: digest.sha256 for digest in each.files if digest.name.endswith(".py")}
         for each in (given, loaded.provenance)
     )
-    return [change for name in {**before, **now} if (change := _describe_change(name, before.get(name), now.get(name)))]
 
+    def describe(name: str) -> str:
+        return "is new" if name not in before else "has changed" if name in now else "is no longer there"
 
-def _describe_change(name: str, before: FileDigest | None, now: FileDigest | None) -> str:
-    if before is None:
-        return f"{name} is new"
-    if now is None:
-        return f"{name} is no longer there"
-    if before.sha256 == now.sha256:
-        return ""
-    return f"{name} has changed: {before.size:,} bytes with SHA-256 {before.sha256[:12]}..., now {now.size:,} bytes"
+    return [f"{name} {describe(name)}" for name in {**before, **now} if before.get(name) != now.get(name)]

@@ -1,17 +1,21 @@
-"""Files that users name: Python files, whose objects are loaded and errors located, and saved estimates."""
+"""Files that users name: Python files, whose objects are loaded and errors located."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
+import os
+import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from switchfit.runtime.errors import InputError, get_first_line
-from switchfit.runtime.files import explain_read_errors, is_regular
+
+_REFERENCE = re.compile(r"(.+\.py):(\w+)")
+"""How a problem file names an object in a Python file."""
 
 
 def load_object(reference: str, folder: Path, what: str) -> Any:
@@ -51,13 +55,36 @@ def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
     InputError
         If it has another form, or the file is missing.
     """
-    file, colon, name = reference.rpartition(":")
-    if not colon or not file.endswith(".py") or not name.isidentifier():
+    match = _REFERENCE.fullmatch(reference)
+    if match is None:
         raise InputError(f"{what} must be given as 'file.py:object'; got {reference!r}.")
-    path = folder / file
-    if not is_regular(path):
+    path = folder / match[1]
+    if not os.path.isfile(path):
         raise InputError(f"{what} {reference!r}: there is no file {path}.")
-    return path, name
+    return path, match[2]
+
+
+def replace_files(contents: Any, change: Callable[[str], str]) -> Any:
+    """Return tables of a problem file with other names of files: of logs, and of Python files with their objects.
+
+    Parameters
+    ----------
+    contents : mapping, sequence, or anything else
+        Arguments of models are left as they are.
+    change : callable
+        Returns the new name for a name.
+    """
+    if isinstance(contents, Mapping):
+        changed = {
+            key: value if key == "arguments" else replace_files(value, change) for key, value in contents.items()
+        }
+        if "columns" in contents and "file" in contents:
+            changed["file"] = change(contents["file"])
+        return changed
+    if isinstance(contents, (list, tuple)):
+        return [replace_files(entry, change) for entry in contents]
+    match = _REFERENCE.fullmatch(contents) if isinstance(contents, str) else None
+    return contents if match is None else f"{change(match[1])}:{match[2]}"
 
 
 def call(function: Any, what: str, **arguments: Any) -> Any:
@@ -162,14 +189,3 @@ def _run(path: Path) -> Any:
         sys.path.remove(str(path.parent))
     _modules[key] = (stamp, module)
     return module
-
-
-def check_saved(path: Path) -> None:
-    """Raise InputError unless there is a file that can be read.
-
-    Parameters
-    ----------
-    path : Path
-    """
-    with explain_read_errors(path, "saved estimate", "the estimate.json"):
-        path.open("rb").close()

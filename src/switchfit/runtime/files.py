@@ -50,14 +50,6 @@ def write_atomically(content: str | bytes, path: Path, *, sync: bool = True) -> 
             temporary.unlink(missing_ok=True)
 
 
-def is_regular(path: Path) -> bool:
-    """Return whether a regular file has that name; False for invalid names."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # too long; a null character
-        return False
-
-
 @contextlib.contextmanager
 def explain_read_errors(path: Path, what: str = "file", inside: str = "a file") -> Iterator[None]:
     """Return a context that turns an OSError into an InputError with the reason.

@@ -41,18 +41,12 @@ def find_logs(folder: Path, given: str) -> list[str] | None:
         If nothing matches the pattern, or there is no log in the folder.
     """
     path = folder / given
-    try:
-        is_folder, exists = path.is_dir() and given.strip() != "", path.exists()
-    except (OSError, ValueError):  # no name that a file can have
-        return None
-    if is_folder and not _is_log(path):
-        with explain_read_errors(path):
-            names = os.listdir(path)
-        inside = sorted(name for name in names if not name.startswith(".") and _is_log(path / name))
+    if os.path.isdir(path) and given.strip() and not _is_log(path):
+        inside = sorted(name for name in os.listdir(path) if not name.startswith(".") and _is_log(path / name))
         if not inside:
             raise InputError(f"{path} has no logs: no file in it ends in {', '.join(ENDINGS)}.")
         return [os.path.join(given, name) for name in inside]
-    if exists or not glob.has_magic(given):
+    if os.path.exists(path) or not glob.has_magic(given):
         return None
     found = sorted(glob.glob(given, root_dir=folder, recursive=True))
     if not found:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from switchfit.io.logs import import_library
 from switchfit.io.logs.log import Event, FloatArray, Log, Options
-from switchfit.io.logs.tables import subtract_first
+from switchfit.io.logs.tables import build_log
 from switchfit.io.logs.text import decode
 from switchfit.runtime.errors import InputError, Issue
 
@@ -44,15 +45,16 @@ def read_gpx(path: Path, options: Options) -> Log:
     points = [point for track in gpx.tracks for segment in track.segments for point in segment.points]
     if not any(point.time for point in points):
         raise InputError(f"{path} has no track with times: of {len(points)} points, none has a time.")
-    times, offset = subtract_first([None if p.time is None else _count_micros(p.time) for p in points], 10**6)
+    times = np.array([None if p.time is None else _count_micros(p.time) for p in points], dtype="datetime64[us]")
     fields = {
         "latitude": "latitude", "longitude": "longitude", "altitude": "elevation", "speed": "speed", "course": "course",
         "hdop": "horizontal_dilution",
     }  # fmt: skip
     columns = {name: _make_column([getattr(point, field) for point in points]) for name, field in fields.items()}
     named = [point for point in gpx.waypoints if point.time and point.name]
-    events = [Event(_count_micros(point.time) * 1e-6 - offset, "waypoint", point.name) for point in named]
-    return _build_log(path, times, columns, offset, place="point", events=tuple(events))
+    log = _build_log(path, times, columns, options, place="point")
+    events = [Event(_count_micros(point.time) * 1e-6 - log.offset, "waypoint", point.name) for point in named]
+    return replace(log, events=tuple(events))
 
 
 def read_nmea(path: Path, options: Options) -> Log:
@@ -84,14 +86,14 @@ def read_nmea(path: Path, options: Options) -> Log:
             f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
         )
     micros = _count_fixes(fixes)
-    times, offset = subtract_first(micros, 10**6) if day else (np.array(micros) * 1e-6, 0.0)
+    times = np.array(micros, dtype="datetime64[us]") if day else np.array(micros) * 1e-6
     columns = {name: _make_column([fix.get(name) for fix in fixes]) for name in UNITS}
     rows = np.array([fix["line"] for fix in fixes], dtype=np.intp)
     issues: tuple[Issue, ...] = ()
     if damaged:
         figures = {"line": float(damaged[0]), "count": float(len(damaged))}
         issues = (Issue("log: damaged sentences", (str(path), "line"), figures),)
-    return _build_log(path, times, columns, offset, rows=rows, place="line", issues=issues)
+    return _build_log(path, times, columns, options, rows=rows, place="line", issues=issues)
 
 
 def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tuple[int, Any]]:
@@ -164,17 +166,8 @@ def _make_column(entries: list[Any]) -> FloatArray:
     return np.array([np.nan if entry is None else float(entry) for entry in entries])
 
 
-def _build_log(path: Path, times: FloatArray, columns: dict[str, FloatArray], offset: float, **more: Any) -> Log:
-    """Return a log of the channels that have a value."""
-    values = {name: column for name, column in columns.items() if np.isfinite(column).any()}
-    return Log(
-        times=times,
-        values=values,
-        units={name: UNITS[name] for name in values},
-        time_unit="s",
-        source=str(path),
-        offset=offset,
-        time_name="time",
-        has_positions=True,
-        **more,
-    )
+def _build_log(path: Path, times: Any, columns: dict[str, FloatArray], options: Options, **more: Any) -> Log:
+    """Return a log of the channels that have a value; its times are stamps of a receiver."""
+    kept = {name: column for name, column in columns.items() if np.isfinite(column).any()}
+    log = build_log(str(path), {"time": times, **kept}, UNITS | {"time": "s"}, options, zones={"time": "UTC"})
+    return replace(log, has_positions=True, has_dates=False, **more)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,8 @@ def read_mat(path: Path, options: Options) -> Log:
         If the file cannot be read, or it is not clear which struct is meant.
     """
     contents, time, topic = _load(path), options.time, options.topic
-    groups = {name: group for name, group in _list_groups(contents).items() if _find_times(group, time)}
+    arrays = dict(_flatten(contents))
+    groups = _find_times(arrays, time)
     if topic is None and len(groups) != 1:
         what = f"several structs with times ({join_names(name or 'the file itself' for name in groups)})"
         raise InputError(
@@ -56,15 +57,15 @@ def read_mat(path: Path, options: Options) -> Log:
         raise InputError(
             f"{path} has no struct {shorten(chosen)} with times; those that have are {join_names(groups)}. {OBJECTS}"
         )
-    group = groups[chosen]
-    key = _find_times(group, time) or ""
-    times = np.ravel(group[key])
+    key, inside = groups[chosen], f"{chosen}." if chosen else ""
+    own = {name.removeprefix(inside): value for name, value in arrays.items() if name.startswith(inside)}
+    units = {name.removeprefix("units."): value for name, value in own.items() if isinstance(value, str)}
+    times = np.ravel(own.pop(key))
     columns = {key: times}
-    for name, value in _flatten(group).items():
-        if name != key:
-            columns |= _split_channels(name, value, len(times))
+    for name, value in own.items():
+        columns |= _split_channels(name, value, len(times))
     source = f"{path} ({chosen})" if chosen else str(path)
-    return build_log(source, columns, _read_units(group), options._replace(time=key))
+    return build_log(source, columns, units, options._replace(time=key))
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -95,22 +96,26 @@ def _read_hdf(h5py: Any, item: Any) -> Any:
     return value
 
 
-def _list_groups(contents: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Return the file itself, called "", and all structs in it by their names."""
-    groups: dict[str, Mapping[str, Any]] = {"": contents}
-    for name, value in contents.items():
+def _flatten(group: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the arrays and texts in structs, and in arrays of structs, by names with dots."""
+    for name, value in group.items():
         if isinstance(value, Mapping):
-            inside = _list_groups(value)
-            groups |= {f"{name}.{inner}" if inner else name: group for inner, group in inside.items()}
-    return groups
+            yield from _flatten(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and all(isinstance(entry, Mapping) for entry in value):
+            yield from _flatten({f"{name}_{k}": entry for k, entry in enumerate(value, start=1)}, prefix)
+        elif isinstance(value, (np.ndarray, str)):
+            yield f"{prefix}{name}", value
 
 
-def _find_times(group: Mapping[str, Any], time: str | None) -> str | None:
-    """Return the name of the vector of times in a struct, None if there is none."""
-    vectors = [name for name, value in group.items() if _is_vector(value)]
-    if time is not None:
-        return time if time in vectors else None
-    return find_time_name(vectors)
+def _find_times(arrays: Mapping[str, Any], time: str | None) -> dict[str, str]:
+    """Return the name of the vector of times in each struct that has one; the file itself is called ""."""
+    vectors: dict[str, list[str]] = {}
+    for name, value in arrays.items():
+        struct, _, own = name.rpartition(".")
+        if _is_vector(value) and time in (None, own):
+            vectors.setdefault(struct, []).append(own)
+    found = {struct: find_time_name(names) if time is None else time for struct, names in vectors.items()}
+    return {struct: name for struct, name in found.items() if name is not None}
 
 
 def _is_vector(value: Any) -> bool:
@@ -122,22 +127,8 @@ def _is_vector(value: Any) -> bool:
     )
 
 
-def _flatten(group: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arrays of a struct and of structs in it that have no times of their own, by names with dots."""
-    found: dict[str, Any] = {}
-    for name, value in group.items():
-        if isinstance(value, Mapping) and name != "units" and not _find_times(value, None):
-            found |= {f"{name}.{inner}": entry for inner, entry in _flatten(value).items()}
-        elif isinstance(value, list) and all(isinstance(entry, Mapping) for entry in value):  # an array of structs
-            for k, entry in enumerate(value, start=1):
-                found |= {f"{name}_{k}.{inner}": inside for inner, inside in _flatten(entry).items()}
-        elif isinstance(value, np.ndarray):
-            found[name] = value
-    return found
-
-
 def _split_channels(name: str, value: Any, samples: int) -> dict[str, Any]:
-    """Return an array with a sample for each time as vectors; nothing for other arrays."""
+    """Return an array with a sample for each time as vectors; nothing for other arrays, and for text."""
     value = np.squeeze(value)
     if value.dtype.kind not in "biuf" or samples not in value.shape or value.ndim > 2:
         return {}
@@ -145,8 +136,3 @@ def _split_channels(name: str, value: Any, samples: int) -> dict[str, Any]:
         return {name: value}
     rows = value if value.shape[0] == samples else value.T
     return {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}
-
-
-def _read_units(group: Mapping[str, Any]) -> dict[str, str]:
-    units = group.get("units", {})
-    return {name: unit for name, unit in units.items() if isinstance(unit, str)} if isinstance(units, Mapping) else {}

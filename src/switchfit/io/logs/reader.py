@@ -6,6 +6,7 @@ What is odd about the times and channels of a log, and the repairs that a user m
 from __future__ import annotations
 
 import importlib
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,9 +19,10 @@ from numpy.typing import NDArray
 from switchfit.io.logs import BAGS
 from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
 from switchfit.io.logs.log import SECONDS, FloatArray, Log, Options
+from switchfit.problem.dates import LENGTHS
 from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
-from switchfit.runtime.files import explain_read_errors, is_regular
+from switchfit.runtime.files import explain_read_errors
 
 REPAIRS = ("sort", "drop-duplicates", "drop-missing-times", "drop-broken-lines")
 """Repairs by name; beside them "unwrap:CHANNEL"."""
@@ -73,16 +75,16 @@ def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
         ("sort", _find_falls),
         ("drop-duplicates", _find_repeats),
     ):
-        found = find(log)
-        if found is None:
+        kind, flawed, kept, figures = find(log)
+        if not flawed.any():
             continue
-        kind, first, figures, kept = found
-        repaired = name in repairs
+        first, repaired = int(flawed.argmax()), name in repairs
         if name == "drop-missing-times" and not repaired:
             raise InputError(
                 f"{log.source}, column {log.time_name!r}: the time of sample {first + 1} is missing ({log.place} "
                 f"{log.rows[first]}). repair='{name}' leaves such samples out."
             )
+        figures |= {"count": flawed.sum(), "time": log.times[first]}
         issues.append(_make_issue(kind, log, first, None, repaired=repaired, **figures))
         log = _pick_samples(log, kept) if repaired else log
     issues += _find_gaps(log)
@@ -92,34 +94,26 @@ def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
     return replace(log, issues=tuple(issues))
 
 
-Flaw = tuple[str, int, dict[str, float], NDArray[np.intp]]
-"""What is odd about times: the kind of issue, its first sample, its figures, and the samples that a repair keeps."""
+Flaw = tuple[str, NDArray[np.bool_], NDArray[Any], dict[str, float]]
+"""What is odd about times: the kind of issue, in which samples, the samples that a repair keeps, and more figures."""
 
 
-def _find_missing(log: Log) -> Flaw | None:
+def _find_missing(log: Log) -> Flaw:
     missing = ~np.isfinite(log.times)
-    if not missing.any():
-        return None
-    return "log: missing times", int(missing.argmax()), {"count": missing.sum()}, np.flatnonzero(~missing)
+    return "log: missing times", missing, ~missing, {}
 
 
-def _find_falls(log: Log) -> Flaw | None:
-    steps = np.diff(log.times)
+def _find_falls(log: Log) -> Flaw:
+    steps = np.append(0.0, np.diff(log.times))[: len(log)]
     falls = steps < 0
-    if not falls.any():
-        return None
-    first = int(falls.argmax()) + 1
-    far = -steps.min() > NEAR * _find_typical_step(log.times)  # not so beside NaN
-    figures = {"count": falls.sum(), "step": -steps[first - 1], "time": log.times[first]}
-    return "log: clock jump" if far else "log: unsorted times", first, figures, np.argsort(log.times, kind="stable")
+    far = -steps[falls].min(initial=0.0) > NEAR * _find_typical_step(log.times)  # not so beside NaN
+    kind = "log: clock jump" if far else "log: unsorted times"
+    return kind, falls, np.argsort(log.times, kind="stable"), {"step": -steps[falls][:1].sum()}
 
 
-def _find_repeats(log: Log) -> Flaw | None:
-    same = np.append(False, np.diff(log.times) == 0)
-    if not same.any():
-        return None
-    first = int(same.argmax())
-    return "log: repeated time", first, {"count": same.sum(), "time": log.times[first]}, np.flatnonzero(~same)
+def _find_repeats(log: Log) -> Flaw:
+    same = np.append(False, np.diff(log.times) == 0)[: len(log)]
+    return "log: repeated time", same, ~same, {}
 
 
 def _find_gaps(log: Log) -> list[Issue]:
@@ -313,12 +307,9 @@ def convert_times(log: Log, unit: str) -> Log:
     """
     if log.time_unit in ("", unit):
         return replace(log, time_unit=unit)
-    factor = SECONDS[log.time_unit] / SECONDS[unit]
-    if factor < 1:  # a division is exact where a product is not: 40 ms are 0.04 s
-        inverse = SECONDS[unit] / SECONDS[log.time_unit]
-        inverse = round(inverse) if abs(inverse - round(inverse)) < 1e-6 else inverse
-        return _map_times(log, lambda t: t / inverse, offset=log.offset / inverse, time_unit=unit)
-    return _map_times(log, lambda t: t * factor, offset=log.offset * factor, time_unit=unit)
+    # A quotient of integers: 40 ms are 0.04 s.
+    length, new = (int(LENGTHS[each] / LENGTHS["ns"]) for each in (log.time_unit, unit))
+    return _map_times(log, lambda t: t * length / new, offset=log.offset * length / new, time_unit=unit)
 
 
 def align_starts(logs: Sequence[Log]) -> list[Log]:
@@ -386,7 +377,7 @@ def _read_format(path: Path, options: Options) -> Log:
 
 def _choose_format(path: Path) -> _Format:
     """Return the format of a file, by the end of its name or by how it begins."""
-    if is_regular(path / "metadata.yaml"):
+    if os.path.isfile(path / "metadata.yaml"):
         return _BAG
     ending = Path(path.name.lower().removesuffix(".gz")).suffix
     return _FORMATS.get(ending) or (_NMEA if _is_nmea(path) else _TEXT)
@@ -394,7 +385,7 @@ def _choose_format(path: Path) -> _Format:
 
 def _is_nmea(path: Path) -> bool:
     """Return whether the first line of a file is a sentence of NMEA 0183."""
-    if not is_regular(path):
+    if not os.path.isfile(path):
         return False
     with explain_read_errors(path), path.open("rb") as file:
         return bool(_SENTENCE.match(file.read(400)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from switchfit.io.logs import explain_damage, import_library
 from switchfit.io.logs.geodesy import LOCAL, SIGMA
 from switchfit.io.logs.log import Event, Log, Options
-from switchfit.io.logs.tables import stack_records
+from switchfit.io.logs.tables import build_log
 from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError, Issue
 
@@ -46,16 +47,16 @@ def read_bag(path: Path, options: Options) -> Log:
     with explain_damage(path, "a ROS bag"):
         store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
-            return _read_topic(path, reader, options.topic)
+            return _read_topic(path, reader, options)
 
 
-def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
-    connections = _choose_connections(path, reader.connections, topic)
+def _read_topic(path: Path, reader: Any, options: Options) -> Log:
+    connections = _choose_connections(path, reader.connections, options.topic)
     kind = connections[0].msgtype
     read = _READERS.get(kind, _flatten)
     start = reader.start_time
     records: list[Record] = []
-    texts: list[tuple[int, str]] = []
+    events: list[Event] = []
     stamps: list[int] = []
     received: list[int] = []
     for connection, time, data in reader.messages(connections=connections):
@@ -64,26 +65,24 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
         stamps.append(_read_stamp(message))
         records.append(read(message))
         if isinstance(getattr(message, "data", None), str):
-            texts.append((time, message.data))
+            events.append(Event((time - start) / SECOND, connection.topic, message.data))
     if not records:
         raise InputError(f"{path}: topic {connections[0].topic} has no messages; there is nothing to read.")
     has_stamps = any(stamps)
     clock, offset = _choose_clock(stamps if has_stamps else received, start)
-    values = stack_records(records)
+    names = dict.fromkeys(name for record in records for name in record)
+    values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
     units = {name: _UNITS.get(_strip(name), "") if kind in _READERS else "" for name in values}
     issues = () if has_stamps else (Issue("log: no stamps", (str(path), connections[0].topic)),)
-    return Log(
-        times=clock,
-        values=values,
-        units=units,
-        time_unit="s",
-        source=f"{path} ({connections[0].topic})",
-        issues=issues,
-        events=tuple(Event((time - start) / SECOND, connections[0].topic, text) for time, text in texts),
-        offset=offset,
-        place="message",
-        time_name="stamp" if has_stamps else "received",
-        has_positions=read is _read_fix,
+    name = "stamp" if has_stamps else "received"
+    log = build_log(
+        f"{path} ({connections[0].topic})",
+        {**values, name: clock},
+        units | {name: "s"},
+        options._replace(time=name, keep_epoch=True),
+    )
+    return replace(
+        log, offset=offset, issues=issues, events=tuple(events), place="message", has_positions=read is _read_fix
     )
 
 

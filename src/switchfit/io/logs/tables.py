@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -28,7 +28,6 @@ from switchfit.io.logs.log import (
 )
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
-from switchfit.runtime.files import explain_read_errors
 
 _NAMES = (
     re.compile(
@@ -62,42 +61,12 @@ def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str 
     return next((name for name in given if name.strip() == TEMPERATURE and name not in channels), None)
 
 
-def interpret_times(
-    numbers: FloatArray, name: str, unit: str, *, keep_epoch: bool = False
-) -> tuple[FloatArray, str, float]:
-    """Return times, their unit, and what was subtracted from them.
-
-    Parameters
-    ----------
-    numbers : (K,) array
-        As they stand in the file.
-    name : str
-        Of the column, which may say the unit.
-    unit : str
-        As the file states it; "" if it does not.
-    keep_epoch : bool, optional
-        Leave times that count from 1970 as they are; otherwise the first one is subtracted.
-    """
-    unit = normalize_time_unit(unit)
-    unit = unit if unit in SECONDS else find_spelled_unit(name)
-    finite = numbers[np.isfinite(numbers)]
-    epoch = find_epoch_unit(float(finite[0])) if len(finite) else None
-    if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):
-        return numbers, unit, 0.0
-    return (numbers, epoch, 0.0) if keep_epoch else (numbers - finite[0], epoch, float(finite[0]))
-
-
-def subtract_first(counts: Sequence[int | None], unit: int = 1) -> tuple[FloatArray, float]:
-    """Return integers since 1970 from the first one on, NaN for None, and the first one; doubles would round them.
-
-    Parameters
-    ----------
-    counts : sequence of int or None
-    unit : int
-        What both are divided by.
-    """
-    first = next(count for count in counts if count is not None)
-    return np.array([np.nan if count is None else (count - first) / unit for count in counts]), first / unit
+def refuse_without_times(source: str, names: Iterable[str]) -> NoReturn:
+    """Raise InputError for a table in which no column is found that has the times."""
+    raise InputError(
+        f"{source}: no column is called time; its columns are {join_names(names)}. Name the one with the times: "
+        "time = ..."
+    )
 
 
 def _are_uptimes(times: FloatArray) -> bool:
@@ -107,12 +76,6 @@ def _are_uptimes(times: FloatArray) -> bool:
         return False
     step = float(np.median(steps))
     return bool(np.all(times == np.rint(times)) and step >= 1000 and step % 60 != 0)
-
-
-def stack_records(records: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
-    """Return the entries of all records by name, NaN where a record lacks one; in the order in which they appear."""
-    names = dict.fromkeys(name for record in records for name in record)
-    return {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
 
 
 def build_log(
@@ -142,10 +105,7 @@ def build_log(
     """
     time = find_time_name(list(columns)) if options.time is None else options.time
     if time is None:
-        raise InputError(
-            f"{source}: no column is called time; its columns are {join_names(columns)}. Name the one with the times: "
-            "time = ..."
-        )
+        refuse_without_times(source, columns)
     if time not in columns:
         raise InputError(f"{source} has no column {shorten(time)}; its columns are {join_names(columns)}.")
     stated = {name: units.get(name, "") or split_unit(name)[1] for name in columns}
@@ -175,19 +135,29 @@ def build_log(
 
 
 def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
+    """Return times, their unit, and what was subtracted from them: the first one, if they count from 1970.
+
+    Integers are subtracted as such; doubles would round them. With `keep_epoch` numbers are left as they are.
+    """
+    second = np.timedelta64(1, "s")
     if column.dtype.kind == "M":
         first = column[~np.isnat(column)][0]
-        return (
-            (column - first) / np.timedelta64(1, "s"),
-            "s",
-            float(first.astype("datetime64[us]").astype(np.int64)) / 1e6,
-        )
+        micros = first.astype("datetime64[us]").astype(np.int64)
+        return (column - first) / second, "s", float(micros) / 1e6
     if column.dtype.kind == "m":
-        return column.astype("timedelta64[ns]").astype(np.int64) * SECONDS["ns"], "s", 0.0
-    times, unit, offset = interpret_times(np.asarray(column, dtype=np.float64), name, unit, keep_epoch=keep_epoch)
-    if offset and column.dtype.kind in "iu":
-        times, offset = subtract_first(column.tolist())
-    return times, unit, offset
+        return column / second, "s", 0.0
+    numbers = np.asarray(column, dtype=np.float64)
+    unit = normalize_time_unit(unit)
+    unit = unit if unit in SECONDS else find_spelled_unit(name)
+    finite = numbers[np.isfinite(numbers)]
+    epoch = find_epoch_unit(float(finite[0])) if len(finite) else None
+    if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):
+        return numbers, unit, 0.0
+    if keep_epoch:
+        return numbers, epoch, 0.0
+    if column.dtype.kind in "iu":
+        return (column.astype(np.int64) - int(column[0])).astype(np.float64), epoch, float(column[0])
+    return numbers - finite[0], epoch, float(finite[0])
 
 
 def read_parquet(path: Path, options: Options) -> Log:
@@ -199,8 +169,6 @@ def read_parquet(path: Path, options: Options) -> Log:
         If the file cannot be read.
     """
     parquet = import_library("pyarrow.parquet", "parquet", f"{path}: Parquet")
-    with explain_read_errors(path):
-        path.open("rb").close()
     with explain_damage(path, "a Parquet file"):
         table = parquet.read_table(path)
         columns = {name: table.column(name).to_numpy() for name in table.column_names}

@@ -11,20 +11,20 @@ import codecs
 import csv
 import gzip
 import re
-import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.io.logs import explain_damage
 from switchfit.io.logs.geodesy import FRAME, find_position
 from switchfit.io.logs.log import Event, FloatArray, Log, Options, is_unit, split_unit, strip_brackets
-from switchfit.io.logs.tables import build_log, find_time_name
+from switchfit.io.logs.tables import build_log, find_time_name, refuse_without_times
 from switchfit.problem.dates import read_date_text
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
@@ -34,14 +34,19 @@ DELIMITERS = (";", "\t", ",", "|", " ")
 """What may separate fields; of two that split all lines alike, the first one: commas are decimals then."""
 SNIFFED = 100
 """Lines that are looked at."""
-MOST_HEADER_LINES = 12
 
 MISSING = frozenset({"", "NA", "N/A", "NAN", "NULL", "NONE"})
 """Cells that stand for a missing value, in capitals."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
-_DATE = re.compile(r"(?:\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}[./]\d{1,2}[./]\d{4}|\d{1,2}:\d{2}\b).*")
+_DATE = re.compile(r"\d{4}[-/]\d{1,2}[-/]\d{1,2}.*|\d{1,2}[./]\d{1,2}[./]\d{4}.*|\d{8}T.*")
+_CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?")
+_GERMAN = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")
+_ONE_DIGIT = re.compile(r"(?<=[- ])(\d)(?!\d)")
+"""A month, a day or an hour that ISO 8601 has with two digits."""
 
+Line = tuple[int, str]
+"""Number of a line, and its text."""
 Row = tuple[int, list[str]]
 """Number of a line, and its cells."""
 
@@ -67,13 +72,13 @@ class Header:
     first: int = 0
 
 
-def find_delimiter(lines: Sequence[str]) -> str:
+def find_delimiter(lines: Sequence[Line]) -> str:
     """Return the delimiter that splits most of the lines into the same number of fields, more than one."""
 
     def share(delimiter: str) -> float:
         try:
-            counts = Counter(len(cells) for cells in split_lines(lines, delimiter))
-        except csv.Error:
+            counts = Counter(len(cells) for _, cells in split_lines(lines, delimiter))
+        except ValueError:
             return 0.0
         fields, often = counts.most_common(1)[0]
         return often / len(lines) if fields > 1 else 0.0
@@ -81,10 +86,15 @@ def find_delimiter(lines: Sequence[str]) -> str:
     return max(DELIMITERS, key=share) if any(map(share, DELIMITERS)) else ","
 
 
-def split_lines(lines: Sequence[str], delimiter: str) -> list[list[str]]:
-    """Return the stripped cells of lines; those of a line that ends in a space have no empty one at the end."""
-    source = [line.strip() for line in lines] if delimiter == " " else lines
-    return [[cell.strip() for cell in row] for row in csv.reader(source, delimiter=delimiter, skipinitialspace=True)]
+def split_lines(lines: Sequence[Line], delimiter: str) -> list[Row]:
+    """Return the number and the cells of each line; of lines that quotes join, the number of the last one."""
+    source = (text.strip() if delimiter == " " else text for _, text in lines)
+    reader = csv.reader(source, delimiter=delimiter, skipinitialspace=True)
+    try:
+        return [(lines[reader.line_num - 1][0], [cell.rstrip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        line = lines[min(reader.line_num, len(lines)) - 1][0]
+        raise ValueError(f"line {line}: {error}; is a quotation mark missing?") from error
 
 
 def is_missing(cell: str) -> bool:
@@ -92,9 +102,14 @@ def is_missing(cell: str) -> bool:
     return cell.upper() in MISSING
 
 
+def is_date(cell: str) -> bool:
+    """Return whether a cell is a date or a time of day."""
+    return bool(_DATE.fullmatch(cell) or _CLOCK.fullmatch(cell))
+
+
 def is_data(cell: str) -> bool:
     """Return whether a cell is a number, a date or a time of day."""
-    return bool(_NUMBER.fullmatch(cell) or _DATE.fullmatch(cell))
+    return bool(_NUMBER.fullmatch(cell)) or is_date(cell)
 
 
 def has_text(cells: Sequence[str]) -> bool:
@@ -113,7 +128,7 @@ def read_header(rows: Sequence[Row], comment: list[str]) -> Header:
     """
     begin = _skip_preamble(rows)
     first = begin
-    while first < min(len(rows), begin + MOST_HEADER_LINES) and _is_header(rows[first][1], first == begin):
+    while first < len(rows) and _is_header(rows[first][1], first == begin):
         first += 1
     lines = [_strip_end(cells) for _, cells in rows[begin:first]]
     if not lines:
@@ -187,74 +202,30 @@ def _split_units(cells: list[str]) -> tuple[list[str], list[str]]:
     return (list(cells) if whole else names), [unit for _, unit in pairs]
 
 
-_WHOLE_DATE = re.compile(r"\d{4}[-/]\d{1,2}[-/]\d{1,2}.*|\d{1,2}[./]\d{1,2}[./]\d{4}.*|\d{8}T.*")
-_CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?")
-_GERMAN = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")
-_YEAR_FIRST = re.compile(r"(\d{4})[-/](\d{1,2})[-/](\d{1,2})(.*)")
+def _read_date(cell: str) -> tuple[np.datetime64, str] | None:
+    """Return the instant of a date in ISO 8601, or day.month.year, and its zone, "" if it states none.
 
-
-def is_date(cell: str) -> bool:
-    """Return whether a cell is a date or a time of day."""
-    return bool(_WHOLE_DATE.fullmatch(cell) or _CLOCK.fullmatch(cell))
-
-
-def parse_dates(cells: Sequence[str], places: Sequence[str]) -> tuple[NDArray[np.datetime64], str]:
-    """Return dates in UTC, NaT where one is missing, and their zone: "" if none states one, "UTC" for several.
-
-    Parameters
-    ----------
-    cells : sequence of str
-        ISO 8601, or day.month.year; without a zone they are counted as if they were UTC.
-    places : sequence of str
-        Where each stands, for messages.
-
-    Raises
-    ------
-    InputError
-        If a cell is something else.
+    Dates without a zone are counted as if they were UTC.
     """
-    found = [None if is_missing(cell) else _read_date(cell, place) for cell, place in zip(cells, places, strict=True)]
-    zones = {entry[1] for entry in found if entry is not None}
-    dates = np.array([None if entry is None else entry[0] for entry in found], dtype="datetime64[us]")
-    return dates, zones.pop() if len(zones) == 1 else "UTC"
+    text = _GERMAN.sub(r"\3-\2-\1", cell).replace("/", "-").replace(",", ".").replace(" UTC", "Z")
+    return read_date_text(_ONE_DIGIT.sub(r"0\1", text))
 
 
-def parse_clock(cells: Sequence[str], places: Sequence[str]) -> FloatArray:
-    """Return the seconds since midnight of times of day."""
-    seconds = np.full(len(cells), np.nan)
-    for k, cell in enumerate(cells):
-        match = _CLOCK.fullmatch(cell)
-        if match:
-            seconds[k] = 3600 * int(match[1]) + 60 * int(match[2]) + float((match[3] or "0").replace(",", "."))
-        elif not is_missing(cell):
-            raise InputError(f"{places[k]}: {cell!r} is not a time of day such as 12:34:56.789, as the others are.")
-    return seconds
-
-
-def _read_date(cell: str, place: str) -> tuple[np.datetime64, str]:
-    """Return the instant of a date, and its zone, "" if it states none."""
-    text = cell.strip()
-    if match := _GERMAN.fullmatch(text):
-        text = f"{match[3]}-{int(match[2]):02d}-{int(match[1]):02d}{match[4]}"
-    elif match := _YEAR_FIRST.fullmatch(text):
-        text = f"{match[1]}-{int(match[2]):02d}-{int(match[3]):02d}{match[4]}"
-    date = read_date_text(text.replace(",", ".").replace(" UTC", "Z"))
-    if date is None:
-        raise InputError(
-            f"{place}: {cell!r} is not a date that can be read; write dates as 2024-05-01T12:34:56.789, or times as "
-            "numbers."
-        )
-    return date
+def _read_clock(cell: str) -> float | None:
+    """Return the seconds since midnight of a time of day."""
+    match = _CLOCK.fullmatch(cell)
+    if match is None:
+        return None
+    return 3600 * int(match[1]) + 60 * int(match[2]) + float((match[3] or "0").replace(",", "."))
 
 
 GZIP = b"\x1f\x8b"
 COMMENTS = ("#", "%")
+NO_NUMBER = "is not a number; leave the cell empty where a value is missing."
 _DATE_NAMES = ("date", "datum", "day")
-_COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
-_POINT_NUMBER = re.compile(r"[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _EXCEL = re.compile(r"sep=.?")
 """The line in which Excel notes the delimiter; the one that is found is the same."""
-_LONG_INTEGER = re.compile(r"(?<![\d.])\d{16,19}(?![\d.])")
+_LONG_INTEGER = re.compile(r"\d{16,19}")
 """Such as nanoseconds since 1970, which doubles would round."""
 
 
@@ -268,46 +239,43 @@ class _Table:
     header : Header
     lines : (K,) array of int
         Number of the line of each row.
-    columns : list of sequences of str, or of arrays
-        The cells of each column; numbers where all of the table are.
+    columns : list of sequences of str
+        The cells of each column.
     comma : bool
         Whether decimals are behind commas.
-    broken : tuple of Issue
+    broken : list of int
         Lines that were dropped.
     """
 
     source: str
     header: Header
     lines: NDArray[np.intp]
-    columns: list[Any]
-    comma: bool = False
-    broken: tuple[Issue, ...] = ()
-
-    def list_cells(self, column: int) -> list[str]:
-        """Return the cells of a column; none where the table has numbers alone."""
-        cells = self.columns[column]
-        return [] if isinstance(cells, np.ndarray) else list(cells)
+    columns: Sequence[Sequence[str]]
+    comma: bool
+    broken: list[int]
 
     def parse_column(self, column: int) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return a column as numbers, NaN for missing ones, and which of its cells are something else."""
         cells = self.columns[column]
-        if isinstance(cells, np.ndarray):
-            return cells.copy(), np.zeros(len(cells), dtype=bool)
-        texts = ["nan" if is_missing(cell) else cell for cell in self.list_cells(column)]
-        texts = [text.replace(",", ".") for text in texts] if self.comma else texts
+        if self.comma:
+            cells = [cell.replace(",", ".") for cell in cells]
         try:
-            if "_" not in "".join(texts):  # Python would read 1_5 as 15
-                return np.array(texts, dtype=np.float64), np.zeros(len(texts), dtype=bool)
+            if "_" not in "".join(cells):  # Python would read 1_5 as 15
+                return np.array(list(map(float, cells))), np.zeros(len(cells), dtype=bool)
         except ValueError:
             pass
-        found = list(map(_parse_number, texts))
-        numbers = np.array([np.nan if number is None else number for number in found])
-        return numbers, np.array([number is None for number in found])
+        found = list(map(_parse_number, cells))
+        return np.array([np.nan if number is None else number for number in found]), np.array(
+            [number is None for number in found]
+        )
 
 
-def _parse_number(text: str) -> float | None:
+def _parse_number(cell: str) -> float | None:
+    """Return the number in a cell, NaN for one that is missing; None for anything else."""
+    if is_missing(cell):
+        return np.nan
     try:
-        return None if "_" in text else float(text)
+        return None if "_" in cell else float(cell)
     except ValueError:
         return None
 
@@ -330,8 +298,11 @@ def read_text(path: Path, options: Options) -> Log:
     log = _read_times(table, column, options)
     values: dict[str, FloatArray] = {}
     events: list[Event] = []
-    issues = list(table.broken)
+    issues = []
     names = table.header.names
+    if table.broken:
+        figures = {"line": float(min(table.broken)), "count": float(len(table.broken)), "repaired": 1.0}
+        issues.append(Issue("log: broken lines", (table.source, "line"), figures))
     for k in range(len(names)) if wanted is None else wanted:
         if (k == column and wanted is None) or names[k] in values:
             continue
@@ -339,11 +310,11 @@ def read_text(path: Path, options: Options) -> Log:
         if not bad.any() and names.count(names[k]) == 1:
             values[names[k]] = found
         elif wanted is not None:
-            _refuse_cell(table, k, int(bad.argmax()))
+            _refuse_cell(table, k, table.columns[k], int(bad.argmax()), NO_NUMBER)
         elif names.count(names[k]) > 1:
             issues.append(Issue("log: repeated name", (table.source, names[k])))
-        elif _is_text(table.list_cells(k), bad):
-            events += _list_changes(names[k], table.list_cells(k), log.times)
+        elif _is_text(table.columns[k], bad):
+            events += _list_changes(names[k], table.columns[k], log.times)
         else:
             first = int(bad.argmax())
             figures = {"line": float(table.lines[first]), "count": float(bad.sum())}
@@ -371,17 +342,11 @@ def decode(path: Path) -> str:
     with explain_read_errors(path):
         data = path.read_bytes()
     if data.startswith(GZIP):
-        try:
+        with explain_damage(path, "a file that is compressed by gzip"):
             data = gzip.decompress(data)
-        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-            raise InputError(
-                f"{path} is compressed by gzip, but damaged or cut off ({error}); compress it anew."
-            ) from None
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        try:
+        with explain_damage(path, "text in UTF-16"):
             return data.decode("utf-16")
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path} is not a text file in UTF-16 (byte {error.start}).") from error
     binary = re.search(rb"[\x00-\x08\x0e-\x1a]", data)
     if binary:
         raise InputError(
@@ -400,17 +365,16 @@ def _read_table(path: Path, drop_broken: bool) -> _Table:
         kept = kept[1:]
     if not kept:
         raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line per sample.")
-    delimiter = find_delimiter([line for _, line in kept[:SNIFFED]])
-    quoted = any('"' in line for _, line in kept)
-    rows = _split_rows(path, kept if quoted else kept[:SNIFFED], delimiter)
-    comments = [line for k, line in lines[: kept[0][0] - 1] if line.lstrip().startswith(COMMENTS)]
-    header = read_header(rows, _split_comment(comments[-1], delimiter) if comments else [])
-    body = kept[header.first :]
-    numbers = None if quoted or not body else _parse_block([line for _, line in body], delimiter, len(header.names))
-    if numbers is not None:
-        return _Table(str(path), header, np.array([k for k, _ in body], dtype=np.intp), list(numbers.T))
-    rows = rows[header.first :] if quoted else _split_rows(path, body, delimiter)
-    rows, broken = _check_widths(path, header, rows, drop_broken)
+    delimiter = find_delimiter(kept[:SNIFFED])
+    comments = [
+        (k, line.strip().lstrip("#% \t")) for k, line in lines[: kept[0][0] - 1] if line.lstrip().startswith(COMMENTS)
+    ]
+    try:
+        rows, notes = split_lines(kept, delimiter), split_lines(comments[-1:], delimiter)
+    except ValueError as error:
+        raise InputError(f"{path}, {error}") from error
+    header = read_header(rows, notes[0][1] if notes else [])
+    rows, broken = _check_widths(path, header, rows[header.first :], drop_broken)
     if not rows:
         raise InputError(f"{path} has a header but no rows; there is nothing to read.")
     comma = delimiter != "," and _use_decimal_commas(path, rows)  # between commas, 1,234 is rather a thousand
@@ -418,51 +382,11 @@ def _read_table(path: Path, drop_broken: bool) -> _Table:
     return _Table(str(path), header, places, list(zip(*(cells for _, cells in rows), strict=True)), comma, broken)
 
 
-def _parse_block(lines: list[str], delimiter: str, width: int) -> FloatArray | None:
-    """Return lines that have numbers alone as an array; None for all others, which are split into cells.
+def _check_widths(path: Path, header: Header, rows: list[Row], drop: bool) -> tuple[list[Row], list[int]]:
+    """Return rows that have as many cells as there are names, and the lines that have not and are dropped.
 
-    NumPy's reader takes a quarter of the time that cells take.
+    Empty cells at the end do not count.
     """
-    text = "\n".join(["", *lines, ""])
-    if delimiter != " ":
-        if lines[0].count(delimiter) == width and all(line.endswith(delimiter) for line in lines):
-            text = text.replace(f"{delimiter}\n", "\n")
-        for empty in (2 * delimiter, 2 * delimiter, f"\n{delimiter}", f"{delimiter}\n"):  # pairs may overlap
-            text = text.replace(empty, f"{empty[0]}nan{empty[1]}")
-    if delimiter != "," and "," in text:
-        if "." in text:
-            return None
-        text = text.replace(",", ".")
-    if "_" in text or _LONG_INTEGER.search(text, 0, text.index("\n", 1)):
-        return None
-    lines = text.split("\n")[1:-1]
-    try:
-        numbers = np.loadtxt(lines, delimiter=None if delimiter == " " else delimiter, comments=None, ndmin=2)
-    except ValueError:
-        return None
-    return numbers if numbers.shape == (len(lines), width) else None
-
-
-def _split_comment(line: str, delimiter: str) -> list[str]:
-    try:
-        return split_lines([line.strip().lstrip("#%").strip()], delimiter)[0]
-    except csv.Error:
-        return []
-
-
-def _split_rows(path: Path, kept: list[tuple[int, str]], delimiter: str) -> list[Row]:
-    """Return the number and the cells of each line; of lines that quotes join, the number of the last one."""
-    source = (line.strip() if delimiter == " " else line for _, line in kept)
-    reader = csv.reader(source, delimiter=delimiter, skipinitialspace=True)
-    try:
-        return [(kept[reader.line_num - 1][0], [cell.rstrip() for cell in cells]) for cells in reader]
-    except csv.Error as error:
-        line = kept[min(reader.line_num, len(kept)) - 1][0]
-        raise InputError(f"{path}, line {line}: {error}; is a quotation mark missing?") from error
-
-
-def _check_widths(path: Path, header: Header, rows: list[Row], drop: bool) -> tuple[list[Row], tuple[Issue, ...]]:
-    """Return rows that have as many cells as there are names; empty cells at the end do not count."""
     width = len(header.names)
     kept: list[Row] = []
     broken: list[int] = []
@@ -479,30 +403,22 @@ def _check_widths(path: Path, header: Header, rows: list[Row], drop: bool) -> tu
                 f"{path}, line {line}: {len(cells)} fields where the header has {width}; is a field missing?{hint} "
                 "repair='drop-broken-lines' leaves such lines out."
             )
-    return kept, _list_broken(str(path), broken)
-
-
-def _list_broken(source: str, lines: Sequence[int]) -> tuple[Issue, ...]:
-    if not lines:
-        return ()
-    figures = {"line": float(lines[0]), "count": float(len(lines)), "repaired": 1.0}
-    return (Issue("log: broken lines", (source, "line"), figures),)
+    return kept, broken
 
 
 def _use_decimal_commas(path: Path, rows: list[Row]) -> bool:
     """Return whether numbers have decimal commas; raise if some have commas and others points."""
-    comma = point = None
-    for line, cells in rows:
-        for cell in cells:
-            if comma is None and "," in cell and _COMMA_NUMBER.fullmatch(cell):
-                comma = (line, cell)
-            elif point is None and "." in cell and _POINT_NUMBER.fullmatch(cell):
-                point = (line, cell)
-        if comma and point:
-            raise InputError(
-                f"{path} has numbers with decimal commas and with decimal points: {comma[1]!r} in line {comma[0]}, "
-                f"{point[1]!r} in line {point[0]}. Export it with one of them."
-            )
+
+    def find(mark: str) -> tuple[int, str] | None:
+        numbers = ((line, cell) for line, cells in rows for cell in cells if mark in cell and _NUMBER.fullmatch(cell))
+        return next(numbers, None)
+
+    comma, point = find(","), find(".")
+    if comma and point:
+        raise InputError(
+            f"{path} has numbers with decimal commas and with decimal points: {comma[1]!r} in line {comma[0]}, "
+            f"{point[1]!r} in line {point[0]}. Export it with one of them."
+        )
     return comma is not None
 
 
@@ -539,65 +455,72 @@ def _find_time(table: _Table, channels: Sequence[int]) -> int:
     numbers, bad = table.parse_column(0)
     if len(table.header.names) > 1 and not bad.any() and np.all(np.diff(numbers) >= 0) and numbers[-1] > numbers[0]:
         return 0
-    raise InputError(
-        f"{table.source}: no column is called time; its columns are {join_names(table.header.names)}. Name the one "
-        "with the times: time = ..."
-    )
+    refuse_without_times(table.source, table.header.names)
 
 
 def _read_times(table: _Table, column: int, options: Options) -> Log:
     """Return a log with the times of a table, and no channels."""
-    name, cells = table.header.names[column], table.list_cells(column)
+    name, cells = table.header.names[column], table.columns[column]
     unit, zone = table.header.units[column], ""
     times: NDArray[Any]
     sample = next((cell for cell in cells if not is_missing(cell)), "")
-    if is_date(sample):
-        places = [f"{table.source}, line {line}, column {name!r}" for line in table.lines]
-        is_clock = "-" not in sample and "/" not in sample and sample.count(".") < 2
-        days = _list_days(table) if is_clock else []
-        if is_clock and not days:
-            times, unit = parse_clock(cells, places), "s"
-        else:
-            dated = [f"{day} {clock}" for day, clock in zip(days, cells, strict=True)] if is_clock else cells
-            times, zone = parse_dates(dated, places)
-    elif cells and all(map(_LONG_INTEGER.fullmatch, cells)):
+    is_clock = _CLOCK.fullmatch(sample) is not None
+    days = _list_days(table) if is_clock else [""] * len(cells)
+    if is_clock and not days:
+        what = "is not a time of day such as 12:34:56.789, as the others are."
+        times, unit = np.array(_read_cells(table, column, cells, _read_clock, np.nan, what)), "s"
+    elif is_date(sample):
+        what = "is not a date that can be read; write dates as 2024-05-01T12:34:56.789, or times as numbers."
+        dated = [f"{day} {cell}".strip() for day, cell in zip(days, cells, strict=True)]
+        dates = _read_cells(table, column, dated, _read_date, (None, None), what)
+        times = np.array([instant for instant, _ in dates], dtype="datetime64[us]")
+        zones = {zone for _, zone in dates} - {None}
+        zone = zones.pop() if len(zones) == 1 else "UTC"
+    elif all(map(_LONG_INTEGER.fullmatch, cells)):
         times = np.array(list(map(int, cells)))
     else:
         times, bad = table.parse_column(column)
         if bad.any():
-            _refuse_cell(table, column, int(bad.argmax()))
+            _refuse_cell(table, column, cells, int(bad.argmax()), NO_NUMBER)
     return build_log(table.source, {name: times}, {name: unit}, options._replace(time=name), {name: zone})
+
+
+def _read_cells(
+    table: _Table, column: int, cells: Sequence[str], read: Callable[[str], Any], missing: Any, what: str
+) -> list[Any]:
+    """Return what a function reads in each cell of a column; raise InputError where that is None."""
+    found = [missing if is_missing(cell) else read(cell) for cell in cells]
+    if None in found:
+        _refuse_cell(table, column, cells, found.index(None), what)
+    return found
 
 
 def _list_days(table: _Table) -> list[str]:
     """Return the cells of the column with the dates of times of day; none if there is no such column."""
     lower = [name.lower() for name in table.header.names]
     day = next((lower.index(name) for name in _DATE_NAMES if name in lower), None)
-    return [] if day is None else table.list_cells(day)
+    return [] if day is None else list(table.columns[day])
 
 
-def _refuse_cell(table: _Table, column: int, row: int) -> None:
+def _refuse_cell(table: _Table, column: int, cells: Sequence[str], row: int, what: str) -> NoReturn:
     raise InputError(
-        f"{table.source}, line {table.lines[row]}, column {table.header.names[column]!r}: "
-        f"{table.columns[column][row]!r} is not a number; leave the cell empty where a value is missing."
+        f"{table.source}, line {table.lines[row]}, column {table.header.names[column]!r}: {cells[row]!r} {what}"
     )
 
 
 def _drop_text(table: _Table, time: int, wanted: list[int] | None) -> _Table:
     """Return the table without the lines that have text in a column of numbers, or no time."""
-    if isinstance(table.columns[time], np.ndarray):
-        return table
     broken = np.zeros(len(table.lines), dtype=bool)
     for k in range(len(table.header.names)) if wanted is None else {time, *wanted}:
-        cells = table.list_cells(k)
+        cells = table.columns[k]
         bad = table.parse_column(k)[1]
         if k == time and is_date(cells[0]):
             bad = np.array([not is_date(cell) for cell in cells])
         if not _is_text(cells, bad):
             broken |= bad
     columns = [list(compress(column, ~broken)) for column in table.columns]
-    issues = table.broken + _list_broken(table.source, table.lines[broken].tolist())
-    return replace(table, columns=columns, lines=table.lines[~broken], broken=issues)
+    lines = table.broken + table.lines[broken].tolist()
+    return replace(table, columns=columns, lines=table.lines[~broken], broken=lines)
 
 
 def _is_text(cells: Sequence[str], bad: NDArray[np.bool_]) -> bool:

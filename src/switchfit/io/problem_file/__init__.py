@@ -14,15 +14,16 @@ import difflib
 import inspect
 import os
 import re
+import reprlib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 import pydantic
 
 from switchfit.io.logs import ENDINGS, find_logs, name_files
-from switchfit.io.problem_file.tables import OPTIONS, Contents, ExperimentTable, OptionsTable, Table, describe_keys
+from switchfit.io.problem_file.tables import Contents, ExperimentTable, Table, describe_keys
 from switchfit.io.user_files import build_at, find_object
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -32,50 +33,29 @@ if TYPE_CHECKING:
     from switchfit.io.problem_file.experiments import Runs
     from switchfit.io.problem_file.logs import Opened
 
-T = TypeVar("T", bound=Table)
 
-
-def read_text(path: Path) -> str:
-    """Return the text of a problem file; raise InputError if it cannot be read.
+def read_contents(path: Path, text: str | None = None) -> tuple[str, Contents]:
+    """Return the text of a problem file and its checked tables; raise InputError with the key that is wrong.
 
     Parameters
     ----------
     path : Path
+    text : str, optional
+        Instead of what the file contains.
     """
     with explain_read_errors(path, "problem file", "the problem file"):
-        data = path.read_bytes()
+        data = path.read_bytes() if text is None else text.encode()
     try:
-        return data.decode()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}.{_suggest_init(path)}") from error
-
-
-def _suggest_init(path: Path) -> str:
-    """Return what to do with a log that was given in place of a problem file; an empty string for another file."""
-    is_log = path.name.lower().endswith(ENDINGS)
-    return f" If it is a log, begin with: switchfit init NAME --from {path}" if is_log else ""
-
-
-def _parse(path: Path, text: str) -> dict[str, Any]:
+        text = data.decode()
+        given = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # no text, no TOML, a number with thousands of digits
+        is_log = path.name.lower().endswith(ENDINGS)
+        remedy = f" If it is a log, begin with: switchfit init NAME --from {path}" if is_log else ""
+        raise InputError(f"{path} is not valid TOML: {error}.{remedy}") from error
     try:
-        return tomllib.loads(text)
-    except RecursionError as error:
-        raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
-    except ValueError as error:  # invalid TOML, or a number with thousands of digits
-        raise InputError(f"{path} is not valid TOML: {error}.{_suggest_init(path)}") from error
-
-
-def parse_contents(path: Path, text: str) -> Contents:
-    """Return the checked tables of a problem file; raise InputError with the key that is wrong.
-
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    text : str
-    """
-    given = _parse(path, text)
-    contents = check_table(Contents, given, str(path))
+        contents = Contents.model_validate(given)
+    except pydantic.ValidationError as error:
+        raise InputError(f"{path}: {_describe_error(error)}") from error
     if contents.problem is not None:
         others = [key for key in ("model", "parameters", "experiments") if key in given]
         if others:
@@ -86,31 +66,14 @@ def parse_contents(path: Path, text: str) -> Contents:
         raise InputError(f"{path}: the key 'model' is missing; name one of {', '.join(BUILT_IN)} or 'file.py:object'.")
     elif not contents.experiments:
         raise InputError(f"{path}: [[experiments]] is missing; give at least one.")
-    return contents
+    return text, contents
 
 
-def check_table(kind: type[T], given: Any, where: str) -> T:
-    """Return a table; raise InputError with the key that is wrong.
-
-    Parameters
-    ----------
-    kind : type
-    given : object
-    where : str
-        Where it is given, for messages.
-    """
-    try:
-        return kind.model_validate(given)
-    except pydantic.ValidationError as error:
-        raise InputError(f"{where}: {_describe_error(error, kind)}") from error
-
-
-def _describe_error(error: pydantic.ValidationError, kind: type[Table]) -> str:
-    """Return the first error in a table as a sentence."""
+def _describe_error(error: pydantic.ValidationError) -> str:
+    """Return the first error in a file as a sentence."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
-    table, field, steps = _follow_location(kind, first["loc"])
-    key = _join_steps(steps)
+    table, field, key = _follow_location(first["loc"])
     if first["type"] == "extra_forbidden":
         known = list(table.model_fields)
         close = difflib.get_close_matches(field, known, n=1)
@@ -118,30 +81,35 @@ def _describe_error(error: pydantic.ValidationError, kind: type[Table]) -> str:
         sentence = f"unknown key {key}; {remedy}"
     else:
         description = describe_keys(table)[field]
-        sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({description})."
+        sentence = f"{key} {_rephrase(first['msg'])}; got {reprlib.repr(first['input'])} ({description})."
         if first["type"] == "missing":
             sentence = f"the key {key} is missing: {description}."
-    different = {_join_steps(_follow_location(kind, e["loc"])[2]) for e in errors} - {key}
+    different = {_follow_location(each["loc"])[2] for each in errors} - {key}
     return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
 
 
-def _follow_location(holder: type[Table], location: Sequence[str | int]) -> tuple[type[Table], str, list[str | int]]:
-    """Return the table of the key at a location, the key, and the steps to it without pydantic's names for unions."""
-    inner: type[Table] | None = holder
-    key = ""
-    steps: list[str | int] = []
+def _follow_location(location: Sequence[str | int]) -> tuple[type[Table], str, str]:
+    """Return the table of the key at a location, the key, and its place, ``'experiments[1].data[2].file'``.
+
+    pydantic's names for unions are left out.
+    """
+    holder: type[Table] = Contents
+    inner: type[Table] | None = Contents
+    key = place = ""
     is_chosen = False  # by the user, as the names of parameters are
     for step in location:
-        if isinstance(step, int) or is_chosen:
-            steps.append(step)
+        if isinstance(step, int):
+            place += f"[{step + 1}]"
+        elif is_chosen:
+            place += f".{step}"
             is_chosen = False
         elif inner is not None and (step in inner.model_fields or step == location[-1]):
-            steps.append(step)
+            place += f".{step}" if place else step
             holder, key = inner, step
             field = holder.model_fields.get(key)
             annotation = field.annotation if field else None
             inner, is_chosen = _find_table(annotation), get_origin(annotation) is dict
-    return holder, key, steps
+    return holder, key, repr(place)
 
 
 def _find_table(annotation: Any) -> type[Table] | None:
@@ -150,28 +118,10 @@ def _find_table(annotation: Any) -> type[Table] | None:
     return next((found for part in get_args(annotation) if (found := _find_table(part)) is not None), None)
 
 
-def _join_steps(steps: Sequence[str | int]) -> str:
-    """Return ``'experiments[1].data[2].file'``, counted from 1."""
-    text = ""
-    for step in steps:
-        text += f"[{step + 1}]" if isinstance(step, int) else f".{step}" if text else step
-    return repr(text)
-
-
-def _rephrase(error: Any) -> str:
+def _rephrase(message: str) -> str:
     """Return pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
-    if error["type"] in ("too_short", "too_long"):
-        bound, size = next((k, v) for k, v in error["ctx"].items() if k in ("min_length", "max_length"))
-        return f"must have at {'least' if bound == 'min_length' else 'most'} {size} entries"
-    message = error["msg"][:1].lower() + error["msg"][1:]
-    for old, new in (("input should be", "must be"), ("a valid ", "a "), ("dictionary", "table"), (" or instance", "")):
-        message = message.replace(old, new)
-    return re.sub(r" of \w+Table$", "", message)
-
-
-def _shorten(given: Any) -> str:
-    text = repr(given)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    message = re.sub(r"^\w+ should", "must", message).replace("dictionary", "table").replace("a valid ", "a ")
+    return re.sub(r" or instance of \w+$", "", message)
 
 
 def load_problem(
@@ -227,8 +177,8 @@ def load_problem(
     (('tau_1', 'heating', 'loss', 'T(t0)'), {})
     """
     path = Path(path)
-    text = read_text(path) if text is None else text
-    contents, opened = _open(path, text, log, streamed=streamed)
+    text, contents = read_contents(path, text)
+    contents, opened = _open(path, contents, log, streamed=streamed)
     from switchfit.io.problem_file.building import build_problem
 
     return build_problem(path, text, contents, opened, log, searched=searched)
@@ -252,15 +202,16 @@ def read_experiments(path: str | Path) -> Runs:
         As in `load_problem`.
     """
     path = Path(path)
-    contents, opened = _open(path, read_text(path), None)
+    contents, opened = _open(path, read_contents(path)[1], None)
     from switchfit.io.problem_file.building import build_without_python
 
     return build_without_python(path, contents, opened)
 
 
-def _open(path: Path, text: str, log: str | Path | None, *, streamed: bool = False) -> tuple[Contents, list[Opened]]:
-    """Return the checked tables of a file and its open logs; arguments as of `load_problem`."""
-    contents = parse_contents(path, text)
+def _open(
+    path: Path, contents: Contents, log: str | Path | None, *, streamed: bool = False
+) -> tuple[Contents, list[Opened]]:
+    """Return the tables of a file, with another log in them if one is given, and its open logs."""
     if contents.problem is not None:
         find_object(contents.problem, path.parent, f"{path}: problem")
     elif contents.model is not None and ".py" in contents.model.name:
@@ -318,6 +269,3 @@ def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
     left_out = any(item.file is None for item in table.list_logs().values())
     files = {None if left_out else table.data[0].file: log}
     return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})
-
-
-__all__ = ["OPTIONS", "OptionsTable", "load_problem", "read_experiments"]

@@ -5,12 +5,11 @@ The files that a problem was built from, and their hashes.
 
 from __future__ import annotations
 
-import ast
 import hashlib
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +20,15 @@ from switchfit.io.problem_file.experiments import (
     build_experiments,
     build_parameter,
     build_system,
-    check_model_name,
     make,
 )
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
-from switchfit.io.user_files import build_at, load_object
-from switchfit.models import BUILT_IN
+from switchfit.io.user_files import build_at, load_object, replace_files
 from switchfit.modes.library import build_library
+from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError, Issue
-from switchfit.runtime.files import is_regular
-
-PYTHON_FILE = re.compile(r"(?P<file>[^:]+\.py):\w+")
-"""How a problem file names an object in a Python file."""
 
 
 def describe_sources(
@@ -56,7 +50,14 @@ def describe_sources(
         Arguments of `estimate`.
     """
     folder = path.absolute().parent
-    files = [file for name in dict.fromkeys(_list_names(contents)) for file in _list_files(folder, name)]
+    names: list[str] = []
+
+    def note(name: str) -> str:
+        names.append(name)
+        return name
+
+    replace_files(contents, note)
+    files = [file for name in names for file in _list_files(folder, name)]
     return Provenance(
         problem_file=path.name,
         folder=str(folder),
@@ -70,53 +71,15 @@ def describe_sources(
     )
 
 
-def _list_names(contents: Any) -> Iterator[str]:
-    """Yield the names of files: logs under the key ``file``, Python files with their objects."""
-    if isinstance(contents, Mapping):
-        for key, value in contents.items():
-            if key == "file" and isinstance(value, str):
-                yield value
-            else:
-                yield from _list_names(value)
-    elif isinstance(contents, (list, tuple)):
-        for value in contents:
-            yield from _list_names(value)
-    elif isinstance(contents, str) and (match := PYTHON_FILE.fullmatch(contents)):
-        yield match["file"]
-
-
 def _list_files(folder: Path, name: str) -> list[Path]:
     """Return the files that a name stands for: those of a pattern or a bag, a Python file and those that it imports."""
     if name.endswith(".py"):
-        return list(_follow_imports(folder / name))
-    try:
-        paths = [folder / found for found in find_logs(folder, name) or [name]]
-    except InputError:  # an argument of the model that is called "file", and is no log
-        return []
-    return [
-        file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if is_regular(file)
-    ]
-
-
-def _follow_imports(path: Path) -> dict[Path, None]:
-    """Return a Python file and the files of its folder that it imports, and so on."""
-    found, left = {path: None}, [path]
-    while left:
-        file = left.pop()
-        try:
-            tree = ast.parse(file.read_bytes())
-        except (OSError, SyntaxError, ValueError):
-            continue
-        for node in ast.walk(tree):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-            for name in names:
-                base = path.parent.joinpath(*name.split("."))
-                for candidate in (base.with_name(f"{base.name}.py"), base / "__init__.py"):
-                    if candidate not in found and is_regular(candidate):
-                        found[candidate] = None
-                        left.append(candidate)
-    return found
+        finder = ModuleFinder([str((folder / name).parent)])
+        finder.run_script(str(folder / name))
+        files = [getattr(module, "__file__", None) for module in finder.modules.values()]
+        return [Path(file) for file in files if file is not None]
+    paths = [folder / found for found in find_logs(folder, name) or [name]]
+    return [file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
 
 
 def digest_file(folder: Path, path: Path) -> FileDigest:
@@ -206,13 +169,10 @@ def build_without_python(path: Path, contents: Contents, opened: Sequence[Opened
     contents : Contents
     opened : sequence of Opened
     """
-    if contents.problem is not None:
+    if contents.model is None:
         return Runs((), ())
-    if contents.model is not None and contents.model.name not in BUILT_IN:
-        check_model_name(f"{path}: model", contents.model)
-    for name, table in contents.parameters.items():
-        build_at(f"{path}: parameters.{name}", build_parameter, table)
-    return build_experiments(path, contents, opened, None)
+    _build_parameters(path, contents)
+    return build_experiments(path, contents, opened, build_system(path, contents.model, run=False))
 
 
 def _load_from_python(path: Path, contents: Contents) -> Problem:
@@ -229,11 +189,12 @@ def _build_from_tables(
 ) -> tuple[Problem, Runs]:
     system = build_system(path, contents.model or ModelTable(name=""))
     runs = build_experiments(path, contents, opened, system, searched=searched)
-    parameters = {
-        name: build_at(f"{path}: parameters.{name}", build_parameter, table)
-        for name, table in contents.parameters.items()
-    }
     options = contents.options.model_dump(exclude=OPTIONS, exclude_none=True)
     if searched:  # with room for transitions, a problem may have nothing else to estimate
         options["max_transitions"] = max(1, *(len(e.transition_times) + len(e.jump_times) for e in runs.experiments))
-    return build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs
+    return build_at(f"{path}", Problem, system, runs.experiments, _build_parameters(path, contents), **options), runs
+
+
+def _build_parameters(path: Path, contents: Contents) -> dict[str, Parameter]:
+    tables = contents.parameters
+    return {name: build_at(f"{path}: parameters.{name}", build_parameter, tables[name]) for name in tables}

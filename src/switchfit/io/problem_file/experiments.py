@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from switchfit.io.logs.log import Log
-from switchfit.io.problem_file.logs import Opened, cut_log, find_origin, find_parameters, list_columns
+from switchfit.io.problem_file.logs import Opened, cut_log, find_parameters, list_columns
 from switchfit.io.problem_file.tables import (
     Contents,
     DataTable,
@@ -38,21 +38,25 @@ from switchfit.runtime.errors import InputError, Issue
 T = TypeVar("T")
 
 
-def build_system(path: Path, table: ModelTable) -> HybridSystem:
-    """Return the system of a model that is built in, or in a Python file.
+def build_system(path: Path, table: ModelTable, *, run: bool = True) -> HybridSystem | None:
+    """Return the system of a model that is built in, or in a Python file; None if that is not to be run.
 
     Parameters
     ----------
     path : Path
         The problem file.
     table : ModelTable
+    run : bool
     """
     what = f"{path}: model"
-    if table.name in BUILT_IN:
-        found = BUILT_IN[table.name]
-    else:
-        check_model_name(what, table)
-        found = load_object(table.name, path.parent, what)
+    if ".py" not in table.name and table.name not in BUILT_IN:
+        raise InputError(
+            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of your "
+            "own as 'file.py:object'."
+        )
+    if not run:
+        return None
+    found = BUILT_IN.get(table.name) or load_object(table.name, path.parent, what)
     return make(found, table, what, HybridSystem)
 
 
@@ -69,7 +73,7 @@ def make(found: Any, table: ModelTable, what: str, kind: type[T]) -> T:
     kind : type
     """
     if callable(found):
-        found = call(found, f"{what} {table.name!r}", **_check_arguments(found, table, what))
+        found = _call(found, table, what)
     elif table.arguments:
         raise InputError(f"{what} {table.name!r} is not a function; leave out its arguments.")
     if not isinstance(found, kind):
@@ -80,91 +84,14 @@ def make(found: Any, table: ModelTable, what: str, kind: type[T]) -> T:
     return found
 
 
-def check_model_name(what: str, table: ModelTable) -> None:
-    """Raise InputError unless a model that is not built in is named as an object of a Python file.
-
-    Parameters
-    ----------
-    what : str
-        Place in the problem file, for messages.
-    table : ModelTable
-    """
-    if ".py" not in table.name:
-        raise InputError(
-            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of your "
-            "own as 'file.py:object'."
-        )
-
-
-def _check_arguments(factory: Callable[..., Any], table: ModelTable, what: str) -> dict[str, Any]:
-    """Return the arguments of a table; raise if the factory does not take them."""
+def _call(factory: Callable[..., Any], table: ModelTable, what: str) -> Any:
+    """Return what a function of a user returns with the arguments of a table; raise if it does not take them."""
     try:
         inspect.signature(factory).bind(**table.arguments)
     except TypeError as error:
         takes = ", ".join(inspect.signature(factory).parameters) or "no arguments"
         raise InputError(f"{what} {table.name!r}: {error}; it takes {takes}.") from error
-    return table.arguments
-
-
-def build_jump(folder: Path, table: JumpTable, system: HybridSystem | None, where: str) -> Jump:
-    """Return a jump; without a system, one whose map was not loaded.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the problem file.
-    table : JumpTable
-    system : HybridSystem or None
-    where : str
-        Place in the problem file, for messages.
-    """
-    if ".py" not in table.map.name:
-        raise ValueError(f"map must name a function of a Python file, 'file.py:function'; got {table.map.name!r}.")
-    if system is None:
-        find_object(table.map.name, folder, where)
-        return Jump(table.time, lambda t, x, p: x)
-    found = load_object(table.map.name, folder, where)
-    if table.map.arguments and callable(found):
-        found = call(found, f"{where} {table.map.name!r}", **_check_arguments(found, table.map, where))
-    return Jump(table.time, found)
-
-
-def build_observe(folder: Path, table: DataTable, system: HybridSystem | None, where: str) -> Callable[..., Any] | None:
-    """Return the observation h(t, x, p); None for the whole state, or without a system.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the problem file.
-    table : DataTable
-    system : HybridSystem or None
-    where : str
-        Place in the problem file, for messages.
-    """
-    if table.observe is None:
-        return None
-    if isinstance(table.observe, str):
-        if system is None:
-            find_object(table.observe, folder, f"{where}.observe")
-            return None
-        observe = load_object(table.observe, folder, f"{where}.observe")
-        if not callable(observe):
-            raise ValueError(f"observe {table.observe!r} must be a function h(t, x, p); got {type(observe).__name__}.")
-        return observe
-    if len(table.observe) != len(table.columns):
-        raise ValueError(
-            f"observe must name one state for each of the {len(table.columns)} columns; got {table.observe}."
-        )
-    if system is None:
-        return None
-    if system.state_names is None:
-        raise ValueError("observe names states, but the model has no state_names; add them to it.")
-    unknown = [name for name in table.observe if name not in system.state_names]
-    if unknown:
-        raise ValueError(
-            f"observe names the unknown state {unknown[0]!r}; the states are {', '.join(system.state_names)}."
-        )
-    return select_states(tuple(system.state_names.index(name) for name in table.observe))
+    return call(factory, f"{what} {table.name!r}", **table.arguments)
 
 
 @functools.cache
@@ -291,7 +218,7 @@ class _Run:
             build = self._build_input if isinstance(item, InputTable) else self._build_data
             built[place] = build_at(f"{self.where}.{place}", build, place, item, log)
         inputs, times, state = built.pop("inputs", None), table.transition_times, table.initial_state
-        places = [f"{self.where}.jumps[{k}]" for k in range(1, len(table.jumps) + 1)]
+        jumps = {f"jumps[{k}]": jump for k, jump in enumerate(table.jumps, start=1)}
         return Experiment(
             data=list(built.values()),
             mode_sequence=tuple(table.mode_sequence or ()),
@@ -303,16 +230,39 @@ class _Run:
             parameter_map=table.parameter_map,
             name=table.name,
             time_unit=table.time_unit,
-            jumps=[
-                build_at(place, build_jump, self.folder, item, self.system, f"{place}.map")
-                for place, item in zip(places, table.jumps, strict=True)
-            ],
-            origin=find_origin(table, logs),
+            jumps=[build_at(f"{self.where}.{at}", self._build_jump, at, jump) for at, jump in jumps.items()],
+            origin=table.origin,
             time_zone=table.time_zone,
         )
 
+    def _load_function(self, place: str, reference: str) -> Any:
+        """Return a function of a Python file, or one in its place if that is not to be run."""
+        if self.system is not None:
+            return load_object(reference, self.folder, f"{self.where}.{place}")
+        find_object(reference, self.folder, f"{self.where}.{place}")
+        return lambda t, x, p: x
+
+    def _build_jump(self, place: str, table: JumpTable) -> Jump:
+        found = self._load_function(f"{place}.map", table.map.name)
+        if table.map.arguments and self.system is not None:
+            found = _call(found, table.map, f"{self.where}.{place}.map")
+        return Jump(table.time, found)
+
+    def _build_observe(self, place: str, table: DataTable) -> Callable[..., Any] | None:
+        """Return the observation h(t, x, p); None for the whole state."""
+        if isinstance(table.observe, str):
+            return self._load_function(f"{place}.observe", table.observe)
+        if self.system is None or table.observe is None:
+            return None
+        states = self.system.state_names
+        if states is None:
+            raise ValueError("observe names states, but the model has no state_names; add them to it.")
+        if unknown := [name for name in table.observe if name not in states]:
+            raise ValueError(f"observe names the unknown state {unknown[0]!r}; the states are {', '.join(states)}.")
+        return select_states(tuple(map(states.index, table.observe)))
+
     def _build_data(self, place: str, item: DataTable, log: Log) -> Measurements | ReferenceSignal:
-        observe = build_observe(self.folder, item, self.system, f"{self.where}.{place}")
+        observe = self._build_observe(place, item)
         for key in FOREIGN[item.kind]:
             if key in item.model_fields_set:
                 raise ValueError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,15 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import make_relative
 from switchfit.io.first_problem import write_table
 from switchfit.io.problem_file.building import ProblemFile
-from switchfit.io.problem_file.tables import StateTable, Table
-from switchfit.problem.experiment import Experiment, initial_state_of
-from switchfit.problem.parameter import LogNormal, Normal, Parameter
-from switchfit.problem.system import HybridSystem
+from switchfit.io.user_files import replace_files
+from switchfit.problem.experiment import Experiment
 from switchfit.runtime.errors import InputError
 
 
 def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) -> str:
     """Return the text of a problem file with the mode sequences and the values of an estimate.
+
+    Initial states that the model has, and not the file, stay with the model.
 
     Parameters
     ----------
@@ -42,9 +41,12 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
         raise InputError(
             f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
         )
-    tables = _dump(contents)
+    tables = contents.model_dump(exclude_unset=True, exclude_none=True)
     for e, (table, run) in enumerate(zip(tables["experiments"], problem.experiments, strict=True)):
-        table |= _describe_run(estimate, problem.system, e, run)
+        table |= _describe_run(estimate, e, run)
+        for entry, value in zip(table.get("initial_state", ()), estimate.initial_state[e], strict=False):
+            if not entry.get("fixed"):
+                entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
     parameters = tables.get("parameters", {})
     for name, table in parameters.items():
         parameter = problem.parameters[name]
@@ -57,74 +59,22 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     if isinstance(durations, Mapping):
         durations = {mode: seconds for mode, seconds in durations.items() if seconds}
     tables["options"] = options | ({"min_duration": durations} if durations else {})
-    _move_paths(tables, loaded.path.absolute().parent, folder)
-    head = (
-        f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses.\n"
-    )
-    return head + "\n".join(write_table(tables)) + "\n"
+    home = loaded.path.absolute().parent
+    moved = replace_files(tables, lambda name: name if Path(name).is_absolute() else make_relative(home / name, folder))
+    head = f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses."
+    return "\n".join([head, *write_table(moved), ""])
 
 
-def _dump(table: Table) -> dict[str, Any]:
-    """Return what a file says in a table, without what it leaves out."""
-    return table.model_dump(exclude_unset=True, exclude_none=True)
-
-
-def _describe_run(estimate: Estimate, system: HybridSystem, e: int, run: Experiment) -> dict[str, Any]:
+def _describe_run(estimate: Estimate, e: int, run: Experiment) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
-    times = estimate.transition_times[e].tolist()
-    found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times}
+    found = {"mode_sequence": list(run.mode_sequence), "transition_times": estimate.transition_times[e].tolist()}
     if run.origin is not None:
         found["origin"] = run.origin.date
         if run.time_zone is not None:
             found["time_zone"] = run.time_zone
-    state = initial_state_of(system, run)
-    if not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
-        values = estimate.initial_state[e].tolist()
-        found["initial_state"] = [_describe_entry(entry, value) for entry, value in zip(state, values, strict=True)]
     return found
-
-
-def _describe_entry(entry: Any, value: float) -> Any:
-    """Return an entry of the initial state for a problem file."""
-    if not isinstance(entry, Parameter) or entry.fixed:
-        return float(_make_plain(entry.value if isinstance(entry, Parameter) else entry))
-    found = {"value": _confine(value, entry.lower, entry.upper)}
-    for key in ("lower", "upper", "unit", "scale"):
-        stated = _make_plain(getattr(entry, key))
-        if stated != StateTable.model_fields[key].default:
-            found[key] = stated
-    if isinstance(entry.prior, (Normal, LogNormal)):
-        found["prior"] = {field.name: _make_plain(getattr(entry.prior, field.name)) for field in fields(entry.prior)}
-    return found
-
-
-def _make_plain(value: Any) -> Any:
-    """Return a number of NumPy, an array or text as Python has it."""
-    return np.asarray(value).tolist()
 
 
 def _confine(value: Any, lower: Any, upper: Any) -> Any:
     """Return an estimate as numbers of Python; rounding must not take it over a bound."""
     return np.clip(np.asarray(value, dtype=float), lower, upper).tolist()
-
-
-def _move_paths(tables: dict[str, Any], home: Path, folder: Path) -> None:
-    """Make paths relative to another folder: logs, and Python files with their objects."""
-
-    def move(name: str) -> str:
-        return name if Path(name).is_absolute() else make_relative(home / name, folder)
-
-    def move_reference(reference: str) -> str:
-        file, colon, thing = reference.rpartition(":")
-        return f"{move(file)}{colon}{thing}" if file.endswith(".py") else reference
-
-    named = [tables["model"]]
-    for run in tables["experiments"]:
-        for item in (*run.get("data", ()), *([run["inputs"]] if "inputs" in run else ())):
-            if "file" in item:
-                item["file"] = move(item["file"])
-            if isinstance(item.get("observe"), str):
-                item["observe"] = move_reference(item["observe"])
-        named += [jump["map"] for jump in run.get("jumps", ())]
-    for table in named:
-        table["name"] = move_reference(table["name"])

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,28 +101,6 @@ def _find_time_scale(log: Log, table: LogTable, time_unit: str) -> float:
     )
 
 
-def find_origin(table: ExperimentTable, logs: Sequence[Log]) -> Any:
-    """Return the date at which times are 0: as stated, else t0, else the beginning of the earliest log with dates.
-
-    Parameters
-    ----------
-    table : ExperimentTable
-    logs : sequence of Log
-        Of its data and inputs.
-    """
-    if table.origin is not None or is_date(table.t0):
-        return table.origin
-    dated = [log for item, log in zip(table.list_logs().values(), logs, strict=True) if _keep_dates(item, log, table)]
-    zones = {log.time_zone for log in dated}
-    if not dated or ("" in zones and len(zones) > 1 and table.time_zone is None):
-        return None  # the experiment says which dates have zones and which have none
-    zone = table.time_zone or (zones.pop() if len(zones) == 1 else "UTC")
-    starts = [
-        as_date(log.start if log.time_zone else log.start.replace(tzinfo=None), "origin") for log in dated if log.start
-    ]
-    return make_origin(min((start.localize(zone, "origin") if zone else start).instants for start in starts), zone)
-
-
 def _keep_dates(item: LogTable, log: Log, run: ExperimentTable) -> bool:
     """Return whether the times of a log are handed over as dates.
 
@@ -183,11 +160,11 @@ def _open_logs(
     path: Path, where: str, contents: Contents, table: ExperimentTable, streamed: bool
 ) -> list[Log] | ValueError:
     """Return the logs of data and inputs, in this order, whose dates begin together; or what is wrong with them."""
-    open_log = _build_empty_log if streamed else _open_log
+    parameters = find_parameters(contents, table)
     try:
         return align_starts(
             [
-                build_at(f"{path}: {where}.{place}", open_log, path.parent, item, find_parameters(contents, table))
+                build_at(f"{path}: {where}.{place}", _open_log, path.parent, item, parameters, streamed)
                 for place, item in table.list_logs().items()
             ]
         )
@@ -206,21 +183,15 @@ def find_parameters(contents: Contents, table: ExperimentTable) -> frozenset[str
     return frozenset(contents.parameters) | frozenset(table.parameter_map)
 
 
-def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str]) -> Log:
+def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str], streamed: bool) -> Log:
+    columns = list(dict.fromkeys(list_columns(table, parameters)))
+    if table.file is None and streamed:
+        return Log(np.zeros(0), dict.fromkeys(columns, np.zeros(0)), dict.fromkeys(columns, ""), "", "the stream")
     if table.file is None:
         raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
     given = table.model_dump(include={"time", "topic", "origin", "range_error", "repair"})
-    columns = list(dict.fromkeys(list_columns(table, parameters)))
     log = read_source(folder / table.file, Options(columns=columns, keep_epoch=True, **given))
     return log if table.epoch is None else _count_from_1970(log, table.epoch)
-
-
-def _build_empty_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str]) -> Log:
-    """Return the log of a table, an empty one if it names no file."""
-    if table.file is not None:
-        return _open_log(folder, table, parameters)
-    columns = list_columns(table, parameters)
-    return Log(np.zeros(0), dict.fromkeys(columns, np.zeros(0)), dict.fromkeys(columns, ""), "", "the stream")
 
 
 def list_columns(table: DataTable | InputTable, parameters: frozenset[str]) -> list[str]:

@@ -62,24 +62,17 @@ def is_date(given: Any) -> bool:
 
 def _check_time(given: Any) -> Any:
     """Return a number or a date."""
-    if isinstance(given, (int, float)) and not isinstance(given, bool):
-        return float(given)
-    if is_date(given):
-        return given
-    raise PydanticCustomError("time_type", f"Input should be a number or a date such as {_find_examples()}")
+    is_number = isinstance(given, (int, float)) and not isinstance(given, bool)
+    return float(given) if is_number else _check_date(given, "a number or a date")
 
 
-def _check_date(given: Any) -> Any:
+def _check_date(given: Any, form: str = "a date") -> Any:
     """Return a date."""
     if is_date(given):
         return given
-    raise PydanticCustomError("date_type", f"Input should be a date such as {_find_examples()}")
-
-
-def _find_examples() -> str:
     from switchfit.problem.dates import EXAMPLES
 
-    return EXAMPLES
+    raise PydanticCustomError("time_type", f"Input should be {form} such as {EXAMPLES}")
 
 
 def _wrap_value(given: Any) -> Any:
@@ -120,7 +113,7 @@ OrTable = Annotated[
 Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
 """A number in the experiment's time unit, or a date."""
 
-Date = Annotated[Any, pydantic.PlainValidator(_check_date)]
+Date = Annotated[Any, pydantic.PlainValidator(lambda given: _check_date(given))]
 Positive = Annotated[float, Field(gt=0)]
 Duration = Annotated[float, Field(ge=0)]
 Names = Annotated[list[str], Field(min_length=1)]
