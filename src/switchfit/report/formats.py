@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import datetime
 import re
+import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -195,18 +196,6 @@ def label_time(run: Timed, name: str = "time") -> str:
     return label_quantity(name, run.time_unit if run.origin is None else run.origin.time_zone)
 
 
-def label_unknown(name: str, unit: str, run: Timed | None) -> str:
-    """Return the label of an axis of values of an unknown: its name with its unit, or with the zone of its dates.
-
-    Parameters
-    ----------
-    name, unit : str
-    run : Timed or None
-        What has the unknown as a time and shows times as dates.
-    """
-    return label_quantity(name, unit) if run is None else label_time(run, name)
-
-
 def list_dated(result: Fit | Problem | Fits) -> list[Timed | None]:
     """Return what has each unknown that is a time with dates as a time: its run; None for every other unknown."""
     if isinstance(result, Fits):
@@ -280,6 +269,10 @@ def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str,
     return number if run is None or run.origin is None else format_time(value, run, error), spread
 
 
+Row = Sequence[str]
+Rows = Sequence[Row]
+
+
 class Table(NamedTuple):
     """Cells as text.
 
@@ -292,9 +285,9 @@ class Table(NamedTuple):
         Of the columns; empty for a table without a header.
     """
 
-    rows: Sequence[Sequence[str]]
+    rows: Rows
     alignment: str
-    titles: Sequence[str] = ()
+    titles: Row = ()
 
     @property
     def columns(self) -> list[int]:
@@ -310,7 +303,7 @@ MOST_JUMPS = 6
 
 
 def format_table(
-    rows: Sequence[Sequence[str]], alignment: str, titles: Sequence[str] = (), *, indent: str = "  "
+    rows: Rows, alignment: str, titles: Row = (), *, indent: str = "  ", most: int = sys.maxsize, where: str = ""
 ) -> list[str]:
     """Return the lines of a table with its columns aligned, two spaces between them.
 
@@ -320,10 +313,16 @@ def format_table(
         As of `Table`.
     indent : str, optional
         What every line begins with.
+    most : int, optional
+        Of more rows the first are listed, and the others counted.
+    where : str, optional
+        Where the others are, behind their number.
     """
-    columns, lines = Table(rows, alignment).columns, [titles, *rows] if titles and rows else rows
+    shown = rows[:most]
+    columns, lines = Table(shown, alignment).columns, [titles, *shown] if titles and rows else shown
     widths = {k: max(len(line[k]) for line in lines) for k in columns}
-    return [(indent + "  ".join(f"{line[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for line in lines]
+    lines = [(indent + "  ".join(f"{line[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for line in lines]
+    return lines + ([f"{indent}and {len(rows) - most} more{where}"] if len(rows) > most else [])
 
 
 def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:

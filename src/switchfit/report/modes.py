@@ -577,12 +577,11 @@ def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]
 
 
 def _list_parameters(log: OnlineLog) -> list[str]:
-    found, rows = _list_values(log), []
-    for name, unit, value, error in found[:LISTED_LAST]:
+    rows = []
+    for name, unit, value, error in _list_values(log):
         shown, spread = format_estimate(float(value[-1]), float(error[-1]), None)
         rows.append([name, shown, spread or "not known yet", unit_suffix(unit).strip()])
-    more = [f"  and {len(found) - LISTED_LAST} more in .parameters"] if len(found) > LISTED_LAST else []
-    return ["", *format_table(rows, "<>><"), *more] if rows else []
+    return ["", *format_table(rows, "<>><", most=LISTED_LAST, where=" in .parameters")] if rows else []
 
 
 def _list_alarms(log: OnlineLog) -> list[str]:

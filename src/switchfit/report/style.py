@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 
 from switchfit.problem.validation import shorten
-from switchfit.report.formats import Timed, label_time, label_unknown
+from switchfit.report.formats import Timed, label_quantity, label_time
 from switchfit.runtime.presentation import Axes, Figure, join_first
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axe
     name, unit : str
     run : Timed or None
     """
-    ax.set_xlabel(label_unknown(name, unit, run))
+    ax.set_xlabel(label_quantity(name, unit) if run is None else label_time(run, name))
     if run is not None:
         return put_ticks(ax, run)
     ax.ticklabel_format(axis="x", useOffset=False)

@@ -11,7 +11,6 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit, Step, disagreement
 from switchfit.fit.trajectory import Comparison
-from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.report.formats import (
     Table,
@@ -97,14 +96,17 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     """
     limits = EVERYTHING if full else SCREEN
     runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    course = [*list_experiments(estimate, limits.experiments, runs, full=full), *list_course(estimate, full=full)]
-    channels = _format_channels(estimate, limits.channels, runs)
+    course = [*list_experiments(estimate, limits.experiments, runs), *list_course(estimate)]
+    where = f", of which more is explained{runs}"
+    channels = format_table(*tabulate_channels(estimate), most=limits.channels, where=where)
     sections = {
         "Fit": _format_rows(course),
-        "Quality of the fit": [*_format_rows(list_quality(estimate, full=full)), *channels],
+        "Quality of the fit": [*_format_rows(list_quality(estimate)), *([""] if channels else []), *channels],
         "Unknowns": _format_unknowns(estimate, limits.unknowns, unknowns),
-        "Held fixed": _format_fixed(estimate, limits.fixed),
-        f"Correlations above {SMALL_CORRELATION:g}": _format_correlations(estimate, limits.correlations, full=full),
+        "Held fixed": format_table(*tabulate_fixed(estimate), most=limits.fixed),
+        f"Correlations above {SMALL_CORRELATION:g}": format_table(
+            list_correlations(estimate), "<>", most=limits.correlations
+        ),
         "Determined worst by the data": _describe_weak(estimate, limits.directions),
         "Warnings": _format_warnings(estimate, limits.warnings, full=full),
     }
@@ -116,8 +118,8 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> list[Row]:
-    """Return each experiment's modes, its horizon and its data; on one screen of several a row each.
+def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
+    """Return each experiment's modes, its horizon, its data, and what its times are counted from.
 
     Parameters
     ----------
@@ -126,29 +128,21 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
         Number of experiments that are listed; the others are counted.
     where : str, optional
         Where to find the others, as the end of a sentence.
-    full : bool
-        Whether each of an experiment's data has a row of its own; it has one if there is a single experiment.
     """
     rows: list[Row] = []
-    single = len(fit.trajectories) == 1
-    names = ["experiment"] if single else fit.run_names
-    for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
+    names = ["experiment"] if len(fit.trajectories) == 1 else fit.run_names
+    origins = list(map(describe_origin, fit.trajectories))
+    for e, (name, trajectory) in enumerate(zip(names[:most], fit.trajectories, strict=False)):
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
-        horizon = format_span(trajectory.times[0], trajectory.times[-1], trajectory)
         jumps = list_jumps(trajectory.jump_times, trajectory)
-        horizon += f", {jumps}" if jumps else ""
-        data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
-        if full or single:
-            rows += [(name, f"{sequence}, {horizon}"), *(("", text) for text in data)]
-        else:
-            rows.append((name, "; ".join([f"{sequence}, {horizon}", *data])))
+        parts = [sequence, format_span(trajectory.times[0], trajectory.times[-1], trajectory), jumps]
+        rows.append((name, ", ".join(filter(None, parts))))
+        data = [_format_data(comparison) for comparison in fit.comparisons[e]]
+        rows += [("", text) for text in data or ["no data: a cost of the trajectory"]]
+        if origins[e] and origins[e] not in origins[e - 1 : e]:
+            rows.append(("times", origins[e]))
     if len(names) > most:
         rows.append(("", f"and {len(names) - most} more experiments{where}"))
-    origins = set(filter(None, map(describe_origin, fit.trajectories)))
-    if len(origins) > 1 and full:
-        rows += [(name, describe_origin(run)) for name, run in zip(names, fit.trajectories, strict=True) if run.origin]
-    elif origins:
-        rows.append(("times", "counted from a date of each experiment's own" if len(origins) > 1 else origins.pop()))
     return rows
 
 
@@ -164,32 +158,25 @@ def _format_data(comparison: Comparison) -> str:
     return f"{names}: {format_count(len(comparison.times), 'sample')}{note}"
 
 
-def list_course(fit: Fit, *, full: bool) -> list[Row]:
-    """Return the method, the effort, the strategies with the lowest J after each, and how the fit ended.
+def list_course(fit: Fit) -> list[Row]:
+    """Return the method, the effort, the engine, the strategies with the lowest J after each, and how the fit ended.
 
     Parameters
     ----------
     fit : Fit
-    full : bool
-        Whether to give the whole message, and the engine in a row of its own.
     """
     rows = [("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))]
     iterations, evaluations = format_count(fit.iterations, "iteration"), format_count(fit.evaluations, "evaluation")
     effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
     if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
         effort = f"{evaluations}, {fit.seconds:.3g} s in all, {iterations} in the last fit"
-    if fit.engine is None:
-        rows.append(("effort", effort))
-    else:
-        rows += [("effort", effort), ("", str(fit.engine))] if full else [("effort", f"{effort}. {fit.engine}")]
+    rows += [("effort", effort), *([("", str(fit.engine))] if fit.engine is not None else [])]
     if fit.steps:
         rows.append(("tried", "; ".join(map(_format_step, fit.steps))))
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
         rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
-    message = fit.message if full or not fit.status.successful else _shorten_status(fit)
-    rows.append(("status", add_dates(message, fit)))
-    return rows
+    return [*rows, ("status", add_dates(fit.message, fit))]
 
 
 _ENDED = {
@@ -213,24 +200,12 @@ def _format_step(step: Step) -> str:
     return f"{step.strategy}: {cost} ({step.seconds:.2g} s{', ' * bool(ended)}{ended})"
 
 
-def _shorten_status(fit: Fit) -> str:
-    """Return how a fit converged, without what is in the verdict, the table of unknowns and the warnings."""
-    where = {
-        Status.CONVERGED_AT_KINK: "Converged at a kink of the cost",
-        Status.CONVERGED_PRECISION: "Converged to the precision of the cost",
-    }.get(fit.status, "Converged")
-    side = "below" if fit.optimality <= fit.tolerance else "above"
-    return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."
-
-
-def list_quality(fit: Fit, *, full: bool) -> list[Row]:
+def list_quality(fit: Fit) -> list[Row]:
     """Return the cost, the optimality, the residual variance and the integration error.
 
     Parameters
     ----------
     fit : Fit
-    full : bool
-        Whether to include the optimality, which the status gives as well.
     """
     first = fit.initial_cost
     if np.isnan(first) and fit.history and not fit.steps:
@@ -238,8 +213,7 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     guess = f"{first:.8g}" if np.isfinite(first) else "not integrable" if fit.steps else ""
     start = f"   (first guess: {guess})" if guess else ""
     rows = [("cost J", f"{fit.cost:.8g}{start}")]
-    if full:
-        rows.append(("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})"))
+    rows.append(("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})"))
     rows += [(name, f"{value:.1e}   (multiplier {multiplier:.6g})") for name, value, multiplier in fit.constraints]
     variance, unknowns = fit.residual_variance, format_count(fit.free_basis.shape[1], "free unknown")
     if np.isfinite(variance):
@@ -254,22 +228,10 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     return rows
 
 
-def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
-    """Return the table of the channels as lines; of more than `most`, those that are explained worst."""
-    table, shares = tabulate_channels(fit)
-    if not table.rows:
-        return []
-    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(table.rows), most)].tolist())
-    lines = format_table(*table._replace(rows=[table.rows[k] for k in kept]))
-    more = len(table.rows) - len(kept)
-    return ["", *lines] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
+def tabulate_channels(fit: Fit) -> Table:
+    """Return the table of the channels, those that are explained worst first; one without variance is last.
 
-
-def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
-    """Return the table of the channels, and the share of the variance of each that is explained.
-
-    The table has the root mean square of the residuals, in units and in sigmas. The share is infinite if a channel has
-    no variance.
+    It has the root mean square of the residuals, in units and in sigmas.
 
     Parameters
     ----------
@@ -288,9 +250,9 @@ def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
                 explained = "" if np.isnan(share) else format_share(share)
                 unit = get_unit(comparison, k, trajectory)
                 rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
-                shares.append(np.inf if np.isnan(share) else share)
+                shares.append(share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
-    return Table(rows, "<>><>>", titles), shares
+    return Table([rows[k] for k in np.argsort(shares, kind="stable")], "<>><>>", titles)
 
 
 def _format_size(values: FloatArray, digits: int) -> str:
@@ -430,12 +392,6 @@ def _mark_unknown(fit: Fit, name: str) -> str:
     return held.replace("idle", "mode collapsed").upper()
 
 
-def _format_fixed(fit: Fit, most: int) -> list[str]:
-    """Return the table of what was not estimated, as lines."""
-    rows, alignment, _ = tabulate_fixed(fit)
-    return format_table(rows[:most], alignment) + ([f"  and {len(rows) - most} more"] if len(rows) > most else [])
-
-
 def tabulate_fixed(fit: Fit) -> Table:
     """Return transition times and parameters that were not estimated, without a header.
 
@@ -456,16 +412,6 @@ def tabulate_fixed(fit: Fit) -> Table:
         )  # fmt: skip
         rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
     return Table(rows, "<<<<")
-
-
-def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
-    """Return the largest correlations as lines: a row each if `full`, else one sentence."""
-    rows = list_correlations(fit)
-    if full or not rows:
-        return format_table(rows, "<>")
-    listed = [f"{pair} {value}" for pair, value in rows[:most]]
-    listed += [f"and {len(rows) - most} more"] if len(rows) > most else []
-    return wrap_text("; ".join(listed), "  ", "    ")
 
 
 def list_correlations(fit: Fit) -> list[tuple[str, str]]:

@@ -325,15 +325,10 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
     listed = text.select_unknowns(estimate, MOST_UNKNOWNS)
     everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
     unknowns, _ = text.tabulate_unknowns(estimate, text.select_unknowns(estimate, FIRST_ROWS), ends=True)
-    channels, shares = text.tabulate_channels(estimate)
     certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
     pairs = text.list_correlations(estimate)
     correlated = _list_correlated(estimate)
-    tried = []
-    for step in estimate.steps:
-        cost = f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed"
-        tried.append([step.strategy, cost, f"{step.evaluations}", f"{step.seconds:.2g}"])
-    course_rows = text.list_course(estimate, full=True) + text.list_quality(estimate, full=True)
+    course = text.list_experiments(estimate, MOST_UNKNOWNS) + text.list_course(estimate) + text.list_quality(estimate)
     return {
         "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
         "unknowns": unknowns,
@@ -341,9 +336,8 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "more_unknowns": len(estimate.theta) - len(listed),
         "unknowns_note": note,
         "fixed": text.tabulate_fixed(estimate),
-        "course": text.list_experiments(estimate, MOST_UNKNOWNS, full=True) + course_rows,
-        "steps_tried": Table(tried, "<>>>", ["strategy", "lowest J after it", "evaluations", "seconds"]),
-        "channels": channels._replace(rows=[channels.rows[k] for k in np.argsort(shares, kind="stable")]),
+        "course": course,
+        "channels": text.tabulate_channels(estimate),
         "diagnostics": tabulate_diagnostics(estimate.residuals),
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
         "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
@@ -391,8 +385,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         margin = MARGIN * (last - first)
         written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
         ranges = {"times": {"start": first - margin, "end": last + margin}}
-        delays = {f"curve-{c}": part.delay for c, part in enumerate(own) if part.delay >= 0}
-        figures.append({"template": template, "sources": written, "ranges": ranges, "delays": delays})
+        figures.append({"template": template, "sources": written, "ranges": ranges})
     sliders: list[dict[str, Any]] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
         movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
