@@ -99,14 +99,13 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     course = [*list_experiments(estimate, limits.experiments, runs), *list_course(estimate)]
     where = f", of which more is explained{runs}"
     channels = format_table(*tabulate_channels(estimate), most=limits.channels, where=where)
+    pairs = list_correlations(estimate)
     sections = {
         "Fit": _format_rows(course),
         "Quality of the fit": [*_format_rows(list_quality(estimate)), *([""] if channels else []), *channels],
         "Unknowns": _format_unknowns(estimate, limits.unknowns, unknowns),
         "Held fixed": format_table(*tabulate_fixed(estimate), most=limits.fixed),
-        f"Correlations above {SMALL_CORRELATION:g}": format_table(
-            list_correlations(estimate), "<>", most=limits.correlations
-        ),
+        f"Correlations above {SMALL_CORRELATION:g}": format_table(pairs, "<>", most=limits.correlations),
         "Determined worst by the data": _describe_weak(estimate, limits.directions),
         "Warnings": _format_warnings(estimate, limits.warnings, full=full),
     }
@@ -361,7 +360,7 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
     marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names]
     few = 2 * np.count_nonzero(fit.is_time) <= most
     order.sort(key=lambda i: (not marked[i], bool(fit.is_time[i]) != few))
-    return sorted(order[: _count_shown(len(order), most)])
+    return sorted(order[:most])
 
 
 def _compare_covariances(fit: Fit) -> str:
@@ -472,11 +471,6 @@ def _format_warnings(estimate: Estimate, most: int, *, full: bool) -> list[str]:
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------
-
-
-def _count_shown(count: int, most: int) -> int:
-    """Return how many rows are shown of a table with room for `most`: two fewer if a line counts the rest."""
-    return count if count <= most else most - 2
 
 
 def _format_rows(rows: Sequence[Row]) -> list[str]:
