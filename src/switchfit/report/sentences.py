@@ -357,13 +357,6 @@ _BOUND = (
     "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known. Move the "
     "bound if it is not a physical one."
 )
-_AT_KINKS = (
-    "{} are at kinks of the cost, as where a transition meets a sample. They have no standard errors, and those of the "
-    "others take them as known; their profiles give intervals.",
-    "{} is at a kink of the cost, as where a transition meets a sample. It has no standard error, and those of the "
-    "others take it as known; its profile gives an interval.",
-)
-"""Of several unknowns, and of one."""
 _ISSUES: dict[str, Sentence] = {
     "trade off": _write_combination,
     **_LOG_ISSUES,
@@ -378,7 +371,8 @@ _ISSUES: dict[str, Sentence] = {
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "at a kink": lambda issue: _AT_KINKS[len(issue.subjects) == 1].format(join_first(issue.subjects)),
+    "at a kink": "{first names}: at a kink of the cost, as where a transition meets a sample. It has no standard error, "
+    "and those of the others take it as known; its profile gives an interval.",
     "not read": "No function of the model reads {names}: the data say nothing about it, and its value above is the "
     "first guess. Remove it from parameters, or use it in the model, whose functions may spell its name otherwise.",
     "acts elsewhere": "{names}: read only by modes, or at transitions, that do not occur in mode_sequence. The data "
@@ -495,13 +489,10 @@ def write_step(step: Issue) -> str:
     ----------
     step : Issue
     """
-    single = len(step.subjects) == 1
-    they_act, them = ("it acts", "it") if single else ("they act", "them")
-    words = {"names": _name(step.subjects), "them": them, "they_act": they_act}
     if step.kind == "next: define it there":
         return suggest_definition(step.subjects[1])
-    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, **words)
-    return text.replace("one of them", "it") if single else text
+    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, names=_name(step.subjects))
+    return text.replace("one of them", "it") if len(step.subjects) == 1 else text
 
 
 def write_agreement(tried: int, better: int, agreeing: int, *, few: bool = False) -> str:
@@ -709,7 +700,7 @@ _REASONS: dict[str, Sentence] = {
     "search cut short": "{first names} ended by its limit of time",
     "not determined": "the data hardly determine {first names}",
     "not read": "no function of the model reads {first names}",
-    "acts elsewhere": "{first names} {act} only in modes or at transitions that do not occur",
+    "acts elsewhere": "only modes or transitions that do not occur read {first names}",
     "without effect": "the cost does not depend on {first names}",
     "at bounds": "{first names} at a bound",
     "integration error": "the integration error of {first names} is {error:.1e}, relative",
@@ -743,11 +734,11 @@ _STEPS = {
     "lower min_duration": "lower min_duration or leave the mode out",
     "move the bound": "move the bound if it is not a physical one",
     "fix or add data": "fix one of them or add data",
-    "remove or use": "remove {names} from parameters, or use {them} in the model",
-    "fix or let it act": "fix {names}, or fit a log in which {they_act}",
+    "remove or use": "remove {names} from parameters or use in the model",
+    "fix or let it act": "fix {names}, or fit a log with other modes",
     "transition time": "make {} a transition time if it is one, or use a smooth function",
     "larger tolerance": "ask for a larger tolerance",
-    "fix alone": "fix {names}, or let {them} act on what is measured",
+    "fix alone": "fix {names}, or measure something else",
     "more data": "add data",
     "smaller rtol": "give the Problem a smaller rtol",
     "raise max_iterations": "raise max_iterations",
@@ -790,7 +781,6 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "agreement": _count_starts,
     "fits": _count_fits,
     "least": _name_least,
-    "act": lambda issue: "acts" if len(issue.subjects) == 1 else "act",
     "per cent": lambda issue: 100 * get_figure(issue, "share"),
     "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
     "where it failed": lambda issue: write_places(issue.subjects[2:], list_figures(issue, "at"), digits=6),

@@ -32,7 +32,7 @@ from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
 from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.certificate import WEAK
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel, list_channels
 from switchfit.uncertainty.verdict import DIFFERENT, find_issues
 
 ONE_SIDED = 1.2
@@ -236,20 +236,16 @@ def tabulate_channels(fit: Fit) -> Table:
     ----------
     fit : Fit
     """
-    single = len(fit.trajectories) == 1
     rows, shares = [], []
-    for name, trajectory, run in zip(fit.run_names, fit.trajectories, fit.comparisons, strict=True):
-        for comparison in run:
-            for k, channel in enumerate(comparison.names):
-                residual, sigma = comparison.residuals[:, k], comparison.sigma
-                count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
-                scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
-                share = explain_channel(comparison, k)
-                label = channel if single else f"{name} {channel}"
-                explained = "" if np.isnan(share) else format_share(share)
-                unit = get_unit(comparison, k, trajectory)
-                rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
-                shares.append(share)
+    for label, e, comparison, k in list_channels(fit.comparisons, fit.run_names):
+        residual, sigma = comparison.residuals[:, k], comparison.sigma
+        count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
+        scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
+        share = explain_channel(comparison, k)
+        explained = "" if np.isnan(share) else format_share(share)
+        unit = get_unit(comparison, k, fit.trajectories[e])
+        rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
+        shares.append(share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
     return Table([rows[k] for k in np.argsort(shares, kind="stable")], "<>><>>", titles)
 
@@ -290,7 +286,6 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
     dated = list_dated(fit)
-    intervals, plain_intervals = fit.confidence_intervals(), Fit.confidence_intervals(fit)
     wide = correct_intervals(fit)
     rows = []
     for i in shown:
@@ -302,15 +297,16 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         counted = "" if run is None else f"t = {value}"
         if run is not None:
             value, relative = format_time(fit.theta[i], run, errors[i]), ""
-        sided = i in joins and _is_sided(intervals[i], plain_intervals[i], fit.theta[i])
-        log_scaled = name in fit.log_scaled and wide[i][0] < wide[i][1]
-        shown_ends = f"95 % in {_format_interval(wide[i], run)}" if (sided or log_scaled) and not ends else ""
+        low, high = (format_end(end, wide[i], run) for end in wide[i])
+        sides = np.sort(np.abs(wide[i] - fit.theta[i]))
+        sided = i in joins and sides[0] > 0 and (np.isnan(errors[i]) or sides[1] > ONE_SIDED * sides[0])
+        shown_ends = f"95 % in [{low}, {high}]" if high and (sided or name in fit.log_scaled) and not ends else ""
         notes = [counted, joins.get(i, ""), prior, shown_ends, _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
-        low, high = (format_end(end, wide[i], run) if ends and known else "" for end in wide[i])
-        guess = f"{fit.initial_theta[i]:.6g}" if run is None else format_time(fit.initial_theta[i], run)
+        guess = format_time(fit.initial_theta[i], run)
         errors_shown = (error, relative, plain if corrected else "") if known else ("", "", "")
-        rows.append([name, value, *errors_shown, low, high, format_unit(fit.theta_units[i]), guess, note])
+        interval = (low, high) if ends and known else ("", "")
+        rows.append([name, value, *errors_shown, *interval, format_unit(fit.theta_units[i]), guess, note])
     titles = ["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]
     table = Table(rows, "<><><>><><", titles)
     if not known or corrected:
@@ -369,20 +365,6 @@ def _compare_covariances(fit: Fit) -> str:
     if found is None:
         return ""
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
-
-
-def _is_sided(ends: FloatArray, symmetric: FloatArray, value: float) -> bool:
-    """Return whether kinks at samples make the interval of a transition time asymmetric."""
-    below, above = value - ends[0], ends[1] - value
-    if not min(below, above) > 0 or np.array_equal(ends, symmetric):
-        return False
-    return not (np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above))
-
-
-def _format_interval(ends: FloatArray, run: Timed | None) -> str:
-    if run is None:
-        return f"[{ends[0]:.4g}, {ends[1]:.4g}]"
-    return f"[{format_end(ends[0], ends, run)}, {format_end(ends[1], ends, run)}]"
 
 
 def _mark_unknown(fit: Fit, name: str) -> str:

@@ -286,39 +286,24 @@ def tabulate_models(found: ModelComparison) -> Table:
 
 @draw_figure.register(ModelComparison)
 def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw the differences in AICc and BIC, and the Akaike weights.
-
-    Parameters
-    ----------
-    found : ModelComparison
-    ax : matplotlib.axes.Axes, optional
-        For the differences alone.
-    """
-    if ax is not None:
-        return style.draw_on(ax, lambda ax: draw_differences(found, ax))
-    figure = style.make_figure(7.8, 1.3 + 0.42 * len(found.names))
-    axes = figure.subplots(1, 2, sharey=True, width_ratios=[1.6, 1.0])
-    draw_differences(found, axes[0])
-    order, places = _list_best_first(found), np.arange(len(found.names))
-    axes[1].barh(places, found.weights[order], height=0.5, color=SHADE)
-    axes[1].set_xlim(0.0, 1.0)
-    axes[1].set_xlabel("Akaike weight")
-    return style.turn_off_formulas(figure)
-
-
-def draw_differences(found: ModelComparison, ax: Axes) -> Axes:
     """Draw by how much AICc and BIC of each model exceed the smallest, the best model on top.
 
     Parameters
     ----------
     found : ModelComparison
-    ax : matplotlib.axes.Axes
+    ax : matplotlib.axes.Axes, optional
     """
+    return style.draw_on(ax, lambda ax: _draw_differences(found, ax), (6.4, 1.3 + 0.42 * len(found.names)))
+
+
+def _draw_differences(found: ModelComparison, ax: Axes) -> Axes:
     order, places = _list_best_first(found), np.arange(len(found.names))
     ax.barh(places - 0.2, found.delta_bic[order], height=0.36, color=FIT, label="BIC")
     ax.barh(places + 0.2, found.delta_aicc[order], height=0.36, color=SHADE, label="AICc")
+    if np.nanmax([found.delta_bic, found.delta_aicc]) > 100:  # a hopeless model would hide the others
+        ax.set_xscale("symlog", linthresh=10.0)
+    ax.set_xlim(left=0.0)
     ax.set_xlabel("difference from the smallest")
-    _limit_differences(ax, np.append(found.delta_bic, found.delta_aicc))
     ax.axvline(RULED_OUT, color=TRANSITION, linewidth=THIN, linestyle=":", label=f"{RULED_OUT:g}: as good as ruled out")
     ax.set_ylim(len(places) - 0.5, -0.5)
     ax.set_yticks(places, [found.names[k] for k in order])
@@ -327,13 +312,6 @@ def draw_differences(found: ModelComparison, ax: Axes) -> Axes:
 
 def _list_best_first(found: ModelComparison) -> list[int]:
     return np.argsort(found.bic, kind="stable").tolist()
-
-
-def _limit_differences(ax: Axes, values: FloatArray) -> None:
-    """Let an axis of differences begin at 0, and be logarithmic where a hopeless model would hide the others."""
-    if np.nanmax(values) > 100:
-        ax.set_xscale("symlog", linthresh=10.0)
-    ax.set_xlim(left=0.0)
 
 
 MEANING = {"D": "log det", "A": "trace", "E": "largest eigenvalue"}
