@@ -325,17 +325,18 @@ def format_table(
     return lines + ([f"{indent}and {len(rows) - most} more{where}"] if len(rows) > most else [])
 
 
-def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:
-    """Return text as lines of at most `WIDTH` columns.
+def wrap_text(text: str, first: str = "", others: str = "  ", width: int = WIDTH) -> list[str]:
+    """Return text as lines of at most so many columns, where names allow it.
 
     Parameters
     ----------
     text : str
     first, others : str, optional
         What the first line and the others begin with.
+    width : int, optional
     """
     return textwrap.wrap(
-        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
+        text, width, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
     )
 
 

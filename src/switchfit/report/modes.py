@@ -302,67 +302,43 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
     discounted = is_discounted(search)
     extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
-    titles = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
-    rows: list[list[str]] = []
+    rows = []
     for fit in search.fitted:
         cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
             cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
-        cells += [f"{getattr(fit, name):.1f}" for name in likely]
-        rows += _extend_row(cells, _list_lines(search, fit))
-    return format_table(rows, "<" + ">" * (len(titles) - 2) + "<", titles)
+        rows.append((fit, [*cells, *(f"{getattr(fit, name):.1f}" for name in likely)]))
+    titles = ["", "switches", "J", *extra, *map(name_criterion, likely)]
+    return _format_sequences(search, rows, "<" + ">" * (len(titles) - 1), titles, "sequence")
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
     name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
     lowest = getattr(search.chosen[0], name)
-    label = name_criterion(name) if name == "mbic" else name_decider(search)
-    titles = ["weight", f"{label} above the best", _title_sequences(search, "alternatives")]
-    rows: list[list[str]] = []
-    for fit in search.chosen[:LISTED]:
-        rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
+    titles = ["weight", f"{name_criterion(name) if name == 'mbic' else name_decider(search)} above the best"]
+    chosen = search.chosen[:LISTED]
+    rows = [(fit, [f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"]) for fit in chosen]
     more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
-    return ["", *format_table(rows, ">><", titles), *more]
+    return ["", *_format_sequences(search, rows, ">>", titles, "alternatives"), *more]
 
 
-def _title_sequences(search: ModeSearch, what: str) -> str:
-    return what if len(search.run_names) == 1 else f"{what}, where not as above"
+def _format_sequences(
+    search: ModeSearch, fits: Sequence[tuple[ModeFit, list[str]]], alignment: str, titles: list[str], what: str
+) -> list[str]:
+    """Return the table of fits with their cells, and their sequences in the last column, in several lines if long.
 
-
-def _extend_row(cells: list[str], lines: list[str]) -> list[list[str]]:
-    """Return a row of a table whose last cell has several lines."""
-    empty = [""] * len(cells)
-    return [[*(empty if k else cells), line] for k, line in enumerate(lines)]
-
-
-def _list_lines(search: ModeSearch, fit: ModeFit) -> list[str]:
-    """Return the sequences of a fit as lines; of several runs, those that differ from the best's."""
-    if len(fit.sequences) == 1:
-        return wrap_sequence(fit.sequences[0])
-    lines = []
-    for name, modes, known in zip(search.run_names, fit.sequences, search.chosen[0].sequences, strict=True):
-        if modes != known:
-            lines += wrap_sequence(modes, f"{name}: ")
-    return lines or ["the same"]
-
-
-def wrap_sequence(modes: Sequence[str], first: str = "") -> list[str]:
-    """Return a mode sequence in lines of at most `LONGEST_LINE` characters, where the names of modes allow it.
-
-    Parameters
-    ----------
-    modes : sequence of str
-    first : str, optional
-        What the first line begins with.
+    Of several runs, those are listed whose sequence differs from the best's.
     """
-    lines = [f"{first}{modes[0]}"]
-    for mode in modes[1:]:
-        if len(lines[-1]) + len(" -> ") + len(mode) <= LONGEST_LINE:
-            lines[-1] += f" -> {mode}"
-        else:
-            lines.append(f"  -> {mode}")
-    return lines
+    single, rows = len(search.run_names) == 1, []
+    for fit, cells in fits:
+        lines: list[str] = []
+        for name, modes, known in zip(search.run_names, fit.sequences, search.chosen[0].sequences, strict=True):
+            if single or modes != known:
+                text = " -> ".join(modes) if single else f"{name}: {' -> '.join(modes)}"
+                lines += wrap_text(text, width=LONGEST_LINE)
+        rows += [[*(c if k == 0 else "" for c in cells), line] for k, line in enumerate(lines or ["the same"])]
+    return format_table(rows, f"{alignment}<", [*titles, what if single else f"{what}, where not as above"])
 
 
 @draw_figure.register(ModeSearch)

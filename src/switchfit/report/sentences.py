@@ -371,8 +371,8 @@ _ISSUES: dict[str, Sentence] = {
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "at a kink": "{first names}: at a kink of the cost, as where a transition meets a sample. It has no standard error, "
-    "and those of the others take it as known; its profile gives an interval.",
+    "at a kink": "{first names}: at a kink of the cost, as where a transition meets a sample. There it has no standard "
+    "error, and those of the others take it as known; its profile gives an interval.",
     "not read": "No function of the model reads {names}: the data say nothing about it, and its value above is the "
     "first guess. Remove it from parameters, or use it in the model, whose functions may spell its name otherwise.",
     "acts elsewhere": "{names}: read only by modes, or at transitions, that do not occur in mode_sequence. The data "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -45,22 +44,16 @@ Row = tuple[str, str]
 """A label at the left, empty where it is that of the row before, and a text."""
 
 
-class Limits(NamedTuple):
-    """Largest number of entries of each section; the others are counted."""
-
-    experiments: int
-    channels: int
-    unknowns: int
-    fixed: int
-    correlations: int
-    directions: int
-    warnings: int
-
-
-SCREEN = Limits(experiments=3, channels=6, unknowns=10, fixed=4, correlations=3, directions=1, warnings=3)
-"""About 40 lines for most fits."""
-
-EVERYTHING = Limits(*[sys.maxsize] * len(SCREEN))
+SCREEN = {
+    "experiments": 3,
+    "channels": 6,
+    "unknowns": 10,
+    "fixed": 4,
+    "correlations": 3,
+    "directions": 1,
+    "warnings": 3,
+}
+"""Largest number of entries of each section, about 40 lines for most fits; the others are counted."""
 
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
@@ -94,20 +87,20 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     str
         Several lines without a newline at the end; the verdict first.
     """
-    limits = EVERYTHING if full else SCREEN
+    limits = dict.fromkeys(SCREEN, sys.maxsize) if full else SCREEN
     runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    course = [*list_experiments(estimate, limits.experiments, runs), *list_course(estimate)]
+    course = [*list_experiments(estimate, limits["others"], runs), *list_course(estimate)]
     where = f", of which more is explained{runs}"
-    channels = format_table(*tabulate_channels(estimate), most=limits.channels, where=where)
+    channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=where)
     pairs = list_correlations(estimate)
     sections = {
         "Fit": _format_rows(course),
         "Quality of the fit": [*_format_rows(list_quality(estimate)), *([""] if channels else []), *channels],
-        "Unknowns": _format_unknowns(estimate, limits.unknowns, unknowns),
-        "Held fixed": format_table(*tabulate_fixed(estimate), most=limits.fixed),
-        f"Correlations above {SMALL_CORRELATION:g}": format_table(pairs, "<>", most=limits.correlations),
-        "Determined worst by the data": _describe_weak(estimate, limits.directions),
-        "Warnings": _format_warnings(estimate, limits.warnings, full=full),
+        "Unknowns": _format_unknowns(estimate, limits["unknowns"], unknowns),
+        "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
+        f"Correlations above {SMALL_CORRELATION:g}": format_table(pairs, "<>", most=limits["others"]),
+        "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
+        "Warnings": _format_warnings(estimate, limits["others"], full=full),
     }
     written = ["\n".join([title, *lines]) for title, lines in sections.items() if lines]
     shown = "\n\n".join(["\n".join(wrap_text(str(estimate.verdict))), *written])

@@ -13,10 +13,9 @@ from switchfit.report.formats import (
     Table,
     Timed,
     describe_origin,
-    format_rounded,
+    format_estimate,
     format_table,
     format_time,
-    label_time,
     list_dated,
     wrap_text,
 )
@@ -260,41 +259,29 @@ def write_profile(profile: Profile) -> str:
     ----------
     profile : Profile
     """
-    unit = unit_suffix(profile.unit)
-    value, error, _ = format_rounded(profile.value, profile.standard_error)
-    percent = f"{100 * profile.level:.3g} %"
+    run, unit, percent = _find_run(profile), unit_suffix(profile.unit), f"{100 * profile.level:.3g} %"
+    value, error = format_estimate(profile.value, profile.standard_error, run)
     low, high = profile.interval()
-    sizes = (profile.standard_error, abs(high - low), abs(profile.value))
-    digits = next((size for size in sizes if np.isfinite(size) and size > 0), 0.0)
     law = "chi-square with 1 degree of freedom"
     law = law if profile.fit.sigma_known else f"F with 1 and {profile.fit.freedom} degrees of freedom"
     quadratic = profile.fit.confidence_intervals(profile.level)[profile.fit.theta_names.index(profile.name)]
-    intervals = [", ".join(_format_number(end, digits) for end in ends) for ends in ((low, high), quadratic)]
+    both = ((low, high), quadratic)
+    exact, other = (", ".join(format_time(end, run, (high - low) / 4) for end in ends) for ends in both)
+    end_unit = unit if run is None else ""
     lines = [
         f"Profile of {profile.name}",
-        f"  estimate              {value} {error}{unit}".rstrip(),
-        f"  {percent:<4} interval         [{intervals[0]}]{unit}   (likelihood ratio, {law})",
-        f"  quadratic             {f'[{intervals[1]}]{unit}' if np.isfinite(quadratic).all() else 'none'}",
+        f"  estimate              {value} {error}{unit if error or run is None else ''}".rstrip(),
+        f"  {percent:<4} interval         [{exact}]{end_unit}   (likelihood ratio, {law})",
+        f"  quadratic             {f'[{other}]{end_unit}' if np.isfinite(quadratic).all() else 'none'}",
         f"  points, fits          {len(profile.values)}, {profile.trace.fits}",
     ]
-    run = _find_run(profile)
-    if run is not None:
-        dates = [format_time(end, run, digits) if np.isfinite(end) else str(end) for end in (profile.value, low, high)]
-        lines.insert(1, f"  {'date':<20}  {dates[0]}, {percent} from {dates[1]} to {dates[2]}")
-        lines.append(f"  {'times':<20}  {describe_origin(run)}")
+    lines += [f"  times                 {describe_origin(run)}"] if run is not None else []
     return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
 
 
 def _find_run(profile: Profile) -> Timed | None:
     """Return the run of a profile of a time that is a date; None for any other."""
     return list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
-
-
-def _format_number(value: float, error: float) -> str:
-    """Return a number to the second digit of an error."""
-    if not np.isfinite(value):
-        return {np.inf: "inf", -np.inf: "-inf"}.get(value, "?")
-    return format_rounded(value, error)[0] if error > 0 else f"{value:.6g}"
 
 
 _ENDS = {
@@ -434,13 +421,9 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
         draw_autocorrelation(channel, row[1])
         draw_quantiles(channel, row[2])
         row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
+        style.label_axis(row[0], channel)
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
-    for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times of another kind
-        label = label_time(shown[k][1])
-        style.put_ticks(ax, shown[k][1])
-        if k + 1 == len(shown) or label_time(shown[k + 1][1]) != label:
-            ax.set_xlabel(label)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
     return style.turn_off_formulas(figure)

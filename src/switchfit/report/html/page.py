@@ -66,6 +66,8 @@ UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
 DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
 DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
 """Of shades below the curves, of what was measured, and of what it is compared with."""
+DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
+"""Of up to so many samples."""
 LABELS = {"measurements": "measured", "reference": "reference"}
 
 
@@ -93,7 +95,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
                 _draw_samples(panel, own, k, samples, run)
                 below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual", sources, run)
                 below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
-                _draw_residuals(below, own, k, samples, run)
+                _draw_residuals(below, own, k, samples)
                 panel.xaxis.visible = False
                 parts.append(below)
             parts[-1].xaxis.axis_label.text = label_time(run)
@@ -101,7 +103,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
             _put_legend_above(panel)
             blocks.append(column(*parts, name=f"channel-{c}-{k}", spacing=0, styles=UNBROKEN, **WIDE))
         if samples is not None and (plane := find_plane(own.names, own.units)) is not None:
-            blocks.append(_draw_path(own, plane, curve, samples, run))
+            blocks.append(_draw_path(own, plane, curve, samples))
     return column(*blocks, spacing=6, **WIDE)
 
 
@@ -114,11 +116,6 @@ def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
     columns : iterable of str
     """
     return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
-
-
-def _size_dots(curves: Curves) -> float:
-    """Return the size of the dots, smaller the more there are."""
-    return 6.0 if len(curves.samples["t"]) <= 150 else 4.0 if len(curves.samples["t"]) <= 600 else 2.5
 
 
 def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
@@ -200,7 +197,8 @@ def _draw_measured(
     """Draw what is measured as dots, or a reference signal as a dashed line."""
     if curves.kind == "reference":
         return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
-    return _tag(plot.scatter(x, y, source=source, size=scale * _size_dots(curves), **DOTS, **legend), "ink")
+    size = next(size for most, size in DOT_SIZES.items() if len(curves.samples["t"]) <= most)
+    return _tag(plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend), "ink")
 
 
 def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
@@ -212,26 +210,24 @@ def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSo
     _add_hover(plot, drawn, tips, run)
 
 
-def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
+def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
     for side in ("s", "n") if "s0" in curves.samples else ():
         _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
-    drawn = _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
-    _add_hover(plot, drawn, [("residual", f"@y{k}{{%.6g}}")], run)
+    _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
 
 
 def _draw_path(
-    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource, run: Timed
+    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource
 ) -> Any:
     """Draw two positions against one another, with the transitions on the fitted path."""
     x, y = plane
     labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
     plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
     _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
-    line = plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
+    plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
     mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
     _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
-    _add_hover(plot, line, [("mode", "@mode")], run)
     _put_legend_above(plot)
     return plot
 
@@ -261,10 +257,8 @@ MARGIN = 0.01
 """Part of the horizon that is shown before and after it."""
 MOST_SLIDERS = 24
 """Sliders of one run."""
-FIRST_ROWS = 40
-"""Unknowns that are listed first: those at a bound or a kink, parameters, transition times; all are behind them."""
-MOST_UNKNOWNS = 300
-"""Unknowns that are listed, and experiments; those left out are counted. Other tables are cut off there too."""
+MOST_ROWS = 100
+"""Unknowns that are listed, and experiments; those left out are counted."""
 MOST_CORRELATED = 60
 """Unknowns in the heat map."""
 MOST_PAIRS = 12
@@ -322,18 +316,15 @@ def _write_json(value: Any) -> str:
 
 def _collect_content(estimate: Estimate) -> dict[str, Any]:
     """Return what the template shows as text; the sentences are those of the report as text."""
-    listed = text.select_unknowns(estimate, MOST_UNKNOWNS)
-    everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
-    unknowns, _ = text.tabulate_unknowns(estimate, text.select_unknowns(estimate, FIRST_ROWS), ends=True)
+    unknowns, note = text.tabulate_unknowns(estimate, text.select_unknowns(estimate, MOST_ROWS), ends=True)
     certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
     pairs = text.list_correlations(estimate)
     correlated = _list_correlated(estimate)
-    course = text.list_experiments(estimate, MOST_UNKNOWNS) + text.list_course(estimate) + text.list_quality(estimate)
+    course = text.list_experiments(estimate, MOST_ROWS) + text.list_course(estimate) + text.list_quality(estimate)
     return {
         "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
         "unknowns": unknowns,
-        "all_unknowns": everything,
-        "more_unknowns": len(estimate.theta) - len(listed),
+        "more_unknowns": len(estimate.theta) - len(unknowns.rows),
         "unknowns_note": note,
         "fixed": text.tabulate_fixed(estimate),
         "course": course,
