@@ -92,13 +92,13 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     course = [*list_experiments(estimate, limits["others"], runs), *list_course(estimate)]
     where = f", of which more is explained{runs}"
     channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=where)
-    pairs = list_correlations(estimate)
+    correlations = format_table(*tabulate_correlations(estimate), most=limits["others"])
     sections = {
         "Fit": _format_rows(course),
         "Quality of the fit": [*_format_rows(list_quality(estimate)), *([""] if channels else []), *channels],
         "Unknowns": _format_unknowns(estimate, limits["unknowns"], unknowns),
         "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
-        f"Correlations above {SMALL_CORRELATION:g}": format_table(pairs, "<>", most=limits["others"]),
+        f"Correlations above {SMALL_CORRELATION:g}": correlations,
         "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
         "Warnings": _format_warnings(estimate, limits["others"], full=full),
     }
@@ -388,7 +388,7 @@ def tabulate_fixed(fit: Fit) -> Table:
     return Table(rows, "<<<<")
 
 
-def list_correlations(fit: Fit) -> list[tuple[str, str]]:
+def tabulate_correlations(fit: Fit) -> Table:
     """Return the correlations of pairs of unknowns that are above `SMALL_CORRELATION` in size, the largest first.
 
     Parameters
@@ -399,7 +399,7 @@ def list_correlations(fit: Fit) -> list[tuple[str, str]]:
     above = np.argwhere(np.abs(correlation) > SMALL_CORRELATION)
     above = above[np.argsort(-np.abs(correlation[tuple(above.T)]), kind="stable")]
     names = fit.theta_names
-    return [(f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}") for i, j in above]
+    return Table([(f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}") for i, j in above], "<>")
 
 
 def _describe_weak(estimate: Estimate, most: int) -> list[str]:

@@ -7,11 +7,13 @@ from functools import partial
 
 import numpy as np
 
+from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.formats import (
     Table,
     Timed,
+    add_dates,
     describe_origin,
     format_estimate,
     format_table,
@@ -47,14 +49,17 @@ def write_certificate(certificate: Certificate) -> str:
     return "\n".join(format_table(*tabulate_certificate(certificate), indent=""))
 
 
-def tabulate_certificate(certificate: Certificate) -> Table:
+def tabulate_certificate(certificate: Certificate, fit: Fit | None = None) -> Table:
     """Return every check with its number, and the verdict, without a header.
 
     Parameters
     ----------
     certificate : Certificate
+    fit : Fit, optional
+        Where it is given, active constraints of times have their dates.
     """
     held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
+    held = held if fit is None else add_dates(held, fit)
     failures = "; ".join(map(str, certificate.failures))
     error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
     rows = [

@@ -34,7 +34,7 @@ from switchfit.estimation.saved import Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.formats import Table, Timed, add_dates, describe_clock, format_span, label_quantity, label_time
+from switchfit.report.formats import Timed, add_dates, describe_clock, format_span, label_quantity, label_time
 from switchfit.report.html.curves import (
     Columns,
     Curves,
@@ -257,12 +257,8 @@ MARGIN = 0.01
 """Part of the horizon that is shown before and after it."""
 MOST_SLIDERS = 24
 """Sliders of one run."""
-MOST_ROWS = 100
-"""Unknowns that are listed, and experiments; those left out are counted."""
 MOST_CORRELATED = 60
 """Unknowns in the heat map."""
-MOST_PAIRS = 12
-"""Correlations that are listed beside it."""
 
 
 def build_page(estimate: Estimate, origin: Provenance) -> str:
@@ -278,20 +274,22 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    content = _collect_content(estimate)
+    functions = (add_dates, certify, find_issues, list_reasons, tabulate_certificate, tabulate_diagnostics)
+    functions += (write_direction, write_reason, write_step)
+    environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
     payload["drawings"] = drawings = {}
     if estimate.residuals.channels:
         drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
-    if content["iterated"]:
+    if any(record.optimality > 0 for record in estimate.history):
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
-    environment.globals |= {f.__name__: f for f in (list_reasons, write_reason, write_step, write_direction)}
-    content |= {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
+    correlated = _list_correlated(estimate)
+    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
-    content |= {"sliders": payload["sliders"], "sliders_cut": cut}
-    content |= {"payload": _write_json(payload), "library": library}
-    return environment.get_template("report.html").render(content)
+    content |= {"sliders": payload["sliders"], "sliders_cut": cut, "drawings": drawings, "library": library}
+    content |= {"correlated": correlated, "correlation": estimate.correlation[np.ix_(correlated, correlated)]}
+    return environment.get_template("report.html").render(content, payload=_write_json(payload))
 
 
 def _compress_svg(figure: Figure) -> str:
@@ -309,34 +307,6 @@ def _write_json(value: Any) -> str:
     """Return JSON that can stand inside a script element."""
     written = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-# --- sentences and tables ---------------------------------------------------------------------------------------------
-
-
-def _collect_content(estimate: Estimate) -> dict[str, Any]:
-    """Return what the template shows as text; the sentences are those of the report as text."""
-    unknowns, note = text.tabulate_unknowns(estimate, text.select_unknowns(estimate, MOST_ROWS), ends=True)
-    certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
-    pairs = text.list_correlations(estimate)
-    correlated = _list_correlated(estimate)
-    course = text.list_experiments(estimate, MOST_ROWS) + text.list_course(estimate) + text.list_quality(estimate)
-    return {
-        "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
-        "unknowns": unknowns,
-        "more_unknowns": len(estimate.theta) - len(unknowns.rows),
-        "unknowns_note": note,
-        "fixed": text.tabulate_fixed(estimate),
-        "course": course,
-        "channels": text.tabulate_channels(estimate),
-        "diagnostics": tabulate_diagnostics(estimate.residuals),
-        "correlations": Table(pairs[:MOST_PAIRS], "<>"),
-        "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
-        "certificate": Table([[add_dates(cell, estimate) for cell in row] for row in certificate.rows], "<<"),
-        "correlated": [estimate.theta_names[i] for i in correlated],
-        "correlation": estimate.correlation[np.ix_(correlated, correlated)],
-        "iterated": any(record.optimality > 0 for record in estimate.history),
-    }
 
 
 def _list_correlated(fit: Fit) -> list[int]:
