@@ -15,7 +15,7 @@ import base64
 import gzip
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jinja2
@@ -50,7 +50,7 @@ from switchfit.report.plot import choose_mode_colours, find_plane
 from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.residuals import explain_channel, explain_worst, rank_runs
+from switchfit.uncertainty.residuals import explain_worst, rank_runs
 from switchfit.uncertainty.verdict import find_issues
 
 FIT, DATA = "#d0392b", "#5b6470"
@@ -275,7 +275,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     functions = (add_dates, certify, find_issues, list_reasons, tabulate_certificate, tabulate_diagnostics)
-    functions += (write_direction, write_reason, write_step)
+    functions += (format_span, join_words, unit_suffix, write_direction, write_reason, write_step)
     environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
     payload["drawings"] = drawings = {}
@@ -362,33 +362,19 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
-    """Return what the template shows of a run; at first it shows the channels that are explained worst."""
-    trajectory, comparisons, worst = fit.trajectories[e], fit.comparisons[e], explain_worst(fit, e)
-    channels, shares = [], []
+    """Return what the template shows of a run; at first it shows some of the channels that are measured."""
+    channels = []
     for c, own in enumerate(curves):
-        hidden = own.kind == "states" and bool(comparisons)
+        shown = own.kind != "states" or not fit.comparisons[e]
         for k, name in enumerate(own.names):
-            channels.append((f"{c}-{k}", f"{name}, not measured" if hidden else name, not hidden))
-            shares.append(np.inf if own.kind == "states" else explain_channel(comparisons[c], k))
-    first = np.argsort(shares, kind="stable")[:MOST_CHANNELS]
+            first = shown and len(channels) < MOST_CHANNELS
+            channels.append((f"{c}-{k}", name if shown else f"{name}, not measured", first))
+    worst = explain_worst(fit, e)
     return {
         "name": fit.run_names[e] if len(fit.trajectories) > 1 else "",
         "explained": format_share(worst) if np.isfinite(worst) else "",
-        "modes": [(mode, colours[mode], format_span(a, b, trajectory)) for mode, a, b in trajectory.mode_spans],
-        "channels": [(name, label, can and k in first) for k, (name, label, can) in enumerate(channels)],
-        "notes": list(_list_notes(fit, e, curves)),
+        "trajectory": fit.trajectories[e],
+        "colours": colours,
+        "channels": channels,
+        "curves": curves,
     }
-
-
-def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
-    """Yield what is not to be seen in the figures of a run: samples that are not drawn, sensors that are late."""
-    unit = unit_suffix(fit.trajectories[e].time_unit)
-    for own in curves:
-        channels = join_words(list(own.names))
-        if own.left_out:
-            drawn = len(own.samples["t"])
-            yield f"Of {channels} {drawn} of {drawn + own.left_out} samples are drawn."
-        late = own.curve["t"][0] - fit.trajectories[e].times[0]
-        if late != 0:
-            where = "its curve stands at the times of the sensor, the modes and transitions at those of the model"
-            yield f"{channels} is late by {late:.6g}{unit}: {where}."
