@@ -190,8 +190,8 @@ def fit_and_page(kind):
 
 
 def test_the_page_says_what_the_text_says_with_the_verdict_first(toss, toss_page):
-    words = Reader(toss_page).words
-    level = toss.verdict.level.capitalize()
+    reader = Reader(toss_page)
+    words, level = reader.words, toss.verdict.level.capitalize()
     assert words.index(level) < words.index("Estimates")
     for part in str(toss.verdict).removesuffix(".").removeprefix(f"{level}: ").split(": ")[-1].split(", or "):
         assert part in words
@@ -199,18 +199,13 @@ def test_the_page_says_what_the_text_says_with_the_verdict_first(toss, toss_page
         line = next(line for line in toss.report(full=True).splitlines() if line.strip().startswith(title))
         assert " ".join(line.split()) in words
     assert all(" ".join(line.split()) in words for line in str(certify(toss, None)).splitlines())
-
-
-def test_numbers_are_those_of_the_estimate(toss, toss_page):
-    table = next(t for t in Reader(toss_page).tables if t[0][1] == "value")
+    table = next(t for t in reader.tables if t[0][1] == "value")
     rows, note = tabulate_unknowns(toss, range(len(toss.theta)), ends=True)
     assert table == [[row[k] for k in rows.columns] for row in [rows.titles, *rows.rows]]
-    head = table[0]
-    low, high = head.index("95 % from"), head.index("to")
-    for i, row in enumerate(table[1:]):
-        scale = correct_errors(toss)[i]
-        np.testing.assert_allclose([float(row[low]), float(row[high])], correct_intervals(toss)[i], atol=0.04 * scale)
-    assert note in Reader(toss_page).words
+    assert note in words
+    low, high = table[0].index("95 % from"), table[0].index("to")
+    ends = [[float(row[low]), float(row[high])] for row in table[1:]]
+    assert (np.abs(ends - correct_intervals(toss)) < 0.04 * correct_errors(toss)[:, None]).all()
 
 
 def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
@@ -318,20 +313,10 @@ def test_curves_follow_an_unknown_to_first_order(toss, name):
     assert np.abs(log[f"d{place}_0"]).max() > 0.01
 
 
-def test_a_delay_moves_the_samples_as_the_curve_in_time():
+def test_a_delay_has_no_slider_and_the_page_says_how_late_its_samples_are():
     fit, text = fit_and_page("delay, outliers")
-    place = fit.theta_names.index("late")
-    (own, *_) = collect_curves(fit, 0, list_places(fit, 0), 800)
-    assert own.delay == place
-    theta = fit.theta.copy()
-    theta[place] += 1e-3
-    evaluator = fit.evaluator_at_solution()
-    times, slopes = own.samples["t"], own.samples[f"d{place}_0"]
-    moved = evaluator.simulate(theta)[0].seen[0][: len(times), 0]
-    before = evaluator.simulate(fit.theta)[0].seen[0][: len(times), 0]
-    assert f"x is late by {fit.theta[place]:.6g} s" in Reader(text).words
-    away = np.abs(times - fit.transition_times[0][0] - fit.theta[place]) > 0.2
-    np.testing.assert_allclose(-slopes[away], (moved - before)[away] / 1e-3, atol=1e-2)
+    assert {slider["name"] for slider in payload_of(text)["sliders"]} == set(fit.theta_names) - {"late"}
+    assert f"x is late by {fit.parameters['late']:.6g} s" in Reader(text).words
 
 
 def test_sliders_stop_at_bounds_and_at_what_can_be_seen(toss):
@@ -412,14 +397,11 @@ def test_many_runs_stay_small_and_the_worst_come_first():
     assert re.findall(r'<option value="\d+">\s*(\S+):', text)[0] == fit.run_names[-1]
     assert len([name for name in payload["templates"] if name.startswith("run-")]) == 1, "all runs share a drawing"
     assert len(text) < 2_500_000
-    first, everything = (table for table in reader.tables if table[0][1] == "value")
-    assert len(first) < len(everything)
-    assert [row[0] for row in everything[1:]] == list(fit.theta_names)
-    assert "v" in [row[0] for row in first], "parameters before transition times"
+    (table,) = (table for table in reader.tables if table[0][1] == "value")
+    assert [row[0] for row in table[1:]] == list(fit.theta_names)
     shown = Reader(fit._repr_html_())
-    assert (shown.count("img"), shown.count("table")) == (0, 1)
-    assert re.search(r"And \d+ more unknowns\.", shown.words)
-    assert "And 35 more." in Reader(fit.problem._repr_html_()).words
+    assert (shown.count("img"), shown.text) == (0, [str(fit)])
+    assert "and 25 more" in Reader(fit.problem._repr_html_()).words
 
 
 @pytest.fixture
@@ -440,22 +422,18 @@ def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, without_bokeh
 # --- in a notebook ----------------------------------------------------------------------------------------------------
 
 
-def test_a_notebook_shows_the_verdict_the_numbers_and_a_figure(toss):
-    reader = Reader(toss._repr_html_())
-    assert {tag for tag, _ in reader.elements} == {"div", "p", "table", "thead", "tbody", "tr", "th", "td", "img"}
-    assert str(toss.verdict) in reader.words
-    rows, _ = tabulate_unknowns(toss, range(len(toss.theta)))
-    assert reader.tables == [[[row[k] for k in rows.columns] for row in [rows.titles, *rows.rows]]]
-    (picture,) = (attributes for tag, attributes in reader.elements if tag == "img")
-    assert picture["alt"]
-    kind, _, content = picture["src"].partition(",")
+def test_a_notebook_shows_the_text_and_a_figure(toss):
+    shown = toss._repr_html_()
+    reader = Reader(shown)
+    assert [tag for tag, _ in reader.elements] == ["div", "pre", "img"]
+    assert reader.text == [str(toss)]
+    kind, _, content = reader.elements[-1][1]["src"].partition(",")
     assert kind == "data:image/png;base64"
     assert matplotlib.image.imread(io.BytesIO(base64.b64decode(content)), format="png")[..., :3].std() > 0.02
-    assert len(toss._repr_html_()) < 150_000
-    runs, unknowns = Reader(heater_problem()._repr_html_()).tables
-    assert runs[1] == ["1", "on → off", "0 to 6", "h", "24"]
-    assert unknowns[1][:2] == ["tau_1", "2"]
-    assert unknowns[2][:5] == ["k", "0.5", "0.01", "5", "1/h"]
+    assert len(shown) < 150_000
+    lines = [line.split() for line in Reader(heater_problem()._repr_html_()).text[0].splitlines()]
+    assert ["run1", "on", "->", "off", "0", "to", "6", "h", "24"] in lines
+    assert ["k", "0.5", "0.01", "5", "1/h"] in lines
 
 
 # --- in a browser -----------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import itertools
-import re
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -396,10 +395,9 @@ def test_correlations_are_the_largest_first():
     expected = np.sort(np.abs(fit.correlation[np.tril_indices(d, -1)]))[::-1]
     expected = expected[expected > 0.1]
     assert sizes == pytest.approx(expected, abs=6e-4)
-    (line,) = write_report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
-    *shown, rest = line.split("; ")
-    assert [abs(float(part.split()[-1])) for part in shown] == pytest.approx(expected[:3], abs=6e-4)
-    assert rest == f"and {len(expected) - 3} more"
+    *shown, rest = write_report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
+    assert shown == section[:3]
+    assert rest == f"  and {len(expected) - 3} more"
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -488,17 +486,6 @@ def test_bands_of_transitions_and_convergence():
     assert (ax.get_yscale(), ax.get_xlabel(), ax.get_ylabel()) == ("log", "iteration", "optimality (KKT residual)")
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), [50.0, 1e-2, np.nan])
     assert ax.lines[1].get_ydata()[0] == 1e-7
-
-
-# --- a real fit -------------------------------------------------------------------------------------------------------
-
-
-def test_what_is_held_fixed_is_printed_as_a_number():
-    fixed = {"k": sf.Parameter(21.0, fixed=True), "gains": sf.Parameter([1.0, -0.25, 1e-12], fixed=True)}
-    system = sf.HybridSystem({"m": lambda t, x, p: p["a"] - p["k"] * x * p["gains"][1] * 0.0}, [0.0])
-    data = sf.Measurements(np.arange(5.0), [0.1, 1.0, 1.9, 3.0, 4.1], sigma=0.1)
-    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ["m"], []), {"a": 0.5, **fixed}), strategy="local")
-    assert re.search(r"\n  k +21\n  gains +\[1, -0\.25, 1e-12\]\n", str(fit))
 
 
 # --- sentences --------------------------------------------------------------------------------------------------------
