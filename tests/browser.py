@@ -68,7 +68,7 @@ class Browser:
         elif event["method"] == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def open(self, path: Path:
+    def open(self, path: Path):
         """Load a file, and wait until its figures are drawn."""
         size = {"width": 1240, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **size)
