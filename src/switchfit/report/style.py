@@ -13,8 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-import numpy as np
-
 from switchfit.problem.validation import shorten
 from switchfit.report.formats import Timed, label_quantity, label_time
 from switchfit.runtime.presentation import Axes, Figure, join_first
@@ -197,13 +195,12 @@ def put_ticks(ax: Axes, run: Timed) -> Axes:
     run : Timed
     """
     if run.origin is not None:
-        from switchfit.report.axes import LONGEST, DateFormatter, DateLocator, Scale
+        from switchfit.report.axes import DateFormatter, DateLocator, Scale
 
         scale = Scale(run.origin, run.time_unit)
-        if np.all(np.abs(scale.to_days(ax.xaxis.get_view_interval())) < LONGEST):
-            locator = DateLocator(scale)
-            ax.xaxis.set_major_locator(locator)
-            ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
+        locator = DateLocator(scale)
+        ax.xaxis.set_major_locator(locator)
+        ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
     return ax
 
 

@@ -361,8 +361,6 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     -------
     matplotlib.axes.Axes
     """
-    from scipy.interpolate import PchipInterpolator  # here, since importing it takes longer than a profile
-
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
@@ -375,11 +373,10 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     for a, b in np.clip(regions, low - margin, high + margin).tolist():
         ax.axvspan(a, b, color=SHADE, alpha=0.15, linewidth=0, label=label)
         label = ""
-    # zeta is near to a straight line: a curve through its points, squared, is the profile between them.
-    shown = slice(first, last + 1)
-    fine = np.linspace(values[first], values[last], 500) if last > first else values[shown]
-    between = PchipInterpolator(values[shown], profile.zeta[shown])(fine) if last > first else profile.zeta[shown]
-    ax.plot(fine, between**2, "-", color=FIT, linewidth=LINE, label="profile")
+    # zeta is near to a straight line: straight between its points, squared, it is the profile between them.
+    shown, fine = slice(first, last + 1), np.linspace(values[first], values[last], 500)
+    curve = np.interp(fine, values[shown], profile.zeta[shown]) ** 2
+    ax.plot(fine, curve, "-", color=FIT, linewidth=LINE, label="profile")
     ax.plot(values[shown], ratio[shown], "o", color=FIT, markersize=3.5)
     x = np.linspace(low - margin, high + margin, 400)
     if np.isfinite(profile.standard_error) and profile.standard_error > 0:
