@@ -252,22 +252,20 @@ def test_without_a_problem_file_the_data_are_hashed_and_without_a_model_nothing_
 
 def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_there(toss, heater):
     np.testing.assert_array_equal(correct_intervals(heater), heater.confidence_intervals())
-    factors = correct_errors(toss) / toss.standard_errors
-    assert (factors > 2).all()
-    narrow, wide = toss.confidence_intervals(), correct_intervals(toss)
-    for k in (0, 1):
-        free = (wide[:, k] > toss.lower) & (wide[:, k] < toss.upper)
-        assert free.any()
-        off = (wide[:, k] - toss.theta) / (narrow[:, k] - toss.theta)
-        np.testing.assert_allclose(off[free], factors[free], rtol=1e-9)
-    problem = toss.problem
     mu = sf.Parameter(0.3, lower=0.01, upper=2.0, unit="1", scale="log")
-    fit = sf.estimate(replace(problem, parameters={**problem.parameters, "mu": mu}), strategy="local")
-    i = fit.theta_names.index("mu")
-    factor = correct_errors(fit)[i] / fit.standard_errors[i]
-    narrow, wide = (np.log(ends[i] / fit.theta[i]) for ends in (fit.confidence_intervals(), correct_intervals(fit)))
-    assert factor > 2
-    np.testing.assert_allclose(wide, factor * narrow, rtol=1e-9)
+    scaled = replace(toss.problem, parameters={**toss.problem.parameters, "mu": mu})
+    fit = sf.estimate(scaled, strategy="local")
+    factors, narrow, wide = (
+        correct_errors(fit) / fit.standard_errors,
+        fit.confidence_intervals(),
+        correct_intervals(fit),
+    )
+    assert (factors > 2).all()
+    for i, name in enumerate(fit.theta_names):
+        scale = np.log if name == "mu" else np.asarray
+        free = (wide[i] > fit.lower[i]) & (wide[i] < fit.upper[i])
+        near, far = (scale(ends[i][free]) - scale(fit.theta[i]) for ends in (narrow, wide))
+        np.testing.assert_allclose(far, factors[i] * near, rtol=1e-9)
 
 
 # --- sliders ----------------------------------------------------------------------------------------------------------
@@ -344,6 +342,8 @@ def test_positions_in_a_plane_are_told_by_names_and_units():
         (("a", "b"), ("m", "m"), None),
     ):
         assert find_plane(names, units) == plane, names
+    # Without samples of both there is nothing to draw in it.
+    assert "match_aspect" not in fit_and_page("no data")[1].partition('id="payload"')[2]
 
 
 # --- one file ---------------------------------------------------------------------------------------------------------
@@ -380,13 +380,6 @@ def test_names_do_no_harm():
     assert "Profile of $$k$$" in Reader(fit.profile("$$k$$")._repr_html_()).words
 
 
-def test_positions_that_are_not_measured_have_no_path():
-    """The plane is told by names and units; without samples of both there is nothing to draw in it."""
-    _, text = fit_and_page("no data")
-    check_alone(text)
-    assert "match_aspect" not in text.partition('id="payload"')[2]
-
-
 def test_many_runs_stay_small_and_the_worst_come_first():
     fit = sf.estimate(sf.Problem(RAMP, ramps(45), {"v": 0.9}), strategy="local")
     text = format_page(fit)
@@ -404,13 +397,9 @@ def test_many_runs_stay_small_and_the_worst_come_first():
     assert "and 25 more" in Reader(fit.problem._repr_html_()).words
 
 
-@pytest.fixture
-def without_bokeh(monkeypatch):
+def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "bokeh" else real(name, *more))
-
-
-def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, without_bokeh):
     with pytest.raises(ImportError, match=r"needs bokeh, not installed here: pip install 'switchfit\[report\]'"):
         heater.save_report(tmp_path / "report.html")
     done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])
@@ -462,8 +451,6 @@ def write(folder, text):
     return path
 
 
-MODELS = "Bokeh.documents.flatMap((d) => d.roots()).flatMap((r) => [...r.references()])"
-
 COLUMN = """(name, source, column) => {
   const element = document.getElementById(name);
   for (const doc of Bokeh.documents) {
@@ -488,7 +475,8 @@ CHOOSE = """(value) => {
 
 def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
     browser.open(write(tmp_path, toss_page))
-    names = [slider["name"] for slider in payload_of(toss_page)["sliders"]]
+    sliders = payload_of(toss_page)["sliders"]
+    places = {slider["name"]: k for k, slider in enumerate(sliders)}
 
     def read(source, column):
         found = browser.evaluate(f"({COLUMN})('run-0', '{source}', '{column}')")
@@ -501,23 +489,17 @@ def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
     assert cost() == f"J = {toss.cost:.7e} (at the estimate)".replace("e-0", "e-")
     assert browser.evaluate("document.querySelectorAll('.slider.shown').length") == len(toss.theta)
 
-    k = names.index("mu")
-    browser.evaluate(f"({MOVE})({k}, 400)")
-    slider = payload_of(toss_page)["sliders"][k]
-    change = slider["values"][-1] - slider["theta"]
-    expected = before[0] + change * read("curve-0", f"d{slider['place']}_0")
-    np.testing.assert_allclose(read("curve-0", "y0"), expected, rtol=1e-12)
-    np.testing.assert_allclose(
-        read("samples-0", "y0"), before[1] + change * read("samples-0", f"d{slider['place']}_0"), rtol=1e-9, atol=1e-15
-    )
-    shown = float(cost().split()[2].rstrip(","))
-    assert shown == pytest.approx(slider["costs"][-1], rel=1e-6)
+    slider = sliders[places["mu"]]
+    browser.evaluate(f"({MOVE})({places['mu']}, 400)")
+    change, slope = slider["values"][-1] - slider["theta"], f"d{slider['place']}_0"
+    for source, old in zip(("curve-0", "samples-0"), before, strict=True):
+        np.testing.assert_allclose(read(source, "y0"), old + change * read(source, slope), rtol=1e-9, atol=1e-15)
+    assert float(cost().split()[2].rstrip(",")) == pytest.approx(slider["costs"][-1], rel=1e-6)
     assert "(evaluated)" in cost()
 
-    t = names.index("tau_1")
-    browser.evaluate(f"({MOVE})({t}, 0)")
+    browser.evaluate(f"({MOVE})({places['tau_1']}, 0)")
     assert "(by the quadratic approximation)" in cost()
-    first = payload_of(toss_page)["sliders"][t]["values"][0]
+    first = sliders[places["tau_1"]]["values"][0]
     assert read("transitions", "x")[0] == pytest.approx(first)
     assert read("modes", "right")[0] == read("modes", "left")[1] == pytest.approx(first)
 
