@@ -15,7 +15,6 @@ import pandas as pd
 import polars as pl
 import pytest
 import xarray as xr
-from browser import Browser, find_browser
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import charge, decay, first_state
@@ -467,27 +466,22 @@ def test_the_page_shows_dates(fits, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_browser() is None, reason="needs Chromium")
-def test_the_browser_agrees_with_zoneinfo(fits, tmp_path):
+def test_the_browser_agrees_with_zoneinfo(browser, fits, tmp_path):
     dated, _ = fits
     dated.save_report(tmp_path / "report.html")
-    browser = Browser(tmp_path / "profile")
-    try:
-        browser.open(tmp_path / "report.html")
-        (shown,) = browser.evaluate(
-            "[...document.querySelectorAll('[data-slider=\"0\"] output')].map((o) => o.textContent)"
-        )
-        assert shown == format_date(dated.transition_dates[0][0], 600)
-        start = dated.trajectory.origin.instant / 1e6
-        for low, high in ((0, 19), (8.5, 10), (9, 9.01), (0, 900), (-3000, 3000)):
-            ticks = browser.evaluate(f"switchfitDates.findTicks({low}, {high}, {start}, 864e5, 'Europe/Berlin')")
-            assert 3 <= len(ticks) <= 10
-            dates = [dated.trajectory.origin.find_date(round(tick * 864e5) / 864e5, "d") for tick in ticks]
-            if high - low > 0.1:
-                assert not any(date.second or date.microsecond for date in dates), dates
-        assert browser.errors == []
-    finally:
-        browser.close()
+    browser.open(tmp_path / "report.html")
+    (shown,) = browser.evaluate(
+        "[...document.querySelectorAll('[data-slider=\"0\"] output')].map((o) => o.textContent)"
+    )
+    assert shown == format_date(dated.transition_dates[0][0], 600)
+    start = dated.trajectory.origin.instant / 1e6
+    for low, high in ((0, 19), (8.5, 10), (9, 9.01), (0, 900), (-3000, 3000)):
+        ticks = browser.evaluate(f"switchfitDates.findTicks({low}, {high}, {start}, 864e5, 'Europe/Berlin')")
+        assert 3 <= len(ticks) <= 10
+        dates = [dated.trajectory.origin.find_date(round(tick * 864e5) / 864e5, "d") for tick in ticks]
+        if high - low > 0.1:
+            assert not any(date.second or date.microsecond for date in dates), dates
+    assert browser.errors == []
 
 
 # --- texts ------------------------------------------------------------------------------------------------------------

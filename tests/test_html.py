@@ -255,11 +255,8 @@ def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_ther
     mu = sf.Parameter(0.3, lower=0.01, upper=2.0, unit="1", scale="log")
     scaled = replace(toss.problem, parameters={**toss.problem.parameters, "mu": mu})
     fit = sf.estimate(scaled, strategy="local")
-    factors, narrow, wide = (
-        correct_errors(fit) / fit.standard_errors,
-        fit.confidence_intervals(),
-        correct_intervals(fit),
-    )
+    factors = correct_errors(fit) / fit.standard_errors
+    narrow, wide = fit.confidence_intervals(), correct_intervals(fit)
     assert (factors > 2).all()
     for i, name in enumerate(fit.theta_names):
         scale = np.log if name == "mu" else np.asarray
@@ -426,17 +423,6 @@ def test_a_notebook_shows_the_text_and_a_figure(toss):
 
 
 # --- in a browser -----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    from browser import Browser, find_browser
-
-    if find_browser() is None:
-        pytest.skip("no Chromium on this machine")
-    opened = Browser(tmp_path_factory.mktemp("chromium"))
-    yield opened
-    opened.close()
 
 
 def check_quiet(browser):
