@@ -44,15 +44,7 @@ Row = tuple[str, str]
 """A label at the left, empty where it is that of the row before, and a text."""
 
 
-SCREEN = {
-    "experiments": 3,
-    "channels": 6,
-    "unknowns": 10,
-    "fixed": 4,
-    "correlations": 3,
-    "directions": 1,
-    "warnings": 3,
-}
+SCREEN = {"experiments": 3, "channels": 6, "unknowns": 10, "fixed": 4, "directions": 1, "others": 3}
 """Largest number of entries of each section, about 40 lines for most fits; the others are counted."""
 
 SMALL_CORRELATION = 0.1
@@ -89,7 +81,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     """
     limits = dict.fromkeys(SCREEN, sys.maxsize) if full else SCREEN
     runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    course = [*list_experiments(estimate, limits["others"], runs), *list_course(estimate)]
+    course = [*list_experiments(estimate, limits["experiments"], runs), *list_course(estimate)]
     where = f", of which more is explained{runs}"
     channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=where)
     correlations = format_table(*tabulate_correlations(estimate), most=limits["others"])
