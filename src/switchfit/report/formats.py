@@ -325,6 +325,17 @@ def format_table(
     return lines + ([f"{indent}and {len(rows) - most} more{where}"] if len(rows) > most else [])
 
 
+def join_sections(*sections: Sequence[str]) -> str:
+    """Return sections as text, with an empty line between them; those without a line are left out.
+
+    Parameters
+    ----------
+    sections : sequence of str
+        The lines of each.
+    """
+    return "\n\n".join("\n".join(lines) for lines in sections if lines)
+
+
 def wrap_text(text: str, first: str = "", others: str = "  ", width: int = WIDTH) -> list[str]:
     """Return text as lines of at most so many columns, where names allow it.
 

@@ -22,6 +22,7 @@ from switchfit.report.formats import (
     format_time,
     format_unit,
     get_unit,
+    join_sections,
     list_dated,
     list_jumps,
     wrap_text,
@@ -94,8 +95,8 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
         "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
         "Warnings": _format_warnings(estimate, limits["others"], full=full),
     }
-    written = ["\n".join([title, *lines]) for title, lines in sections.items() if lines]
-    shown = "\n\n".join(["\n".join(wrap_text(str(estimate.verdict))), *written])
+    written = [[title, *lines] for title, lines in sections.items() if lines]
+    shown = join_sections(wrap_text(str(estimate.verdict)), *written)
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
 
 

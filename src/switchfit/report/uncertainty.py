@@ -244,12 +244,13 @@ def tabulate_diagnostics(diagnostics: ResidualDiagnostics) -> Table:
     for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
         size = [f"{len(channel.values)}", f"{channel.rms:.3g}", f"{channel.mean:+.2f}"]
         correlation = [f"{channel.correlation:+.2f}", f"{channel.effective:.0f}"]
-        tests = [_format_probability(channel.whiteness), _format_probability(channel.normality)]
+        tests = [format_probability(channel.whiteness), format_probability(channel.normality)]
         rows.append([label, *size, *correlation, *tests, f"{channel.outliers}"])
     return Table(rows, "<" + ">" * 8, titles)
 
 
-def _format_probability(value: float) -> str:
+def format_probability(value: float) -> str:
+    """Return a probability as text; a dash if it is not known."""
     return "-" if np.isnan(value) else f"{value:.3f}" if value >= 5e-4 else f"{value:.0e}"
 
 

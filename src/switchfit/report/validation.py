@@ -17,6 +17,7 @@ from switchfit.report.formats import (
     format_table,
     format_time,
     get_unit,
+    join_sections,
     label_quantity,
     list_dated,
     suffix_time,
@@ -25,6 +26,7 @@ from switchfit.report.formats import (
 from switchfit.report.plot import plot_modes
 from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, SHADE, SMALL, THIN, TRANSITION
+from switchfit.report.uncertainty import format_probability
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text, join_first
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent
@@ -110,33 +112,32 @@ def write_validation(found: Validation) -> str:
     ----------
     found : Validation
     """
-    lines = wrap_text(str(found.verdict))
+    sections = [wrap_text(str(found.verdict))]
     errors, names = found.corrected_standard_errors, found.theta_names
     rows = {}
-    columns = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
-    for (name, value, error, unit), run in zip(columns, list_dated(found.problem), strict=True):
+    known = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
+    for (name, value, error, unit), run in zip(known, list_dated(found.problem), strict=True):
         shown, spread = format_estimate(float(value), float(error), run)
         rows[name] = [name, shown, spread if spread != "held" else "", unit]
     refit = () if found.refit is None else found.refit.theta_names
     estimated = [name for name in names if name in refit and name not in found.kept]
     given = [name for name in names if name not in (*found.kept, *estimated)]
     titles = {"Kept from the fit": found.kept, "Estimated from this run": estimated, "As given": given}
-    for title, listed in titles.items():
-        if listed:
-            lines += ["", title, *format_table([rows[name] for name in listed], "<>><")]
+    sections += [
+        [title, *format_table([rows[name] for name in listed], "<>><")] for title, listed in titles.items() if listed
+    ]
     if not np.array_equal(errors, found.standard_errors, equal_nan=True):
-        lines += ["", ALLOWED]
-    lines += ["", "Channels", *format_table(*tabulate_predicted(found))]
+        sections.append([ALLOWED])
+    sections.append(["Channels", *format_table(*tabulate_predicted(found))])
     if np.isfinite(found.chi_square):
         kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"
         chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
-        lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
+        sections.append([f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"])
     if found.inputs:
-        tests = []
-        for test in found.inputs:
-            tests.append([test.channel, test.input, "-" if np.isnan(test.probability) else f"{test.probability:.2g}"])
-        lines += ["", "Correlation with inputs", *format_table(tests, "<<>", ["residuals of", "and input", "P(none)"])]
-    return "\n".join(lines)
+        tests = [(test.channel, test.input, format_probability(test.probability)) for test in found.inputs]
+        columns = ["residuals of", "and input", "P(none)"]
+        sections.append(["Correlation with inputs", *format_table(tests, "<<>", columns)])
+    return join_sections(*sections)
 
 
 def tabulate_predicted(found: Validation) -> Table:
@@ -150,7 +151,7 @@ def tabulate_predicted(found: Validation) -> Table:
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     for label, _, comparison, k in list_channels(found.comparisons, found.run_names):
         explained, test = explain_channel(comparison, k), tests.get(label)
-        white = "" if test is None or np.isnan(test.whiteness) else f"{test.whiteness:.2g}"
+        white = "" if test is None else format_probability(test.whiteness)
         count = int(np.isfinite(comparison.measured[:, k]).sum())
         shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
         lag = "" if test is None else f"{test.correlation:+.2f}"
@@ -237,12 +238,11 @@ def write_comparison(found: ModelComparison) -> str:
     ----------
     found : ModelComparison
     """
-    lines = wrap_text(write_best(found))
-    lines += ["", *format_table(*tabulate_models(found))]
+    lines = format_table(*tabulate_models(found))
     ended = [name for name, fit in zip(found.names, found.estimates, strict=True) if not fit.status.successful]
     if ended:
         lines += wrap_text(f"Not converged: {', '.join(ended)}. Likelihoods of these may be too small.", "  ")
-    return "\n".join(lines)
+    return join_sections(wrap_text(write_best(found)), lines)
 
 
 _STRENGTHS = ((RULED_OUT, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
@@ -338,15 +338,17 @@ def write_design(design: Design) -> str:
     before, after = (f"{value:.4g}" for value in (design.criterion_before, design.criterion_after))
     rows.append((f"{MEANING[design.criterion]} of covariance", "", before, after, ""))
     head = f"{design.criterion}-optimal design of {design.run} for {join_first(design.names)}."
-    lines = [*wrap_text(head), "", *format_table(rows, "<>>><", titles)]
-    for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL)):
-        lines += ["", *wrap_text(template.format(", ".join(names)))] if names else []
+    texts = [
+        template.format(", ".join(names))
+        for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL))
+        if names
+    ]
     for name, values in design.inputs.items():
-        lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
+        texts.append(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")
     for sensor, times in design.sample_times.items():
         listed = ", ".join(format_time(time, path) for time in times.tolist()) + suffix_time(path)
-        lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
-    return "\n".join(lines)
+        texts.append(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")
+    return join_sections(wrap_text(head), format_table(rows, "<>>><", titles), *map(wrap_text, texts))
 
 
 _UNDETERMINED = (
