@@ -630,24 +630,16 @@ def _write_ending(issue: Issue) -> str:
 def _describe_many(issue: Issue) -> str:
     """Return how many fits are of each level, and how much of the data they explain."""
     counts = {level: int(get_figure(issue, level)) for level in LEVELS}
-    total = sum(counts.values())
-    parts = [f"{count} {'is' if count == 1 else 'are'} {level}" for level, count in counts.items() if count]
-    if len(parts) == 1:
-        parts = [parts[0].replace(f"{total} ", "the only fit " if total == 1 else f"all {total} fits ", 1)]
-    else:
-        parts[0] = parts[0].replace(" ", f" of {total} fits ", 1)
-    worst = get_figure(issue, "worst")
+    parts = join_words([f"{count} {level}" for level, count in counts.items() if count])
+    text, worst = f"{parts} of {format_count(sum(counts.values()), 'fit')}", get_figure(issue, "worst")
     if not np.isfinite(worst):
-        return join_words(parts)
-    if total == 1:
-        return f"{parts[0]} and explains {format_share(worst)} of the variance"
-    return f"{parts[0]} and explain {format_share(worst)} of the variance or more (fit {issue.subjects[0]} least)"
+        return text
+    return f"{text}, explaining {format_share(worst)} of the variance or more (fit {issue.subjects[0]} least)"
 
 
 def _count_fits(issue: Issue) -> str:
     """Return the number of fits that a reason is about."""
-    count, total = int(get_figure(issue, "count")), int(get_figure(issue, "fits"))
-    return "the only fit" if total == 1 else f"all {total} fits" if count == total else f"{count} of {total} fits"
+    return f"{get_figure(issue, 'count'):.0f} of {format_count(int(get_figure(issue, 'fits')), 'fit')}"
 
 
 def _name_least(issue: Issue) -> str:
