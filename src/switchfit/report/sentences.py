@@ -112,7 +112,7 @@ def write_constraint(constraint: Constraint) -> str:
 @format_text.register(Kink)
 def write_kink(kink: Kink) -> str:
     """Return which unknown is at a kink, and the derivatives on both sides."""
-    return f"{kink.unknown} at a kink ({kink.left:.1e}, {kink.right:.1e})"
+    return f"{kink.unknown} = {kink.value:.10g}, where the derivative jumps from {kink.left:.1e} to {kink.right:.1e}"
 
 
 # --- how a fit ended --------------------------------------------------------------------------------------------------
@@ -137,17 +137,13 @@ def _describe_ending(ended: Termination) -> dict[str, str]:
     return {
         "iterations": format_count(ended.iterations, "iteration"),
         "earlier": f", {earlier} of them before the mesh was refined," if earlier else "",
-        "kinks": ", ".join(map(_write_jump_of_slope, ended.kinks)),
+        "kinks": ", ".join(map(str, ended.kinks)),
         "unread": describe_unread(ended.unread, ended.absent),
         "direction": " ".join(f"{part:+.2g} {name}" for name, part in ended.flat_direction) or "no direction",
         "idle": ", ".join(ended.idle),
         "violated": "; ".join(f"{name} = {value:.2e}" for name, value in ended.violated),
         "reason": f" {ended.reason or unknown}".rstrip(),
     }
-
-
-def _write_jump_of_slope(kink: Kink) -> str:
-    return f"{kink.unknown} = {kink.value:.10g}, where the derivative jumps from {kink.left:.1e} to {kink.right:.1e}"
 
 
 def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
@@ -265,17 +261,6 @@ def _write_combination(issue: Issue) -> str:
     return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
 
 
-def _name_undetermined(issue: Issue) -> str:
-    *others, last = issue.subjects or ("the unknowns",)
-    return f"{', '.join(others)} and {last} apart from one another" if others else last
-
-
-def _measure_sigma(issue: Issue) -> float:
-    """Return by which factor sigma is off."""
-    root = float(np.sqrt(get_figure(issue, "chi-square")))
-    return root if issue.kind == "sigma too small" else 1 / root if root > 0 else np.inf
-
-
 def _list_correlated(issue: Issue) -> str:
     each = zip(issue.subjects, list_figures(issue, "correlation"), strict=False)
     return join_first([f"{label} ({value:.2f})" for label, value in each])
@@ -291,12 +276,6 @@ def _list_wrong(issue: Issue) -> str:
     each = zip(issue.subjects, list_figures(issue, "derivatives"), list_figures(issue, "differences"), strict=False)
     entries = [f"{name} (derivative {stated:.3g}, differences {found:.3g})" for name, stated, found in each]
     return f"; it is wrong in {', '.join(entries)}" if entries else ""
-
-
-def _write_passage(issue: Issue) -> str:
-    """Return what passes which value where the cost jumps."""
-    at = list_figures(issue, "at")
-    return f"{issue.subjects[0]} passes {at[0]:.8g}" if len(at) == 1 else f"the step passes {_write_at(issue)}"
 
 
 def _write_at(issue: Issue) -> str:
@@ -379,7 +358,7 @@ _ISSUES: dict[str, Sentence] = {
     "say nothing about it, and its value above is the first guess. Fix it, or fit a log in which it acts too.",
     "without effect": "The cost does not depend on {names}, to second order: the data say nothing about it, and its "
     "value above is the first guess. Fix it, or let it act on what is measured.",
-    "hardly determined": "The data hardly determine {undetermined} (smallest eigenvalue {eigenvalue:.2g} of the "
+    "hardly determined": "The data hardly determine {first names} (smallest eigenvalue {eigenvalue:.2g} of the "
     "Hessian scaled to unit curvature). Fix one of the unknowns, or add data that tell them apart.",
     "no errors: not finite": "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "
@@ -389,10 +368,9 @@ _ISSUES: dict[str, Sentence] = {
     "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
     "sigma too small": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too small, or the "
-    "model misses something (look at the residuals). Standard errors are too small, by a factor of {off by:.2g} if it "
-    "is sigma.",
+    "model misses something (look at the residuals). If it is sigma, standard errors are too small by its root.",
     "sigma too large": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too large, or the "
-    "samples were smoothed before. Standard errors are too large, by a factor of {off by:.2g} if it is sigma.",
+    "samples were smoothed before. If it is sigma, standard errors are too large by its root.",
     "correlated residuals": "Neighbouring residuals are correlated in {correlated}: the model misses something there, "
     "or the samples were smoothed before. The {values:.0f} values are worth about {effective:.0f} independent ones: "
     "the standard errors, which take them as independent, are too small by a factor of up to {narrowing:.2g}.",
@@ -421,8 +399,8 @@ _ISSUES: dict[str, Sentence] = {
     # Why a line search failed, or a fit ended with an error
     "wrong slope": "The gradient does not belong to the cost: along that direction it says {before:.3g}, differences "
     "of the cost say {after:.3g}{wrong entries}. Check the derivatives.{delay}",
-    "jump": "The cost jumps from {before:.8g} to {after:.8g} where {passage}. The optimiser needs a cost that is "
-    "continuous there.{delay}",
+    "jump": "The cost jumps from {before:.8g} to {after:.8g} where the step passes {places}. The optimiser needs a "
+    "cost that is continuous there.{delay}",
     "switch": "{jump}{1}, and derivatives do not include such a switch. If {0} is a time, make it a transition time; "
     "if it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or fix it.",
     "undefined": "{undefined}. {definition}.",
@@ -452,14 +430,11 @@ def write_verdict(verdict: Verdict) -> str:
     ----------
     verdict : Verdict
     """
-    collapsed = [reason for reason in verdict.reasons if reason.kind == "a mode collapsed"]
-    others = [reason for reason in verdict.reasons if reason not in (*verdict.answers, *collapsed[1:])]
-    reasons = [_count_modes(collapsed) if reason in collapsed else write_reason(reason) for reason in others]
-    more = len(reasons) - LISTED_REASONS
-    rest = ["and another reason" if more == 1 else f"and {more} more reasons"] if more > 0 else []
-    reasons = [*map(write_reason, verdict.answers), *reasons[:LISTED_REASONS], *rest]
+    reasons, most = list_reasons(verdict), len(verdict.answers) + LISTED_REASONS
+    rest = [f"and {format_count(len(reasons) - most, 'more reason')}"] if len(reasons) > most else []
+    said = "; ".join([*map(write_reason, reasons[:most]), *rest])
     steps = ", or ".join(write_step(step) for step in verdict.next_steps[:LISTED_STEPS])
-    return f"{verdict.level.capitalize()}: {'; '.join(reasons)}{f': {steps}' if steps else ''}."
+    return f"{verdict.level.capitalize()}: {said}{f': {steps}' if steps else ''}."
 
 
 def list_reasons(verdict: Verdict) -> list[Issue]:
@@ -584,13 +559,6 @@ def _write_wrong_model(issue: Issue) -> str:
 def _name(names: tuple[str, ...]) -> str:
     """Return the first names, and the number of the others."""
     return join_words(names or ("the unknowns",)) if len(names) <= LISTED_NAMES else join_first(names, LISTED_NAMES)
-
-
-def _count_modes(collapsed: list[Issue]) -> str:
-    if len(collapsed) == 1:
-        return write_reason(collapsed[0])
-    names = tuple(_name_mode(*issue.subjects[:2]).removeprefix("mode ") for issue in collapsed)
-    return f"{len(names)} modes collapsed ({_name(names)})"
 
 
 def _count_starts(issue: Issue) -> str:
@@ -753,16 +721,13 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "names": _join,
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
     "held mode": lambda issue: capitalise(_name_mode(*issue.subjects[:2], position=get_figure(issue, "position"))),
-    "undetermined": _name_undetermined,
     "correlated": _list_correlated,
     "non-normal": _list_non_normal,
     "wrong entries": _list_wrong,
-    "passage": _write_passage,
     "jump": _write_jump,
     "places": _write_at,
     "kind": lambda issue: issue.kind,
     "orders": lambda issue: ", ".join(f"{order:.2f}" for order in list_figures(issue, "orders")),
-    "off by": _measure_sigma,
     "undefined": lambda issue: capitalise(write_undefined(issue)),
     "definition": lambda issue: capitalise(suggest_definition(issue.subjects[1])),
     "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
