@@ -234,11 +234,8 @@ def _plot_panels(
     columns = max(min(len(shown), columns), 1)
     rows = max(-(-len(shown) // columns), 1)
     figure = style.make_figure(each[0] * columns + 0.5, each[1] * rows + 0.5)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    axes = [figure.add_subplot(rows, columns, number + 1) for number in range(len(shown))]
     for number, panel in enumerate(axes):
-        if number >= len(shown):
-            panel.set_visible(False)
-            continue
         draw(study, shown[number], panel)
         if number % columns:
             panel.set_ylabel("")

@@ -733,7 +733,6 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
     "first names": lambda issue: _name(issue.subjects),
     "mode": lambda issue: _name_mode(*issue.subjects[:2]),
-    "explanation": _explain,
     "explanation of the worst": _explain_worst,
     "agreement": _count_starts,
     "fits": _count_fits,
