@@ -145,18 +145,13 @@ def line_with(text: str, start: str) -> str:
 # --- text -------------------------------------------------------------------------------------------------------------
 
 
-def test_unknowns_have_errors_units_guesses_and_modes():
+def test_errors_and_correlations_are_those_of_the_inverse_by_hand():
     fit = made()
-    text = report(fit)
     # (H^-1)_ii by hand: det = 400 (250000 - 90000) - 20 (20 * 2500) = 63e6
     by_hand = np.sqrt([160000 / 63e6, 1e6 / 63e6, (40000 - 400) / 63e6])
     assert fit.standard_errors == pytest.approx(by_hand)
-    assert line_with(text, "tau_1  ") == "tau_1 4.000 ± 0.050 (1.3 %) s 3 stick -> slip"
-    assert line_with(text, "tau_2  ") == "tau_2 7.00 ± 0.13 (1.8 %) s 8 slip -> stick"
-    assert line_with(text, "mu  ") == "mu 0.800 ± 0.025 (3.1 %) 0.5"
-    assert line_with(text, "g  ") == "g 9.81 m/s^2"
     # correlation of tau_2 and mu: -cofactor / root of the product of the others
-    assert line_with(text, "tau_2, mu") == f"tau_2, mu {-400 * 300 / np.sqrt(1e6 * 39600):+.3f}"
+    assert line_with(report(fit), "tau_2, mu") == f"tau_2, mu {-400 * 300 / np.sqrt(1e6 * 39600):+.3f}"
 
 
 @pytest.mark.parametrize(
