@@ -24,7 +24,7 @@ from switchfit.report.formats import (
 from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime import special
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.certificate import Certificate, DerivativeCheck, Direction, Identifiability
 from switchfit.uncertainty.profiles import Profile
 from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
@@ -150,29 +150,22 @@ def write_identifiability(found: Identifiability) -> str:
     ----------
     found : Identifiability
     """
-    count = len(found.theta_names) - len(found.held)
-    where = _PLACES[found.where]
-    sentences = []
-    if others := [name for name in found.without if name not in (*found.unread, *found.absent)]:
-        sentences.append(f"{where} the cost does not depend on {', '.join(others)}, to second order.")
-    if found.unread or found.absent:
-        sentences.append(f"{capitalise(describe_unread(found.unread, found.absent))}.")
-    if found.idle:
-        sentences.append(
-            f"{where} the cost does not depend on {', '.join(found.idle)}, because a mode has collapsed: leave it out "
-            "of mode_sequence."
-        )
-    if not count:
-        sentences.append(f"{where} constraints, kinks and collapsed modes hold all unknowns.")
-    elif found.undetermined == 0:
-        sentences.append(
-            f"{where} the data determine all {count} unknowns; condition number of the scaled Hessian "
-            f"{found.condition_number:.3g}."
-        )
-    elif (many := found.undetermined - len(found.without)) > 0:
-        what = "one combination" if many == 1 else f"{many} combinations"
-        sentences.append(f"{where} the data do not determine {what} of the {count} unknowns.")
-    lines = [line for sentence in sentences for line in wrap_text(sentence, others="")]
+    count, many = len(found.theta_names) - len(found.held), found.undetermined - len(found.without)
+    others = ", ".join(name for name in found.without if name not in (*found.unread, *found.absent))
+    where, condition = _PLACES[found.where], f"condition number of the scaled Hessian {found.condition_number:.3g}"
+    collapsed = f"{', '.join(found.idle)}, because a mode has collapsed: leave it out of mode_sequence."
+    cases = (
+        (others, f"{where} the cost does not depend on {others}, to second order."),
+        (found.unread or found.absent, f"{capitalise(describe_unread(found.unread, found.absent))}."),
+        (found.idle, f"{where} the cost does not depend on {collapsed}"),
+        (not count, f"{where} constraints, kinks and collapsed modes hold all unknowns."),
+        (count and not found.undetermined, f"{where} the data determine all {count} unknowns; {condition}."),
+        (
+            count and many > 0,
+            f"{where} the data do not determine {format_count(many, 'combination')} of the {count} unknowns.",
+        ),
+    )
+    lines = [line for applies, sentence in cases if applies for line in wrap_text(sentence, others="")]
     for direction in found.directions if count else ():
         lines += wrap_text(write_direction(found, direction), "  - ", "    ")
     return "\n".join(lines)

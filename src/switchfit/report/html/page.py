@@ -274,8 +274,8 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    functions = (add_dates, certify, find_issues, list_reasons, tabulate_certificate, tabulate_diagnostics)
-    functions += (format_span, join_words, unit_suffix, write_direction, write_reason, write_step)
+    functions: list[Any] = [add_dates, certify, find_issues, format_span, join_words, list_reasons, unit_suffix]
+    functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
     environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
     payload["drawings"] = drawings = {}
