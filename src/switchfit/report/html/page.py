@@ -363,7 +363,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
     """Return what the template shows of a run; at first it shows some of the channels that are measured."""
-    channels = []
+    channels: list[tuple[str, str, bool]] = []
     for c, own in enumerate(curves):
         shown = own.kind != "states" or not fit.comparisons[e]
         for k, name in enumerate(own.names):
