@@ -368,7 +368,8 @@ _ISSUES: dict[str, Sentence] = {
     "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
     "sigma too small": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too small, or the "
-    "model misses something (look at the residuals). If it is sigma, standard errors are too small by the root of that.",
+    "model misses something (look at the residuals). If it is sigma, standard errors are too small by the root of "
+    "that.",
     "sigma too large": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too large, or the "
     "samples were smoothed before. If it is sigma, standard errors are too large by the root of that.",
     "correlated residuals": "Neighbouring residuals are correlated in {correlated}: the model misses something there, "
