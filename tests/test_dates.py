@@ -439,7 +439,8 @@ def test_ticks_of_any_span(span):
 def test_profiles_residuals_and_many_fits_show_dates(fits):
     dated, _ = fits
     profile = dated.profile("tau_1")
-    assert re.search(r"date +2020-03-29 \d\d:\d\d, 95 % from 2020-03-29 \d\d:\d\d to 2020-03-29", str(profile))
+    assert re.search(r"estimate +2020-03-29 \d\d:\d\d ± ", str(profile))
+    assert re.search(r"95 % interval +\[2020-03-29 \d\d:\d\d, 2020-03-29 \d\d:\d\d\]", str(profile))
     assert profile.plot().axes[0].get_xlabel() == "tau_1 (Europe/Berlin)"
     assert dated.plot_residuals().axes[0].get_xlabel() == "time (Europe/Berlin)"
     study = sf.bootstrap(dated, 40)
