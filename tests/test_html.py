@@ -203,6 +203,8 @@ def test_the_page_says_what_the_text_says_with_the_verdict_first(toss, toss_page
     rows, note = tabulate_unknowns(toss, range(len(toss.theta)), ends=True)
     assert table == [[row[k] for k in rows.columns] for row in [rows.titles, *rows.rows]]
     assert note in words
+    (correlations,) = (t for t in reader.tables if t[0][1:] == list(toss.theta_names))
+    assert [[float(cell) for cell in row[1:]] for row in correlations[1:]] == toss.correlation.round(2).tolist()
     low, high = table[0].index("95 % from"), table[0].index("to")
     ends = [[float(row[low]), float(row[high])] for row in table[1:]]
     assert (np.abs(ends - correct_intervals(toss)) < 0.04 * correct_errors(toss)[:, None]).all()

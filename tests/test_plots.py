@@ -1,9 +1,7 @@
 """Plots: what is drawn equals the numbers, labels have units, and one rule for axes holds for all of them."""
 
 import csv
-import doctest
 import html
-import importlib
 import warnings
 from dataclasses import replace
 
@@ -107,15 +105,6 @@ def test_axes_given_are_drawn_in_and_returned_and_a_figure_is_made_without(name,
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert figure._repr_png_()[:4] == b"\x89PNG"
-
-
-@pytest.mark.parametrize("module", ["formats", "plot", "style"])
-def test_examples_of_plot_functions_run(module):
-    """Of those that no method of a result calls; the methods have examples of their own."""
-    found = importlib.import_module(f"switchfit.report.{module}")
-    tried = doctest.testmod(found)
-    assert tried.failed == 0
-    assert tried.attempted > 2
 
 
 # --- units ------------------------------------------------------------------------------------------------------------

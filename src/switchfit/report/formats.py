@@ -146,13 +146,6 @@ def format_date(date: datetime.datetime, error: float, *, short: bool = False) -
     error : float
     short : bool, optional
         Leave out hours, minutes and seconds that are zero.
-
-    Examples
-    --------
-    >>> import datetime
-    >>> date = datetime.datetime(2020, 3, 23, 17, 41, 12)
-    >>> [format_date(date, error) for error in (6 * 86400, 86400, 900, 20, 0.3)]
-    ['2020-03-23', '2020-03-23 18h', '2020-03-23 17:41', '2020-03-23 17:41:12', '2020-03-23 17:41:12.00']
     """
     seconds, form = next(((s, form) for s, form in PLACES if error >= ENOUGH * s), (0.0, " %H:%M:%S.%f"))
     digits = 0 if seconds else min(max(int(np.ceil(-np.log10(max(error, 1e-6) / ENOUGH))), 1), 6)

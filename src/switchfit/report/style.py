@@ -64,16 +64,6 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, fl
     ------
     TypeError
         If `ax` is something else.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.report.style import draw_on
-    >>> ax = Figure().subplots()
-    >>> draw_on(ax, lambda ax: ax) is ax
-    True
-    >>> len(draw_on(None, lambda ax: ax).axes)
-    1
     """
     from matplotlib.axes import Axes
 
@@ -103,12 +93,6 @@ def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what:
     ------
     ValueError
         If there is no such panel, or if axes are given for several.
-
-    Examples
-    --------
-    >>> from switchfit.report.style import choose_panel
-    >>> choose_panel(["x", "y"], "y", None, "channel"), choose_panel(["x", "y"], None, None, "channel")
-    (1, None)
     """
     listed = join_first(map(repr, names), 12)
     if given is None:

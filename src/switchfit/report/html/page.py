@@ -258,7 +258,7 @@ MARGIN = 0.01
 MOST_SLIDERS = 24
 """Sliders of one run."""
 MOST_CORRELATED = 60
-"""Unknowns in the heat map."""
+"""Unknowns in the heat map, the first ones; the largest correlations of all are listed beside it."""
 
 
 def build_page(estimate: Estimate, origin: Provenance) -> str:
@@ -284,11 +284,12 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     if any(record.optimality > 0 for record in estimate.history):
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
-    correlated = _list_correlated(estimate)
+    known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
     content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
     content |= {"sliders": payload["sliders"], "sliders_cut": cut, "drawings": drawings, "library": library}
-    content |= {"correlated": correlated, "correlation": estimate.correlation[np.ix_(correlated, correlated)]}
+    content |= {"correlated": [estimate.theta_names[i] for i in known]}
+    content |= {"correlation": estimate.correlation[np.ix_(known, known)]}
     return environment.get_template("report.html").render(content, payload=_write_json(payload))
 
 
@@ -307,15 +308,6 @@ def _write_json(value: Any) -> str:
     """Return JSON that can stand inside a script element."""
     written = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _list_correlated(fit: Fit) -> list[int]:
-    """Return the unknowns in the heat map: of too many those with the largest correlations."""
-    known = np.flatnonzero(np.isfinite(np.diag(fit.correlation)))
-    if len(known) < 2:
-        return []
-    strength = np.abs(np.nan_to_num(fit.correlation - np.eye(len(fit.theta))))[np.ix_(known, known)].max(axis=1)
-    return sorted(known[np.argsort(-strength, kind="stable")[:MOST_CORRELATED]].tolist())
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
