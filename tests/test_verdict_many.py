@@ -145,7 +145,7 @@ def test_a_short_mode_is_one_of_its_horizon_wherever_the_clock_begins():
 @pytest.fixture(scope="module")
 def study():
     found = sf.monte_carlo(room(), 200, theta=TRUTH)
-    assert str(found).startswith("Good: all 200 fits converged, in one minimum.\n")
+    assert str(found).startswith("Good: 200 of 200 fits converged, in one minimum.\n")
     return found
 
 
