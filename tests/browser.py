@@ -68,9 +68,10 @@ class Browser:
         elif event["method"] == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def open(self, path: Path, *, width=1240):
+    def open(self, path: Path):
         """Load a file, and wait until its figures are drawn."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=1000, deviceScaleFactor=1, mobile=False)
+        size = {"width": 1240, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
         self.errors, self.requests = [], []
         self.call("Page.navigate", url=path.resolve().as_uri())
         self.wait("document.documentElement?.dataset.ready === 'true'")
@@ -88,17 +89,6 @@ class Browser:
         done = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in done, done
         return done["result"].get("value")
-
-    def screenshot(self, path: Path | None = None, *, whole=False):
-        """Return a picture as PNG."""
-        options = {"captureBeyondViewport": True} if whole else {}
-        if whole:
-            size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-            options["clip"] = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
-        picture = base64.b64decode(self.call("Page.captureScreenshot", format="png", **options)["data"])
-        if path is not None:
-            path.write_bytes(picture)
-        return picture
 
     def print(self):
         """Return the page printed, as PDF."""

@@ -155,6 +155,18 @@ def quick_processes(monkeypatch):
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless Chromium."""
+    from browser import Browser, find_browser
+
+    if find_browser() is None:
+        pytest.skip("no Chromium on this machine")
+    opened = Browser(tmp_path_factory.mktemp("chromium"))
+    yield opened
+    opened.close()
+
+
 MOST_MAPPINGS = 55_000
 """Pieces of memory that a process may map before compiled programs are dropped; the kernel allows 65,530."""
 

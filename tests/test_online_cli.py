@@ -394,23 +394,15 @@ def test_a_port_that_is_taken(page, folder):
 
 
 @pytest.mark.slow
-def test_the_page_in_a_browser(page, replayed, tmp_path):
+def test_the_page_in_a_browser(browser, page, replayed):
     """It draws what has come, without an error, and asks nothing of any other machine."""
-    from browser import Browser, find_browser
-
-    if find_browser() is None:
-        pytest.skip("no Chromium on this machine")
-    browser = Browser(tmp_path)
-    try:
-        browser.call("Page.navigate", url=page.address)
-        for line in replayed.stdout.splitlines():
-            page.show(line)
-        browser.wait("document.getElementById('mode')?.textContent === 'rise'")
-        assert browser.evaluate("document.querySelectorAll('.chart').length") == 6, "mode, statistic, a, b, c, time"
-        assert browser.evaluate("document.getElementById('parameters').textContent").startswith("a0.694")
-        assert browser.evaluate("document.querySelectorAll('.alarm').length") == 2
-        assert browser.errors == []
-        asked = {url.removeprefix(page.address)[:9] for url in browser.requests if url.startswith("http")}
-        assert asked <= {"/", "/now.json"}
-    finally:
-        browser.close()
+    browser.call("Page.navigate", url=page.address)
+    for line in replayed.stdout.splitlines():
+        page.show(line)
+    browser.wait("document.getElementById('mode')?.textContent === 'rise'")
+    assert browser.evaluate("document.querySelectorAll('.chart').length") == 6, "mode, statistic, a, b, c, time"
+    assert browser.evaluate("document.getElementById('parameters').textContent").startswith("a0.694")
+    assert browser.evaluate("document.querySelectorAll('.alarm').length") == 2
+    assert browser.errors == []
+    asked = {url.removeprefix(page.address)[:9] for url in browser.requests if url.startswith("http")}
+    assert asked <= {"/", "/now.json"}

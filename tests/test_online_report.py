@@ -59,7 +59,7 @@ def test_without_an_alarm_and_with_an_unknown_parameter_and_dates():
     assert "rate[1] 0.5 not known yet 1/s" in lines
     assert early.plot() is not None
     assert str(log).startswith("cool since 2024-05-01 12:00:0")
-    assert "mode from to" in [" ".join(line.split()) for line in str(log).splitlines()]
+    assert "mode from (UTC) to (UTC)" in [" ".join(line.split()) for line in str(log).splitlines()]
     assert log.plot().axes[-1].get_xlabel() == "time (UTC)"
     assert (log.time_unit, log.units) == ("s", {"rate": "1/s"})
 

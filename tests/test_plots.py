@@ -1,8 +1,7 @@
 """Plots: what is drawn equals the numbers, labels have units, and one rule for axes holds for all of them."""
 
 import csv
-import doctest
-import importlib
+import html
 import warnings
 from dataclasses import replace
 
@@ -83,7 +82,6 @@ PLOTS = {
     "plane": lambda car, starts, **ax: car.plot_plane(**ax),
     "profile": lambda car, starts, **ax: car.profile("v").plot(**ax),
     "waterfall": lambda car, starts, **ax: starts.plot(**ax),
-    "parameters": lambda car, starts, **ax: starts.plot_parameters(**ax),
     "fits": lambda car, starts, **ax: sf.estimate_many([heater_problem()] * 3).plot(unknown="k", **ax),
     "bootstrap": lambda car, starts, **ax: sf.bootstrap(starts.best, 5).plot(unknown="k", **ax),
     "monte carlo": lambda car, starts, **ax: sf.monte_carlo(heater_problem(), 5, theta=[2.5, 0.4]).plot(
@@ -109,27 +107,16 @@ def test_axes_given_are_drawn_in_and_returned_and_a_figure_is_made_without(name,
         assert figure._repr_png_()[:4] == b"\x89PNG"
 
 
-@pytest.mark.parametrize("module", ["formats", "plot", "style"])
-def test_examples_of_plot_functions_run(module):
-    """Of those that no method of a result calls; the methods have examples of their own."""
-    found = importlib.import_module(f"switchfit.report.{module}")
-    tried = doctest.testmod(found)
-    assert tried.failed == 0
-    assert tried.attempted > 2
-
-
 # --- units ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("quick_certificates")
 def test_units_of_channels_are_in_labels_and_tables(car, tmp_path):
     """One that is left out is that of the state of the same name."""
-    assert [ax.get_ylabel() for ax in car.plot().axes[:2]] == ["east (m)", "residual\n(m)"]
     line = next(line for line in car.report().splitlines() if line.split()[:2] == ["east", "80"])
     assert line.split()[3] == "m"
     car.save(tmp_path / "fit.json")
-    for fit in (car, sf.Estimate.load(tmp_path / "fit.json")):
-        assert fit.comparisons[0][0].units == ("m", "m")
+    assert sf.Estimate.load(tmp_path / "fit.json").comparisons[0][0].units == ("m", "m")
     data = sf.Measurements([0.5, 1.0, 1.5], [0.5, 1.0, 1.4], names=("T",))
     system = sf.HybridSystem({"on": lambda t, x, p: p["a"] + 0 * x}, [0.0], state_names=("T",), state_units=("K",))
     fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 2.0), {"a": 1.0}), strategy="local")
@@ -220,25 +207,13 @@ def test_path_in_the_plane(car, heater):
 # --- of many starts ---------------------------------------------------------------------------------------------------
 
 
-def test_costs_and_ends_of_starts(starts):
+def test_costs_of_starts(starts):
     ax = starts.plot().axes[0]
     drawn, heights = ax.collections[0].get_offsets()[:, 1], np.sort(starts.cost) - starts.cost.min()
     np.testing.assert_allclose(drawn, np.maximum(heights, 1e-12 * starts.cost.min()))
     low, high = ax.get_ylim()
     assert low < drawn.min()
     assert high / low > 100
-    moved = replace(starts, theta=starts.theta.copy(), clusters=starts.clusters.copy(), cost=starts.cost.copy())
-    moved.theta[0] *= [2.0, 0.5]
-    moved.clusters[0], moved.cost[0] = 1, 10 * starts.cost.max()
-    ax = moved.plot_parameters().axes[0]
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["tau_1 (h)", "k (1/h)"]
-    *best, other = ax.lines
-    np.testing.assert_allclose(other.get_xdata(), [1.0, 0.0])
-    for line in best:
-        np.testing.assert_allclose(line.get_xdata(), [0.0, 1.0], atol=1e-5)
-    assert {line.get_color() for line in best} == {FIT} != {other.get_color()}
-    legend = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert legend == [f"J = {starts.cost.min():.6g}", f"J = {moved.cost[0]:.6g}"]
 
 
 # --- one line and notebooks -------------------------------------------------------------------------------------------
@@ -263,25 +238,13 @@ def test_every_result_is_one_line(heater, starts, models):
     assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
 
 
-NOTEBOOK = {
-    "fit": (lambda heater, starts, models: heater, 1, 1),
-    "profile": (lambda heater, starts, models: heater.profile("k"), 1, 0),
-    "starts": (lambda heater, starts, models: starts, 1, 1),
-    "models": (lambda heater, starts, models: models, 1, 1),
-    "validation": (lambda heater, starts, models: heater.validate(heater.problem), 1, 1),
-    "prediction": (lambda heater, starts, models: heater.predict(np.linspace(0.0, 7.0, 20)), 1, 0),
-    "modes": (lambda heater, starts, models: sf.find_modes(heater.problem, max_switches=1), 1, 0),
-}
-"""What makes a result, and how many figures and tables a notebook shows of it."""
-
-
-@pytest.mark.parametrize("name", ["profile", *(pytest.param(n, marks=pytest.mark.slow) for n in NOTEBOOK)])
-def test_a_notebook_shows_a_short_table_and_a_small_figure(name, heater, starts, models):
-    make, figures, tables = NOTEBOOK[name]
-    page = make(heater, starts, models)._repr_html_()
-    assert (page.count("<img"), page.count("<table")) == (figures, tables)
-    assert page.startswith("<div>")
-    assert len(page) < 60_000
+@pytest.mark.slow
+def test_a_notebook_shows_the_text_and_a_small_figure(heater, starts, models):
+    found = [heater.profile("k"), starts, models, heater.validate(heater.problem), heater.predict([1.0, 7.0])]
+    for result in (*found, sf.find_modes(heater.problem, max_switches=1)):
+        page = result._repr_html_()
+        assert page.startswith(f"<div><pre>{html.escape(str(result))}</pre><img ")
+        assert len(page) < 60_000
 
 
 def test_one_panel_of_several(heater, models):

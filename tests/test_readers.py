@@ -109,8 +109,8 @@ def test_the_report_says_what_nothing_reads(tmp_path):
     assert fit.status is sf.Status.SINGULAR
     assert (fit.unread, fit.absent) == (("q[0]", "q[1]"), ("w",))
     assert str(fit.verdict).endswith(
-        "; no function of the model reads q; w acts only in modes or at transitions that do not occur: remove q from "
-        "parameters, or use it in the model, or fix w, or fit a log in which it acts."
+        "; no function of the model reads q; only modes or transitions that do not occur read w: remove q from "
+        "parameters or use in the model, or fix w, or fit a log with other modes."
     )
     assert "but no function of the model reads q: remove q from parameters" in fit.message
     assert [issue.kind for issue in find_issues(fit)] == ["not read", "acts elsewhere"], "not: hardly determined"
@@ -131,7 +131,7 @@ def test_an_entry_of_an_array_that_is_not_read_has_no_effect():
         return p["q"][0] - p["k"] * x
 
     fit = sf.estimate(make_problem({"h": sf.Parameter(1.0, fixed=True), "q": [1.0, 3.0]}, modes={"b": relax_by_entry}))
-    assert str(fit.verdict).endswith("; the cost does not depend on q[1]: fix q[1], or let it act on what is measured.")
+    assert str(fit.verdict).endswith("; the cost does not depend on q[1]: fix q[1], or measure something else.")
 
 
 def test_what_else_is_hardly_determined_is_still_said():

@@ -16,6 +16,7 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.trajectory import compare
 from switchfit.problem.data import LOSSES, influence, robust
 from switchfit.problem.functions import use_float64
+from switchfit.report.formats import format_rounded
 
 
 def free(t, x, p):
@@ -228,7 +229,8 @@ def test_a_logarithmic_scale_changes_the_path_and_the_intervals_alone():
     assert low * high == pytest.approx(log.theta[1] ** 2, rel=1e-12)
     assert np.log(high / log.theta[1]) == pytest.approx(1.959964 * log.standard_errors[1] / log.theta[1], rel=1e-6)
     np.testing.assert_allclose(log.confidence_intervals()[0], plain.confidence_intervals()[0], rtol=1e-6)
-    assert f"95 % in [{low:.4g}, {high:.4g}]" in str(log)
+    shown = ", ".join(format_rounded(end, (high - low) / 10)[0] for end in (low, high))
+    assert f"95 % in [{shown}]" in str(log)
     bounded = sf.estimate(problem(k=sf.Parameter(2.0, lower=0.1, upper=2.05, scale="log")))
     assert (bounded.theta[1], bounded.standard_errors[1]) == (2.05, 0.0)
     assert list(map(str, bounded.active)) == ["k at its upper bound 2.05"]

@@ -123,6 +123,7 @@ def test_halves_pass_and_tenths_do_not(kind):
         ([np.array([1.0, 2.0]), [3, 4]], [[1.0, 2.0], [3.0, 4.0]]),
         ([], []),
         (np.array([1.0, 2.0], dtype=">f8"), [1.0, 2.0]),
+        (np.array([1.0, 2.0]), [1.0, 2.0]),
         (np.ma.array([1.0, 2.0], mask=[False, False]), [1.0, 2.0]),
     ],
 )
@@ -131,13 +132,11 @@ def test_numbers_are_read_as_they_are(given, expected):
     assert type(array) is np.ndarray
     assert array.dtype == np.float64
     np.testing.assert_array_equal(array, expected)
+    assert not np.shares_memory(array, np.asarray(given))
 
 
-def test_the_array_is_a_copy():
-    mine = np.array([1.0, 2.0])
-    assert not np.shares_memory(as_array(mine, "x"), mine)
-
-
+ENDLESS = []
+ENDLESS.append(ENDLESS)
 DATES = [datetime.datetime(2020, 1, 1), datetime.datetime(2020, 1, 2)]
 
 
@@ -164,6 +163,7 @@ DATES = [datetime.datetime(2020, 1, 1), datetime.datetime(2020, 1, 2)]
         (np.timedelta64(1, "s"), TypeError, "dates and time differences are not supported"),
         (np.ma.array([1.0, 2.0], mask=[True, False]), ValueError, "a masked array with 1 masked entries"),
         (PROBLEM, TypeError, "got <Problem>"),
+        (ENDLESS, ValueError, "nested more than 8 deep"),
         (np.zeros(2, dtype=[("a", float)]), TypeError, "got"),
     ],
 )
@@ -172,13 +172,6 @@ def test_what_is_no_number_is_refused(given, error, said):
         as_array(given, "x")
     assert str(caught.value).endswith(".")
     assert type(caught.value) is error
-
-
-def test_a_list_that_contains_itself_has_no_end():
-    endless = []
-    endless.append(endless)
-    with pytest.raises(ValueError, match="nested more than 8 deep"):
-        as_array(endless, "x")
 
 
 def test_a_traced_value_is_refused():
@@ -212,28 +205,15 @@ def test_masked_values_of_a_reference_are_bridged():
 # Counts, flags, choices, functions, paths
 
 
+NO_COUNTS = [3.0, "3", None, True, np.True_, np.array([3]), np.array(True), [3]]
+NO_FLAGS = [0, np.nan, "yes", None, np.array([True])]
+NO_LISTS = [{"a", "b"}, {"a": 1}, iter("ab"), 3, None, np.array(1.0)]
+
+
 @pytest.mark.parametrize("given", [np.int64(3), np.array(3), jnp.array(3)])
 def test_integers_are_counts(given):
     assert type(as_count(given, "runs")) is int
     assert as_count(given, "runs") == 3
-
-
-@pytest.mark.parametrize("given", [3.0, "3", None, True, np.True_, np.array([3]), np.array(True), [3]])
-def test_what_is_no_count_is_refused(given):
-    with pytest.raises(TypeError, match="runs must be a whole number"):
-        as_count(given, "runs")
-
-
-@pytest.mark.parametrize("given", [0, np.nan, "yes", None, np.array([True])])
-def test_a_flag_is_true_or_false(given):
-    with pytest.raises(TypeError, match="Parameter fixed must be True or False; got"):
-        sf.Parameter(1.0, fixed=given)
-
-
-@pytest.mark.parametrize("given", [{"a", "b"}, {"a": 1}, iter("ab"), 3, None, np.array(1.0)])
-def test_sequences_have_an_order_and_can_be_read_twice(given):
-    with pytest.raises(TypeError, match="names must be a list of names; got"):
-        as_sequence(given, "names", "a list of names")
 
 
 def test_what_is_accepted_is_returned():
@@ -245,6 +225,9 @@ def test_what_is_accepted_is_returned():
 @pytest.mark.parametrize(
     ("call", "error", "said"),
     [
+        *((lambda bad=bad: as_count(bad, "n"), TypeError, "n must be a whole number") for bad in NO_COUNTS),
+        *((lambda bad=bad: sf.Parameter(1.0, fixed=bad), TypeError, "must be True or False; got") for bad in NO_FLAGS),
+        *((lambda bad=bad: as_sequence(bad, "n", "a list"), TypeError, "n must be a list; got") for bad in NO_LISTS),
         (lambda: as_count(0, "runs", at_least=1), ValueError, "runs must be 1 or more; got 0"),
         (lambda: as_count(-1, "seed"), ValueError, "seed must not be negative; got -1"),
         (lambda: as_count(10**400, "runs"), ValueError, "runs must be at most 1000000000; got an integer of 1329 bits"),
@@ -277,10 +260,6 @@ class Shown:
         return self.text
 
 
-def test_what_messages_show_is_on_one_line():
-    assert shorten(Shown("a  b\n1  2")) == "a b 1 2"
-
-
 LONG = ["x" * 10**6, [1.0] * 10**6, np.zeros(10**6), {k: k for k in range(10**5)}, 10**5000]
 
 
@@ -288,6 +267,7 @@ LONG = ["x" * 10**6, [1.0] * 10**6, np.zeros(10**6), {k: k for k in range(10**5)
     "value", [*LONG, Shown("x" * 10**7), Shown(None), PROBLEM], ids=lambda value: type(value).__name__
 )
 def test_what_messages_show_is_short(value):
+    assert shorten(Shown("a  b\n1  2")) == "a b 1 2"
     began = time.perf_counter()
     assert 0 < len(shorten(value)) <= LONGEST
     assert time.perf_counter() - began < 0.5

@@ -45,7 +45,7 @@ def test_good_fits_are_good():
     assert good.verdict.level == "good"
     assert good.levels.tolist() == ["good"] * 12
     worst = int(np.argmin(good.explained))
-    assert str(good.verdict).startswith("Good: all 12 fits are good and explain 99.")
+    assert str(good.verdict).startswith("Good: 12 good of 12 fits, explaining 99.")
     assert f"(fit {worst} least)" in str(good.verdict)
     assert str(good).startswith(str(good.verdict))
     assert good.verdict.next_steps == ()
@@ -82,7 +82,7 @@ def test_the_share_of_a_reference_is_that_of_a_single_fit():
     many = sf.estimate_many([problem, problem])
     assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-3)
     assert many.verdict.level == single.verdict.level == "doubtful"
-    assert "little of the variance is explained in all 2 fits" in str(many.verdict)
+    assert "little of the variance is explained in 2 of 2 fits" in str(many.verdict)
 
 
 def test_a_cost_without_data_has_no_share():
@@ -90,7 +90,7 @@ def test_a_cost_without_data_has_no_share():
     k = sf.Parameter(0.8, fixed=True)
     many = sf.estimate_many([sf.Problem(ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": k})])
     assert np.isnan(many.explained).all()
-    assert str(many.verdict) == "Good: the only fit is good."
+    assert str(many.verdict) == "Good: 1 good of 1 fit."
 
 
 def test_one_bad_fit_among_many_is_named_and_all_are_bad_where_half_of_them_are():
@@ -99,7 +99,7 @@ def test_one_bad_fit_among_many_is_named_and_all_are_bad_where_half_of_them_are(
     many = sf.estimate_many(problems[2:])
     assert np.flatnonzero(many.levels == "bad").tolist() == [0]
     said = str(many.verdict)
-    assert said.startswith("Doubtful: 3 of 4 fits are good and 1 is bad; the model is far from the data in ")
+    assert said.startswith("Doubtful: 3 good and 1 bad of 4 fits; the model is far from the data in ")
     assert "(fit 0 explains" in said
     assert said.endswith("fit problem 0 by itself with sf.estimate.")
 
@@ -145,7 +145,7 @@ def test_a_short_mode_is_one_of_its_horizon_wherever_the_clock_begins():
 @pytest.fixture(scope="module")
 def study():
     found = sf.monte_carlo(room(), 200, theta=TRUTH)
-    assert str(found).startswith("Good: all 200 fits converged, in one minimum.\n")
+    assert str(found).startswith("Good: 200 of 200 fits converged, in one minimum.\n")
     return found
 
 

@@ -88,7 +88,7 @@ class Multistart(Fits):
 
         See Also
         --------
-        multistart, Multistart.plot_parameters
+        multistart
 
         Examples
         --------
@@ -101,30 +101,6 @@ class Multistart(Fits):
         'cost above the best'
         """
         return draw_figure(self, ax=ax)
-
-    def plot_parameters(self, *, ax: Drawn | None = None) -> Drawn:
-        """Draw where every start ended: a line over all unknowns for each, starts of one minimum in one colour.
-
-        Parameters
-        ----------
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        multistart, Multistart.plot
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> figure = sf.multistart(problem, 8).plot_parameters()
-        >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
-        ['tau_1 (h)', 'k (1/h)']
-        """
-        return draw_figure(self, what="parameters", ax=ax)
 
 
 def multistart(

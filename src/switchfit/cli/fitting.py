@@ -130,7 +130,8 @@ def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:
     """Return the CSV files for what a screen of the report has no room for."""
     from switchfit.report.text import SCREEN
 
-    is_long = {"runs": len(estimate.run_names) > SCREEN.experiments, "unknowns": len(estimate.theta) > SCREEN.unknowns}
+    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
+    is_long = {"runs": counts["runs"] > SCREEN["experiments"], "unknowns": counts["unknowns"] > SCREEN["unknowns"]}
     return {} if folder is None else {name: folder / f"{name}.csv" for name in is_long if is_long[name]}
 
 

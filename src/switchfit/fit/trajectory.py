@@ -105,7 +105,7 @@ class Trajectory(Tabular):
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison(Tabular):
+class Comparison:
     """Measured and fitted values, for one of the data of one experiment.
 
     Attributes

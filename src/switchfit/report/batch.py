@@ -23,11 +23,10 @@ from switchfit.report.formats import (
     format_table,
     format_time,
     label_quantity,
-    label_unknown,
     list_dated,
     wrap_text,
 )
-from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN
+from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, SHADE, SMALL, THIN
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 
 LISTED_MINIMA = 10
@@ -38,18 +37,8 @@ LISTED_FITS, LISTED_WORST = 24, 12
 LISTED_COLUMNS = 4
 """Unknowns in the line of a fit."""
 TOO_FEW = "Fewer than two fits converged: no statistics."
-BOOTSTRAP_TITLES = {
-    "residuals": "Bootstrap of residuals",
-    "wild": "Bootstrap of residuals with random signs",
-    "blocks": "Bootstrap of blocks of residuals",
-}
-
 OTHERS = "#bbbbbb"
 """Of a line that joins starts."""
-SAME = 1e-6
-"""Relative spread of the ends of an unknown below which all starts ended at one value."""
-DRAWN_PLACES = 30
-"""Largest number of unknowns in the figure of the starts' ends."""
 LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
 """Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
@@ -204,10 +193,9 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
     """
     order = fits.worst_first[:DRAWN_FITS]
     title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
-    height = 1.4 + 0.2 * max(len(order), 5)
+    each = 2.9, 0.9 + 0.2 * max(len(order), 5)
     shown = select_unknowns(fits, DRAWN_UNKNOWNS if unknown is None and ax is None else len(fits.theta_names))
-    sizes: dict[str, Any] = {"alone": (5.2, height), "each": (2.9, height - 0.5), "columns": DRAWN_UNKNOWNS}
-    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, **sizes)
+    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, each, DRAWN_UNKNOWNS)
 
 
 def _plot_panels(
@@ -217,7 +205,6 @@ def _plot_panels(
     title: str | None,
     unknown: str | None,
     ax: Axes | None,
-    alone: tuple[float, float] = (6.4, 4.2),
     each: tuple[float, float] = (3.4, 2.7),
     columns: int = 3,
 ) -> Axes | Figure:
@@ -232,22 +219,22 @@ def _plot_panels(
         Of the legend.
     unknown : str or None
     ax : matplotlib.axes.Axes or None
-    alone, each : (width, height)
-        Of the only panel, and of each of several, in inches.
+    each : (width, height)
+        Of each panel of several, in inches.
     columns : int
         Largest number of panels side by side.
     """
     one = style.choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
+    if isinstance(study, MonteCarlo | Bootstrap) and study.success.sum() < 2:
+        draw = _say_too_few
     if one is not None:
-        return style.draw_on(ax, lambda ax: style.draw_legend_above(draw(study, shown[one], ax), title=title), alone)
+        size = 6.4, max(each[1], 4.2)
+        return style.draw_on(ax, lambda ax: style.draw_legend_above(draw(study, shown[one], ax), title=title), size)
     columns = max(min(len(shown), columns), 1)
     rows = max(-(-len(shown) // columns), 1)
     figure = style.make_figure(each[0] * columns + 0.5, each[1] * rows + 0.5)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    axes = [figure.add_subplot(rows, columns, number + 1) for number in range(len(shown))]
     for number, panel in enumerate(axes):
-        if number >= len(shown):
-            panel.set_visible(False)
-            continue
         draw(study, shown[number], panel)
         if number % columns:
             panel.set_ylabel("")
@@ -294,9 +281,8 @@ def plot_bootstrap(study: Bootstrap, *, unknown: str | None = None, ax: Axes | N
     ax : matplotlib.axes.Axes, optional
         For one unknown.
     """
-    shown = range(len(study.theta_names))
-    draw = draw_bootstrap if study.success.sum() > 1 else _say_too_few
-    return _plot_panels(study, shown, draw, BOOTSTRAP_TITLES[study.resample], unknown, ax)
+    shown = np.flatnonzero(study.resampled).tolist()
+    return _plot_panels(study, shown, draw_bootstrap, f"Bootstrap: {study.resample}", unknown, ax)
 
 
 def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
@@ -363,8 +349,7 @@ def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes 
     """
     failed = int((~study.success).sum())
     title = f"{failed} runs that did not converge are left out" if failed else None
-    draw = draw_monte_carlo if study.success.sum() > 1 else _say_too_few
-    return _plot_panels(study, range(len(study.theta_names)), draw, title, unknown, ax)
+    return _plot_panels(study, range(len(study.theta_names)), draw_monte_carlo, title, unknown, ax)
 
 
 def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
@@ -389,23 +374,15 @@ def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
 
 
 @draw_figure.register(Multistart)
-def plot_starts(study: Multistart, *, what: str = "waterfall", ax: Axes | None = None) -> Axes | Figure:
-    """Draw many starts: the final cost of each above the best, ascending, or a line over all unknowns for each.
-
-    Starts that ended together share a colour. Where they ended, each unknown has its own scale, between the lowest and
-    the highest of its ends, which stand at the sides.
+def plot_starts(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the final cost of each start above the best, ascending; those of one minimum share a colour.
 
     Parameters
     ----------
     study : Multistart
-    what : {"waterfall", "parameters"}
-        For parameters, of more than 30 unknowns, transition times are left out first.
     ax : matplotlib.axes.Axes, optional
     """
-    if what == "waterfall":
-        return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
-    shown = select_unknowns(study, DRAWN_PLACES)
-    return style.draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
+    return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
 
 
 def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
@@ -415,57 +392,19 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
     height = np.where(np.isfinite(costs), np.maximum(costs - costs[0], floor), np.nan)
     ax.plot(rank, height, color=OTHERS, linewidth=THIN, zorder=1)
     for k in range(_count_minima(study)):
-        here = labels == k
+        here, colour = labels == k, GROUP_COLOURS[min(k, len(GROUP_COLOURS) - 1)]
         label = f"J = {costs[here][0]:.6g}: {format_count(int(here.sum()), 'start')}"
         label = label if k < len(GROUP_COLOURS) - 1 else ""
-        ax.scatter(rank[here], height[here], s=22, color=_choose_colour(k), label=label, zorder=2)
+        ax.scatter(rank[here], height[here], s=22, color=colour, label=label, zorder=2)
     failed = labels < 0
     if failed.any():
         ax.scatter(rank[failed], height[failed], s=24, marker="x", color=DATA, label="not converged")
     ax.set_yscale("log")
-    ax.set_ylim(
-        floor / 3, max(3 * np.nanmax(height, initial=floor), 1e3 * floor)
-    )  # all in one minimum: a few decades, not one tick
+    # All in one minimum: a few decades, not one tick.
+    ax.set_ylim(floor / 3, max(3 * np.nanmax(height, initial=floor), 1e3 * floor))
     ax.locator_params(axis="x", integer=True)
     ax.set_xlim(0.5, len(order) + 0.5)
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")
     ax.legend(frameon=False, fontsize=SMALL, loc="upper left")
     return ax
-
-
-def _choose_colour(k: int) -> str:
-    return GROUP_COLOURS[min(k, len(GROUP_COLOURS) - 1)]
-
-
-def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
-    """Draw ends, the best on top."""
-    ends = study.theta[:, shown]
-    there = np.isfinite(ends).all(axis=1) & study.success
-    low, high = (side(ends[there], axis=0, initial=at) for side, at in ((np.min, np.inf), (np.max, -np.inf)))
-    span = high - low
-    # Ends that agree to what the search tells apart stand in the middle, and rounding does not fill the axis.
-    same = span <= SAME * np.maximum(np.abs(low), np.abs(high))
-    places = np.where(same, 0.5, (ends - low) / np.where(same, 1.0, span))
-    rows, dated = np.arange(len(shown)), list_dated(study)
-    clocks = [dated[i] for i in shown]
-    for rank, r in enumerate(sorted(np.flatnonzero(there), key=lambda r: study.cost[r])):
-        k = int(study.clusters[r])
-        label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
-        look: dict[str, Any] = {"color": _choose_colour(k), "markersize": 4, "linewidth": THIN, "alpha": 0.8}
-        ax.plot(places[r], rows, "o-", label=label, zorder=3 - 1e-6 * rank, **look)
-    settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
-    for row in rows[: len(shown) if there.any() else 0]:
-        error = np.nan if same[row] else span[row] / 10
-        first, last = (format_time(end, clocks[row], error) for end in (low[row], high[row]))
-        if not same[row]:
-            ax.text(-0.04, row, first, ha="right", **settings)
-        ax.text(1.04, row, last, ha="left", **settings)
-    room = 0.6 if any(clocks) else 0.22  # a date is longer than a number
-    ax.set_xlim(-room, 1 + room)
-    ax.set_ylim(len(shown) - 0.5, -0.5)
-    labels = [label_unknown(study.theta_names[i], study.theta_units[i], c) for i, c in zip(shown, clocks, strict=True)]
-    ax.set_yticks(rows, labels)
-    ax.set_xticks([])
-    ax.set_xlabel("where starts ended, from the lowest to the highest value")
-    return style.draw_legend_above(ax)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import datetime
 import re
+import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -145,13 +146,6 @@ def format_date(date: datetime.datetime, error: float, *, short: bool = False) -
     error : float
     short : bool, optional
         Leave out hours, minutes and seconds that are zero.
-
-    Examples
-    --------
-    >>> import datetime
-    >>> date = datetime.datetime(2020, 3, 23, 17, 41, 12)
-    >>> [format_date(date, error) for error in (6 * 86400, 86400, 900, 20, 0.3)]
-    ['2020-03-23', '2020-03-23 18h', '2020-03-23 17:41', '2020-03-23 17:41:12', '2020-03-23 17:41:12.00']
     """
     seconds, form = next(((s, form) for s, form in PLACES if error >= ENOUGH * s), (0.0, " %H:%M:%S.%f"))
     digits = 0 if seconds else min(max(int(np.ceil(-np.log10(max(error, 1e-6) / ENOUGH))), 1), 6)
@@ -193,18 +187,6 @@ def describe_origin(run: Timed) -> str:
 def label_time(run: Timed, name: str = "time") -> str:
     """Return the label of an axis of times, such as "time (min)"; with the zone where times are dates."""
     return label_quantity(name, run.time_unit if run.origin is None else run.origin.time_zone)
-
-
-def label_unknown(name: str, unit: str, run: Timed | None) -> str:
-    """Return the label of an axis of values of an unknown: its name with its unit, or with the zone of its dates.
-
-    Parameters
-    ----------
-    name, unit : str
-    run : Timed or None
-        What has the unknown as a time and shows times as dates.
-    """
-    return label_quantity(name, unit) if run is None else label_time(run, name)
 
 
 def list_dated(result: Fit | Problem | Fits) -> list[Timed | None]:
@@ -280,6 +262,10 @@ def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str,
     return number if run is None or run.origin is None else format_time(value, run, error), spread
 
 
+Row = Sequence[str]
+Rows = Sequence[Row]
+
+
 class Table(NamedTuple):
     """Cells as text.
 
@@ -292,9 +278,9 @@ class Table(NamedTuple):
         Of the columns; empty for a table without a header.
     """
 
-    rows: Sequence[Sequence[str]]
+    rows: Rows
     alignment: str
-    titles: Sequence[str] = ()
+    titles: Row = ()
 
     @property
     def columns(self) -> list[int]:
@@ -310,7 +296,7 @@ MOST_JUMPS = 6
 
 
 def format_table(
-    rows: Sequence[Sequence[str]], alignment: str, titles: Sequence[str] = (), *, indent: str = "  "
+    rows: Rows, alignment: str, titles: Row = (), *, indent: str = "  ", most: int = sys.maxsize, where: str = ""
 ) -> list[str]:
     """Return the lines of a table with its columns aligned, two spaces between them.
 
@@ -320,23 +306,41 @@ def format_table(
         As of `Table`.
     indent : str, optional
         What every line begins with.
+    most : int, optional
+        Of more rows the first are listed, and the others counted.
+    where : str, optional
+        Where the others are, behind their number.
     """
-    columns, lines = Table(rows, alignment).columns, [titles, *rows] if titles and rows else rows
-    widths = {k: max(len(line[k]) for line in lines) for k in columns}
-    return [(indent + "  ".join(f"{line[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for line in lines]
+    shown = rows[:most]
+    columns, written = Table(shown, alignment).columns, [titles, *shown] if titles and rows else shown
+    widths = {k: max(len(row[k]) for row in written) for k in columns}
+    lines = [(indent + "  ".join(f"{row[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for row in written]
+    return lines + ([f"{indent}and {len(rows) - most} more{where}"] if len(rows) > most else [])
 
 
-def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:
-    """Return text as lines of at most `WIDTH` columns.
+def join_sections(*sections: Sequence[str]) -> str:
+    """Return sections as text, with an empty line between them; those without a line are left out.
+
+    Parameters
+    ----------
+    sections : sequence of str
+        The lines of each.
+    """
+    return "\n\n".join("\n".join(lines) for lines in sections if lines)
+
+
+def wrap_text(text: str, first: str = "", others: str = "  ", width: int = WIDTH) -> list[str]:
+    """Return text as lines of at most so many columns, where names allow it.
 
     Parameters
     ----------
     text : str
     first, others : str, optional
         What the first line and the others begin with.
+    width : int, optional
     """
     return textwrap.wrap(
-        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
+        text, width, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC
 from typing import Any
 
@@ -15,13 +15,13 @@ from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.report.formats import format_iso, format_unit, get_unit, list_dated
 from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
-from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, correct_intervals, list_channels
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals, list_channels
 
 ERROR, LOW, HIGH = "{} std. error", "{} low", "{} high"
 """Names of the columns beside an unknown: its standard error, and the ends of its 95 % interval."""
@@ -47,41 +47,37 @@ def describe_estimate(estimate: Estimate, *, what: str = "unknowns") -> Frame:
 
 def _describe_unknowns(estimate: Estimate) -> Frame:
     """Return a row for each unknown; standard errors and intervals allow for correlated residuals, as in the report."""
-    names, rows = estimate.theta_names, ("unknown",)
-    held = [np.array_equal(row, np.zeros(len(names))) for row in estimate.covariance]
-    errors, naive = (np.where(held, np.nan, e) for e in (correct_errors(estimate), estimate.standard_errors))
+    names, naive, dated = estimate.theta_names, estimate.standard_errors, list_dated(estimate)
     low, high = correct_intervals(estimate).T
     joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in estimate.transitions}
     columns: dict[str, Any] = {
         "value": estimate.theta,
-        "std_error": errors,
+        "std_error": np.where(naive == 0, np.nan, correct_errors(estimate)),  # held
         "low": low,
         "high": high,
-        "unit": np.array(list(map(format_unit, estimate.theta_units)), dtype=str),
-        "naive_std_error": naive,
+        "unit": list(map(format_unit, estimate.theta_units)),
+        "naive_std_error": np.where(naive == 0, np.nan, naive),
         "guess": estimate.initial_theta,
         "lower": estimate.lower,
         "upper": estimate.upper,
-        "transition": np.array([joins.get(i, "") for i in range(len(names))], dtype=str),
-        "held": np.array(["; ".join(list_holds(estimate, name)) for name in names], dtype=str),
+        "transition": [joins.get(i, "") for i in range(len(names))],
+        "held": ["; ".join(list_holds(estimate, name)) for name in names],
     }
-    dated = list_dated(estimate)
     if any(run is not None for run in dated):
         for name, times in {"date": estimate.theta, "date_low": low, "date_high": high}.items():
-            dates = ["" if run is None else format_iso(t, run) for t, run in zip(times, dated, strict=True)]
-            columns[name] = np.array(dates, dtype=str)
-    variables = [Variable(name, values, rows) for name, values in columns.items()]
-    square = ("unknown", "unknown_2")
-    named = ("covariance", "correlation", "hessian")
-    variables += [Variable(name, getattr(estimate, name), square, column="") for name in named]
+            columns[name] = ["" if run is None else format_iso(t, run) for t, run in zip(times, dated, strict=True)]
+    variables = _list_variables("unknown", columns)
+    for name in ("covariance", "correlation", "hessian"):
+        variables.append(Variable(name, getattr(estimate, name), ("unknown", "unknown_2"), column=""))
     ended: dict[str, str | float] = {"verdict": estimate.verdict.level, "status": estimate.status.name}
     ended |= {"cost": float(estimate.cost), "seconds": float(estimate.seconds)}
-    labels = {"unknown_2": Labels(names)}
-    return Frame("unknown", (_name_rows("unknown", names),), tuple(variables), labels, ended)
+    (index,) = _list_variables("unknown", {"unknown": names})
+    return Frame("unknown", (index,), tuple(variables), {"unknown_2": Labels(names)}, ended)
 
 
-def _name_rows(dimension: str, names: Sequence[str]) -> Variable:
-    return Variable(dimension, np.array(names, dtype=str), (dimension,))
+def _list_variables(rows: str, columns: Mapping[str, Any]) -> list[Variable]:
+    """Return columns by their names as variables, one entry a row."""
+    return [Variable(name, np.asarray(values), (rows,)) for name, values in columns.items()]
 
 
 def list_holds(fit: Fit, name: str) -> Iterator[str]:
@@ -143,9 +139,8 @@ def _describe_residuals(estimate: Estimate) -> Frame:
             "unit": np.full(len(i), get_unit(comparison, k, estimate.trajectories[e])),
         }
         parts.append(columns)
-    rows = ("sample",)
     names = list(parts[0]) if parts else []
-    variables = [Variable(name, np.concatenate([part[name] for part in parts]), rows) for name in names]
+    variables = _list_variables("sample", {name: np.concatenate([part[name] for part in parts]) for name in names})
     index = tuple(v._replace(unit=_get_time_unit(estimate)) if v.name == "time" else v for v in variables[:3])
     return Frame("sample", index, tuple(variables[3:]))
 
@@ -153,12 +148,11 @@ def _describe_residuals(estimate: Estimate) -> Frame:
 def _describe_history(fit: Fit) -> Frame:
     """Return a row for each iteration."""
     kinds = {"iteration": np.int64, "cost": float, "optimality": float, "step": float, "evaluations": np.int64}
-    rows, columns = ("iteration",), []
-    for name, kind in kinds.items():
-        columns.append(Variable(name, np.array([getattr(record, name) for record in fit.history], dtype=kind), rows))
+    columns = {name: np.array([getattr(r, name) for r in fit.history], dtype=kind) for name, kind in kinds.items()}
+    index, *others = _list_variables("iteration", columns)
     theta = np.array([record.theta for record in fit.history]).reshape(-1, len(fit.theta_names))
-    unknowns = _split(theta, rows, fit.theta_names, fit.theta_units)
-    return Frame("iteration", (columns[0],), (*columns[1:], *unknowns))
+    unknowns = _split(theta, ("iteration",), fit.theta_names, fit.theta_units)
+    return Frame("iteration", (index,), (*others, *unknowns))
 
 
 def _list_dates(result: Trajectory | Prediction, rows: tuple[str]) -> list[Variable]:
@@ -185,37 +179,6 @@ def describe_trajectory(trajectory: Trajectory) -> Frame:
     states = _split(trajectory.states, rows, trajectory.state_names, trajectory.state_units)
     variables = (*_list_dates(trajectory, rows), Variable("mode", trajectory.modes, rows), *states)
     return Frame("time", (Variable("time", trajectory.times, rows, trajectory.time_unit),), variables)
-
-
-@describe_frame.register(Comparison)
-def describe_comparison(comparison: Comparison) -> Frame:
-    """Return a row for each sample, with four columns for each channel.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    """
-    both, columns = ("time", "channel"), {"fitted": comparison.fitted, "residual": comparison.residuals}
-    columns |= {} if comparison.sigma is None else {"sigma": comparison.sigma}
-    others = [Variable(name, values, both, column=f"{{}} {name}") for name, values in columns.items()]
-    index = (Variable("time", comparison.times, ("time",)),)
-    measured = Variable("measured", comparison.measured, both)
-    return Frame("time", index, (measured, *others), {"channel": Labels(comparison.names)})
-
-
-@describe_frame.register(ResidualDiagnostics)
-def describe_diagnostics(diagnostics: ResidualDiagnostics) -> Frame:
-    """Return a row for each channel: its size, and the tests of its residuals.
-
-    Parameters
-    ----------
-    diagnostics : ResidualDiagnostics
-    """
-    rows, channels = ("channel",), diagnostics.channels
-    names = ("mean", "rms", "correlation", "whiteness", "normality", "skewness", "kurtosis", "effective", "outliers")
-    samples = Variable("samples", np.array([len(channel.values) for channel in channels], dtype=np.int64), rows)
-    tests = [Variable(name, np.array([getattr(channel, name) for channel in channels]), rows) for name in names]
-    return Frame("channel", (_name_rows("channel", diagnostics.labels),), (samples, *tests))
 
 
 @describe_frame.register(Prediction)
@@ -260,8 +223,7 @@ def describe_profile(profile: Profile) -> Frame:
     rows, fit = (profile.name,), profile.fit
     low, high = map(float, profile.interval())
     columns = {"cost": profile.costs, "zeta": profile.zeta, "converged": profile.converged}
-    variables = [Variable(name, values, rows) for name, values in columns.items()]
-    variables += _split(profile.thetas, rows, fit.theta_names, fit.theta_units)
+    variables = _list_variables(profile.name, columns) + _split(profile.thetas, rows, fit.theta_names, fit.theta_units)
     others = tuple(variable for variable in variables if variable.name != profile.name)
     attributes = {"estimate": profile.value, "std_error": profile.standard_error, "level": profile.level}
     attributes |= {"low": low, "high": high, "widening": profile.widening}
@@ -289,8 +251,7 @@ def describe_fits(fits: Fits) -> Frame:
         Variable("start", fits.start, both, column="{} start"),
     ]
     names = ("cost", "explained", "samples", "optimality", "iterations", "evaluations", "collapsed", "at_bounds")
-    variables += [Variable(name, getattr(fits, name), rows) for name in names]
-    variables.append(Variable("message", fits.message, rows))
+    variables += [Variable(name, getattr(fits, name), rows) for name in (*names, "message")]
     variables.append(Variable("covariance", fits.covariance, (*both, "unknown_2")))
     attributes: dict[str, str | float] = {"requested": fits.requested, "seconds": float(fits.seconds)}
     if isinstance(fits, Multistart):

@@ -23,6 +23,7 @@ from switchfit.report.formats import (
     format_rounded,
     format_table,
     format_time,
+    join_sections,
     label_quantity,
     label_time,
     suffix_time,
@@ -233,17 +234,15 @@ def write_search(search: ModeSearch) -> str:
     ----------
     search : ModeSearch
     """
-    lines = wrap_text(search.message)
+    fit, head = search.best, wrap_text(search.message)
     if not search.chosen:
-        return "\n".join(lines)
-    lines += [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
-    lines += ["", *list_segments(search), *list_parameters(search)]
-    fit = search.best
-    if fit is not None and not np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True):
-        lines += ["", ALLOWED]
-    lines += ["", *tabulate_numbers(search), *(list_alternatives(search) if len(search.chosen) > 1 else [])]
-    lines += ["", f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"]
-    return "\n".join(lines)
+        return "\n".join(head)
+    head += [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
+    corrected = fit is not None and not np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True)
+    best = list_segments(search), list_parameters(search), [ALLOWED] if corrected else []
+    alternatives = list_alternatives(search) if len(search.chosen) > 1 else []
+    effort = f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"
+    return join_sections(head, *best, tabulate_numbers(search), alternatives, [effort])
 
 
 def _tabulate_segments(
@@ -254,13 +253,8 @@ def _tabulate_segments(
     shown = [ends[0], *(time for time, _ in known), ends[1]]
     spread_unit = "" if run.origin is None else f" {run.time_unit}"
     spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in known)]
-    titles = ["mode", _title_time(run, "from"), "", _title_time(run, "to")]
+    titles = ["mode", label_time(run, "from"), "", label_time(run, "to")]
     return Table(list(zip(modes, shown[:-1], spreads, shown[1:], strict=True)), "<>>>", titles)
-
-
-def _title_time(run: Timed, name: str) -> str:
-    """Return the title of a column of times, with their unit unless they are dates."""
-    return name if run.origin is not None else label_time(run, name)
 
 
 def list_segments(search: ModeSearch) -> list[str]:
@@ -294,7 +288,7 @@ def list_parameters(search: ModeSearch) -> list[str]:
             k = search.best.theta_names.index(name)
             number, error, relative = format_rounded(search.best.theta[k], correct_errors(search.best)[k])
             rows.append([name, number, f"{error} {relative}".strip()])
-    return ["", *format_table(rows, "<><")] if rows else []
+    return format_table(rows, "<><")
 
 
 def tabulate_numbers(search: ModeSearch) -> list[str]:
@@ -302,67 +296,43 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
     discounted = is_discounted(search)
     extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
-    titles = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
-    rows: list[list[str]] = []
+    rows = []
     for fit in search.fitted:
         cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
             cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
-        cells += [f"{getattr(fit, name):.1f}" for name in likely]
-        rows += _extend_row(cells, _list_lines(search, fit))
-    return format_table(rows, "<" + ">" * (len(titles) - 2) + "<", titles)
+        rows.append((fit, [*cells, *(f"{getattr(fit, name):.1f}" for name in likely)]))
+    titles = ["", "switches", "J", *extra, *map(name_criterion, likely)]
+    return _format_sequences(search, rows, "<" + ">" * (len(titles) - 1), titles, "sequence")
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
     name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
     lowest = getattr(search.chosen[0], name)
-    label = name_criterion(name) if name == "mbic" else name_decider(search)
-    titles = ["weight", f"{label} above the best", _title_sequences(search, "alternatives")]
-    rows: list[list[str]] = []
-    for fit in search.chosen[:LISTED]:
-        rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
+    titles = ["weight", f"{name_criterion(name) if name == 'mbic' else name_decider(search)} above the best"]
+    chosen = search.chosen[:LISTED]
+    rows = [(fit, [f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"]) for fit in chosen]
     more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
-    return ["", *format_table(rows, ">><", titles), *more]
+    return [*_format_sequences(search, rows, ">>", titles, "alternatives"), *more]
 
 
-def _title_sequences(search: ModeSearch, what: str) -> str:
-    return what if len(search.run_names) == 1 else f"{what}, where not as above"
+def _format_sequences(
+    search: ModeSearch, fits: Sequence[tuple[ModeFit, list[str]]], alignment: str, titles: list[str], what: str
+) -> list[str]:
+    """Return the table of fits with their cells, and their sequences in the last column, in several lines if long.
 
-
-def _extend_row(cells: list[str], lines: list[str]) -> list[list[str]]:
-    """Return a row of a table whose last cell has several lines."""
-    empty = [""] * len(cells)
-    return [[*(empty if k else cells), line] for k, line in enumerate(lines)]
-
-
-def _list_lines(search: ModeSearch, fit: ModeFit) -> list[str]:
-    """Return the sequences of a fit as lines; of several runs, those that differ from the best's."""
-    if len(fit.sequences) == 1:
-        return wrap_sequence(fit.sequences[0])
-    lines = []
-    for name, modes, known in zip(search.run_names, fit.sequences, search.chosen[0].sequences, strict=True):
-        if modes != known:
-            lines += wrap_sequence(modes, f"{name}: ")
-    return lines or ["the same"]
-
-
-def wrap_sequence(modes: Sequence[str], first: str = "") -> list[str]:
-    """Return a mode sequence in lines of at most `LONGEST_LINE` characters, where the names of modes allow it.
-
-    Parameters
-    ----------
-    modes : sequence of str
-    first : str, optional
-        What the first line begins with.
+    Of several runs, those are listed whose sequence differs from the best's.
     """
-    lines = [f"{first}{modes[0]}"]
-    for mode in modes[1:]:
-        if len(lines[-1]) + len(" -> ") + len(mode) <= LONGEST_LINE:
-            lines[-1] += f" -> {mode}"
-        else:
-            lines.append(f"  -> {mode}")
-    return lines
+    single, rows = len(search.run_names) == 1, []
+    for fit, cells in fits:
+        lines: list[str] = []
+        for name, modes, known in zip(search.run_names, fit.sequences, search.chosen[0].sequences, strict=True):
+            if single or modes != known:
+                text = " -> ".join(modes) if single else f"{name}: {' -> '.join(modes)}"
+                lines += wrap_text(text, width=LONGEST_LINE)
+        rows += [[*(c if k == 0 else "" for c in cells), line] for k, line in enumerate(lines or ["the same"])]
+    return format_table(rows, f"{alignment}<", [*titles, what if single else f"{what}, where not as above"])
 
 
 @draw_figure.register(ModeSearch)
@@ -475,27 +445,23 @@ def write_insertion(found: Insertion) -> str:
     found : Insertion
     """
     run, pulses = found.trajectory, found.minima(LISTED_MINIMA)
-    lines = [] if pulses else ["No short pulse of any mode lowers J."]
+    text, rows = "No short pulse of any mode lowers J.", []
     if pulses:
-        best = pulses[0]
-        at = format_time(best.time, run) + suffix_time(run)
-        speed = f"{-best.rate:.4g} per {run.time_unit} of its length"
-        lines += wrap_text(f"A short pulse of {best.mode} at {at} lowers J fastest: by {speed}.")
-        rows = []
-        for pulse in pulses:
-            interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
-            rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
-        lines += ["", *format_table(rows, "<>><", ["mode", _title_time(run, "time"), "dJ / d length", "in"])]
+        at = format_time(pulses[0].time, run) + suffix_time(run)
+        speed = f"{-pulses[0].rate:.4g} per {run.time_unit} of its length"
+        text = f"A short pulse of {pulses[0].mode} at {at} lowers J fastest: by {speed}."
+    for pulse in pulses:
+        interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
+        rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
+    table = format_table(rows, "<>><", ["mode", label_time(run, "time"), "dJ / d length", "in"])
     undefined = [
         f"{mode} in {found.modes[m]}"
         for m in np.unique(found.active).tolist()
         for k, mode in enumerate(found.modes)
         if np.isnan(found.rate[found.active == m, k]).all()
     ]
-    if undefined:
-        text = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
-        lines += ["", *wrap_text(text)]
-    return "\n".join(lines)
+    why = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
+    return join_sections(wrap_text(text), table, wrap_text(why) if undefined else [])
 
 
 @draw_figure.register(Insertion)
@@ -546,15 +512,13 @@ def write_log(log: OnlineLog) -> str:
     since = format_estimate(now.since, float(error), log)[0]
     changes = format_count(len(now.transition_times), "change")
     first = f"{now.mode} since {since}{unit}, after {changes} of mode up to {end}{unit}."
-    lines = wrap_text(f"{first} {capitalise(now.status.value)}.")
-    lines += ["", *_list_modes(log), *_list_parameters(log), *_list_alarms(log), ""]
-    counts = Counter(status.name for status in log.status)
+    head = wrap_text(f"{first} {capitalise(now.status.value)}.")
+    counts, took = Counter(status.name for status in log.status), log.latency()
     counted = ", ".join(f"{number} {name}" for name, number in counts.items())
-    lines += wrap_text(f"{format_count(len(log.times), 'update')}: {counted}")
-    took = log.latency()
     p50, p90, p99, most = (f"{1e3 * took[name]:.3g}" for name in ("p50", "p90", "p99", "max"))
-    lines.append(f"an update took {p50} ms (median), {p90} (90 %), {p99} (99 %), {most} (the longest)")
-    return "\n".join(lines)
+    effort = wrap_text(f"{format_count(len(log.times), 'update')}: {counted}")
+    effort.append(f"an update took {p50} ms (median), {p90} (90 %), {p99} (99 %), {most} (the longest)")
+    return join_sections(head, _list_modes(log), _list_parameters(log), _list_alarms(log), effort)
 
 
 def _list_modes(log: OnlineLog) -> list[str]:
@@ -577,12 +541,11 @@ def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]
 
 
 def _list_parameters(log: OnlineLog) -> list[str]:
-    found, rows = _list_values(log), []
-    for name, unit, value, error in found[:LISTED_LAST]:
+    rows = []
+    for name, unit, value, error in _list_values(log):
         shown, spread = format_estimate(float(value[-1]), float(error[-1]), None)
         rows.append([name, shown, spread or "not known yet", unit_suffix(unit).strip()])
-    more = [f"  and {len(found) - LISTED_LAST} more in .parameters"] if len(found) > LISTED_LAST else []
-    return ["", *format_table(rows, "<>><"), *more] if rows else []
+    return format_table(rows, "<>><", most=LISTED_LAST, where=" in .parameters")
 
 
 def _list_alarms(log: OnlineLog) -> list[str]:
@@ -593,9 +556,9 @@ def _list_alarms(log: OnlineLog) -> list[str]:
         began = began if spread else format_time(alarm.transition_time, log)
         refuted = "retracted" if alarm in log.retracted else ""
         rows.append([format_time(alarm.time, log), alarm.mode, began, spread, f"{alarm.statistic:.1f}", refuted])
-    titles = [_title_time(log, "alarm at"), "mode", _title_time(log, "since"), "", "statistic", "and then"]
+    titles = [label_time(log, "alarm at"), "mode", label_time(log, "since"), "", "statistic", "and then"]
     more = [f"  {len(log.alarms) - LISTED_LAST} earlier ones in .alarms"] if len(log.alarms) > LISTED_LAST else []
-    return ["", *format_table(rows, "><>>><", titles), *more] if rows else ["", "  no alarm"]
+    return [*format_table(rows, "><>>><", titles), *more] or ["  no alarm"]
 
 
 @draw_figure.register(OnlineLog)

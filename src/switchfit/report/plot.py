@@ -79,15 +79,6 @@ def plot_fit(fit: Fit, *, bands: bool = True, level: float = 0.95) -> Figure:
     matplotlib.figure.Figure
         Save it with ``figure.savefig("fit.png")``. Of more than 10 experiments, the 10 that are explained worst are
         shown, the worst first.
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_fit
-    >>> figure = plot_fit(sf.estimate(heater_problem()))
-    >>> [ax.get_ylabel() for ax in figure.axes]
-    ['thermometer', 'residual']
     """
     level, wanted, runs = as_level(level), as_flag(bands, "bands"), choose_runs(fit)
     intervals = {e: find_transition_intervals(fit, e, level) for e in runs}
@@ -584,14 +575,6 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
     Parameters
     ----------
     names, units : sequence of str
-
-    Examples
-    --------
-    >>> from switchfit.report.plot import find_plane
-    >>> find_plane(("heading", "X", "Y"), ("rad", "m", "m"))
-    (1, 2)
-    >>> find_plane(("T1", "T2"), ("K", "K")) is None
-    True
     """
     parts = [re.findall(r"[^\W\d_]+", name.lower()) for name in names]
     for k, one in enumerate(parts):

@@ -112,7 +112,7 @@ def write_constraint(constraint: Constraint) -> str:
 @format_text.register(Kink)
 def write_kink(kink: Kink) -> str:
     """Return which unknown is at a kink, and the derivatives on both sides."""
-    return f"{kink.unknown} at a kink ({kink.left:.1e}, {kink.right:.1e})"
+    return f"{kink.unknown} = {kink.value:.10g}, where the derivative jumps from {kink.left:.1e} to {kink.right:.1e}"
 
 
 # --- how a fit ended --------------------------------------------------------------------------------------------------
@@ -137,17 +137,13 @@ def _describe_ending(ended: Termination) -> dict[str, str]:
     return {
         "iterations": format_count(ended.iterations, "iteration"),
         "earlier": f", {earlier} of them before the mesh was refined," if earlier else "",
-        "kinks": ", ".join(map(_write_jump_of_slope, ended.kinks)),
+        "kinks": ", ".join(map(str, ended.kinks)),
         "unread": describe_unread(ended.unread, ended.absent),
         "direction": " ".join(f"{part:+.2g} {name}" for name, part in ended.flat_direction) or "no direction",
         "idle": ", ".join(ended.idle),
         "violated": "; ".join(f"{name} = {value:.2e}" for name, value in ended.violated),
         "reason": f" {ended.reason or unknown}".rstrip(),
     }
-
-
-def _write_jump_of_slope(kink: Kink) -> str:
-    return f"{kink.unknown} = {kink.value:.10g}, where the derivative jumps from {kink.left:.1e} to {kink.right:.1e}"
 
 
 def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
@@ -265,17 +261,6 @@ def _write_combination(issue: Issue) -> str:
     return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
 
 
-def _name_undetermined(issue: Issue) -> str:
-    *others, last = issue.subjects or ("the unknowns",)
-    return f"{', '.join(others)} and {last} apart from one another" if others else last
-
-
-def _measure_sigma(issue: Issue) -> float:
-    """Return by which factor sigma is off."""
-    root = float(np.sqrt(get_figure(issue, "chi-square")))
-    return root if issue.kind == "sigma too small" else 1 / root if root > 0 else np.inf
-
-
 def _list_correlated(issue: Issue) -> str:
     each = zip(issue.subjects, list_figures(issue, "correlation"), strict=False)
     return join_first([f"{label} ({value:.2f})" for label, value in each])
@@ -291,12 +276,6 @@ def _list_wrong(issue: Issue) -> str:
     each = zip(issue.subjects, list_figures(issue, "derivatives"), list_figures(issue, "differences"), strict=False)
     entries = [f"{name} (derivative {stated:.3g}, differences {found:.3g})" for name, stated, found in each]
     return f"; it is wrong in {', '.join(entries)}" if entries else ""
-
-
-def _write_passage(issue: Issue) -> str:
-    """Return what passes which value where the cost jumps."""
-    at = list_figures(issue, "at")
-    return f"{issue.subjects[0]} passes {at[0]:.8g}" if len(at) == 1 else f"the step passes {_write_at(issue)}"
 
 
 def _write_at(issue: Issue) -> str:
@@ -357,13 +336,6 @@ _BOUND = (
     "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known. Move the "
     "bound if it is not a physical one."
 )
-_AT_KINKS = (
-    "{} are at kinks of the cost, as where a transition meets a sample. They have no standard errors, and those of the "
-    "others take them as known; their profiles give intervals.",
-    "{} is at a kink of the cost, as where a transition meets a sample. It has no standard error, and those of the "
-    "others take it as known; its profile gives an interval.",
-)
-"""Of several unknowns, and of one."""
 _ISSUES: dict[str, Sentence] = {
     "trade off": _write_combination,
     **_LOG_ISSUES,
@@ -378,14 +350,15 @@ _ISSUES: dict[str, Sentence] = {
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "at kinks": lambda issue: _AT_KINKS[len(issue.subjects) == 1].format(join_first(issue.subjects)),
+    "at kinks": "{first names}: at a kink of the cost, as where a transition meets a sample. There it has no standard "
+    "error, and those of the others take it as known; its profile gives an interval.",
     "not read": "No function of the model reads {names}: the data say nothing about it, and its value above is the "
     "first guess. Remove it from parameters, or use it in the model, whose functions may spell its name otherwise.",
     "acts elsewhere": "{names}: read only by modes, or at transitions, that do not occur in mode_sequence. The data "
     "say nothing about it, and its value above is the first guess. Fix it, or fit a log in which it acts too.",
     "without effect": "The cost does not depend on {names}, to second order: the data say nothing about it, and its "
     "value above is the first guess. Fix it, or let it act on what is measured.",
-    "not determined": "The data hardly determine {undetermined} (smallest eigenvalue {eigenvalue:.2g} of the "
+    "not determined": "The data hardly determine {first names} (smallest eigenvalue {eigenvalue:.2g} of the "
     "Hessian scaled to unit curvature). Fix one of the unknowns, or add data that tell them apart.",
     "no errors: not finite": "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "
@@ -395,10 +368,10 @@ _ISSUES: dict[str, Sentence] = {
     "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
     "sigma too small": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too small, or the "
-    "model misses something (look at the residuals). Standard errors are too small, by a factor of {off by:.2g} if it "
-    "is sigma.",
+    "model misses something (look at the residuals). If it is sigma, standard errors are too small by the root of "
+    "that.",
     "sigma too large": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too large, or the "
-    "samples were smoothed before. Standard errors are too large, by a factor of {off by:.2g} if it is sigma.",
+    "samples were smoothed before. If it is sigma, standard errors are too large by the root of that.",
     "correlated residuals": "Neighbouring residuals are correlated in {correlated}: the model misses something there, "
     "or the samples were smoothed before. The {values:.0f} values are worth about {effective:.0f} independent ones: "
     "the standard errors, which take them as independent, are too small by a factor of up to {narrowing:.2g}.",
@@ -427,8 +400,8 @@ _ISSUES: dict[str, Sentence] = {
     # Why a line search failed, or a fit ended with an error
     "wrong slope": "The gradient does not belong to the cost: along that direction it says {before:.3g}, differences "
     "of the cost say {after:.3g}{wrong entries}. Check the derivatives.{delay}",
-    "jump": "The cost jumps from {before:.8g} to {after:.8g} where {passage}. The optimiser needs a cost that is "
-    "continuous there.{delay}",
+    "jump": "The cost jumps from {before:.8g} to {after:.8g} where the step passes {places}. The optimiser needs a "
+    "cost that is continuous there.{delay}",
     "switch": "{jump}{1}, and derivatives do not include such a switch. If {0} is a time, make it a transition time; "
     "if it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or fix it.",
     "undefined": "{undefined}. {definition}.",
@@ -458,14 +431,11 @@ def write_verdict(verdict: Verdict) -> str:
     ----------
     verdict : Verdict
     """
-    collapsed = [reason for reason in verdict.reasons if reason.kind == "a mode collapsed"]
-    others = [reason for reason in verdict.reasons if reason not in (*verdict.answers, *collapsed[1:])]
-    reasons = [_count_modes(collapsed) if reason in collapsed else write_reason(reason) for reason in others]
-    more = len(reasons) - LISTED_REASONS
-    rest = ["and another reason" if more == 1 else f"and {more} more reasons"] if more > 0 else []
-    reasons = [*map(write_reason, verdict.answers), *reasons[:LISTED_REASONS], *rest]
+    reasons, most = list_reasons(verdict), len(verdict.answers) + LISTED_REASONS
+    rest = [f"and {format_count(len(reasons) - most, 'more reason')}"] if len(reasons) > most else []
+    said = "; ".join([*map(write_reason, reasons[:most]), *rest])
     steps = ", or ".join(write_step(step) for step in verdict.next_steps[:LISTED_STEPS])
-    return f"{verdict.level.capitalize()}: {'; '.join(reasons)}{f': {steps}' if steps else ''}."
+    return f"{verdict.level.capitalize()}: {said}{f': {steps}' if steps else ''}."
 
 
 def list_reasons(verdict: Verdict) -> list[Issue]:
@@ -495,13 +465,10 @@ def write_step(step: Issue) -> str:
     ----------
     step : Issue
     """
-    single = len(step.subjects) == 1
-    they_act, them = ("it acts", "it") if single else ("they act", "them")
-    words = {"names": _name(step.subjects), "them": them, "they_act": they_act}
     if step.kind == "next: define it there":
         return suggest_definition(step.subjects[1])
-    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, **words)
-    return text.replace("one of them", "it") if single else text
+    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, names=_name(step.subjects))
+    return text.replace("one of them", "it") if len(step.subjects) == 1 else text
 
 
 def write_agreement(tried: int, better: int, agreeing: int, *, few: bool = False) -> str:
@@ -595,13 +562,6 @@ def _name(names: tuple[str, ...]) -> str:
     return join_words(names or ("the unknowns",)) if len(names) <= LISTED_NAMES else join_first(names, LISTED_NAMES)
 
 
-def _count_modes(collapsed: list[Issue]) -> str:
-    if len(collapsed) == 1:
-        return write_reason(collapsed[0])
-    names = tuple(_name_mode(*issue.subjects[:2]).removeprefix("mode ") for issue in collapsed)
-    return f"{len(names)} modes collapsed ({_name(names)})"
-
-
 def _count_starts(issue: Issue) -> str:
     tried, better, agreeing = (int(get_figure(issue, name)) for name in ("tried", "better", "agreeing"))
     return write_agreement(tried, better, agreeing, few=issue.kind == "few starts agree")
@@ -639,24 +599,16 @@ def _write_ending(issue: Issue) -> str:
 def _describe_many(issue: Issue) -> str:
     """Return how many fits are of each level, and how much of the data they explain."""
     counts = {level: int(get_figure(issue, level)) for level in LEVELS}
-    total = sum(counts.values())
-    parts = [f"{count} {'is' if count == 1 else 'are'} {level}" for level, count in counts.items() if count]
-    if len(parts) == 1:
-        parts = [parts[0].replace(f"{total} ", "the only fit " if total == 1 else f"all {total} fits ", 1)]
-    else:
-        parts[0] = parts[0].replace(" ", f" of {total} fits ", 1)
-    worst = get_figure(issue, "worst")
+    parts = join_words([f"{count} {level}" for level, count in counts.items() if count])
+    text, worst = f"{parts} of {format_count(sum(counts.values()), 'fit')}", get_figure(issue, "worst")
     if not np.isfinite(worst):
-        return join_words(parts)
-    if total == 1:
-        return f"{parts[0]} and explains {format_share(worst)} of the variance"
-    return f"{parts[0]} and explain {format_share(worst)} of the variance or more (fit {issue.subjects[0]} least)"
+        return text
+    return f"{text}, explaining {format_share(worst)} of the variance or more (fit {issue.subjects[0]} least)"
 
 
 def _count_fits(issue: Issue) -> str:
     """Return the number of fits that a reason is about."""
-    count, total = int(get_figure(issue, "count")), int(get_figure(issue, "fits"))
-    return "the only fit" if total == 1 else f"all {total} fits" if count == total else f"{count} of {total} fits"
+    return f"{get_figure(issue, 'count'):.0f} of {format_count(int(get_figure(issue, 'fits')), 'fit')}"
 
 
 def _name_least(issue: Issue) -> str:
@@ -709,7 +661,7 @@ _REASONS: dict[str, Sentence] = {
     "search cut short": "{first names} ended by its limit of time",
     "not determined": "the data hardly determine {first names}",
     "not read": "no function of the model reads {first names}",
-    "acts elsewhere": "{first names} {act} only in modes or at transitions that do not occur",
+    "acts elsewhere": "only modes or transitions that do not occur read {first names}",
     "without effect": "the cost does not depend on {first names}",
     "at bounds": "{first names} at a bound",
     "integration error": "the integration error of {first names} is {error:.1e}, relative",
@@ -743,11 +695,11 @@ _STEPS = {
     "lower min_duration": "lower min_duration or leave the mode out",
     "move the bound": "move the bound if it is not a physical one",
     "fix or add data": "fix one of them or add data",
-    "remove or use": "remove {names} from parameters, or use {them} in the model",
-    "fix or let it act": "fix {names}, or fit a log in which {they_act}",
+    "remove or use": "remove {names} from parameters or use in the model",
+    "fix or let it act": "fix {names}, or fit a log with other modes",
     "transition time": "make {} a transition time if it is one, or use a smooth function",
     "larger tolerance": "ask for a larger tolerance",
-    "fix alone": "fix {names}, or let {them} act on what is measured",
+    "fix alone": "fix {names}, or measure something else",
     "more data": "add data",
     "smaller rtol": "give the Problem a smaller rtol",
     "raise max_iterations": "raise max_iterations",
@@ -770,27 +722,22 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "names": _join,
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
     "held mode": lambda issue: capitalise(_name_mode(*issue.subjects[:2], position=get_figure(issue, "position"))),
-    "undetermined": _name_undetermined,
     "correlated": _list_correlated,
     "non-normal": _list_non_normal,
     "wrong entries": _list_wrong,
-    "passage": _write_passage,
     "jump": _write_jump,
     "places": _write_at,
     "kind": lambda issue: issue.kind,
     "orders": lambda issue: ", ".join(f"{order:.2f}" for order in list_figures(issue, "orders")),
-    "off by": _measure_sigma,
     "undefined": lambda issue: capitalise(write_undefined(issue)),
     "definition": lambda issue: capitalise(suggest_definition(issue.subjects[1])),
     "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
     "first names": lambda issue: _name(issue.subjects),
     "mode": lambda issue: _name_mode(*issue.subjects[:2]),
-    "explanation": _explain,
     "explanation of the worst": _explain_worst,
     "agreement": _count_starts,
     "fits": _count_fits,
     "least": _name_least,
-    "act": lambda issue: "acts" if len(issue.subjects) == 1 else "act",
     "per cent": lambda issue: 100 * get_figure(issue, "share"),
     "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
     "where it failed": lambda issue: write_places(issue.subjects[2:], list_figures(issue, "at"), digits=6),

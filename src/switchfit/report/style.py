@@ -13,10 +13,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-import numpy as np
-
 from switchfit.problem.validation import shorten
-from switchfit.report.formats import Timed, label_time, label_unknown
+from switchfit.report.formats import Timed, label_quantity, label_time
 from switchfit.runtime.presentation import Axes, Figure, join_first
 
 if TYPE_CHECKING:
@@ -66,16 +64,6 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, fl
     ------
     TypeError
         If `ax` is something else.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.report.style import draw_on
-    >>> ax = Figure().subplots()
-    >>> draw_on(ax, lambda ax: ax) is ax
-    True
-    >>> len(draw_on(None, lambda ax: ax).axes)
-    1
     """
     from matplotlib.axes import Axes
 
@@ -105,12 +93,6 @@ def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what:
     ------
     ValueError
         If there is no such panel, or if axes are given for several.
-
-    Examples
-    --------
-    >>> from switchfit.report.style import choose_panel
-    >>> choose_panel(["x", "y"], "y", None, "channel"), choose_panel(["x", "y"], None, None, "channel")
-    (1, None)
     """
     listed = join_first(map(repr, names), 12)
     if given is None:
@@ -197,13 +179,12 @@ def put_ticks(ax: Axes, run: Timed) -> Axes:
     run : Timed
     """
     if run.origin is not None:
-        from switchfit.report.axes import LONGEST, DateFormatter, DateLocator, Scale
+        from switchfit.report.axes import DateFormatter, DateLocator, Scale
 
         scale = Scale(run.origin, run.time_unit)
-        if np.all(np.abs(scale.to_days(ax.xaxis.get_view_interval())) < LONGEST):
-            locator = DateLocator(scale)
-            ax.xaxis.set_major_locator(locator)
-            ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
+        locator = DateLocator(scale)
+        ax.xaxis.set_major_locator(locator)
+        ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
     return ax
 
 
@@ -216,7 +197,7 @@ def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axe
     name, unit : str
     run : Timed or None
     """
-    ax.set_xlabel(label_unknown(name, unit, run))
+    ax.set_xlabel(label_quantity(name, unit) if run is None else label_time(run, name))
     if run is not None:
         return put_ticks(ax, run)
     ax.ticklabel_format(axis="x", useOffset=False)

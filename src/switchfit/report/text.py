@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit, Step, disagreement
 from switchfit.fit.trajectory import Comparison
-from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.report.formats import (
     Table,
@@ -24,6 +22,7 @@ from switchfit.report.formats import (
     format_time,
     format_unit,
     get_unit,
+    join_sections,
     list_dated,
     list_jumps,
     wrap_text,
@@ -33,7 +32,7 @@ from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
 from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.certificate import WEAK
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel, list_channels
 from switchfit.uncertainty.verdict import DIFFERENT, find_issues
 
 ONE_SIDED = 1.2
@@ -46,22 +45,8 @@ Row = tuple[str, str]
 """A label at the left, empty where it is that of the row before, and a text."""
 
 
-class Limits(NamedTuple):
-    """Largest number of entries of each section; the others are counted."""
-
-    experiments: int
-    channels: int
-    unknowns: int
-    fixed: int
-    correlations: int
-    directions: int
-    warnings: int
-
-
-SCREEN = Limits(experiments=3, channels=6, unknowns=10, fixed=4, correlations=3, directions=1, warnings=3)
-"""About 40 lines for most fits."""
-
-EVERYTHING = Limits(*[sys.maxsize] * len(SCREEN))
+SCREEN = {"experiments": 3, "channels": 6, "unknowns": 10, "fixed": 4, "directions": 1, "others": 3}
+"""Largest number of entries of each section, about 40 lines for most fits; the others are counted."""
 
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
@@ -95,29 +80,31 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     str
         Several lines without a newline at the end; the verdict first.
     """
-    limits = EVERYTHING if full else SCREEN
+    limits = dict.fromkeys(SCREEN, sys.maxsize) if full else SCREEN
     runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    course = [*list_experiments(estimate, limits.experiments, runs, full=full), *list_course(estimate, full=full)]
-    channels = _format_channels(estimate, limits.channels, runs)
+    course = [*list_experiments(estimate, limits["experiments"], runs), *list_course(estimate)]
+    where = f", of which more is explained{runs}"
+    channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=where)
+    correlations = format_table(*tabulate_correlations(estimate), most=limits["others"])
     sections = {
         "Fit": _format_rows(course),
-        "Quality of the fit": [*_format_rows(list_quality(estimate, full=full)), *channels],
-        "Unknowns": _format_unknowns(estimate, limits.unknowns, unknowns),
-        "Held fixed": _format_fixed(estimate, limits.fixed),
-        f"Correlations above {SMALL_CORRELATION:g}": _format_correlations(estimate, limits.correlations, full=full),
-        "Determined worst by the data": _describe_weak(estimate, limits.directions),
-        "Warnings": _format_warnings(estimate, limits.warnings, full=full),
+        "Quality of the fit": [*_format_rows(list_quality(estimate)), *([""] if channels else []), *channels],
+        "Unknowns": _format_unknowns(estimate, limits["unknowns"], unknowns),
+        "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
+        f"Correlations above {SMALL_CORRELATION:g}": correlations,
+        "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
+        "Warnings": _format_warnings(estimate, limits["others"], full=full),
     }
-    written = ["\n".join([title, *lines]) for title, lines in sections.items() if lines]
-    shown = "\n\n".join(["\n".join(wrap_text(str(estimate.verdict))), *written])
+    written = [[title, *lines] for title, lines in sections.items() if lines]
+    shown = join_sections(wrap_text(str(estimate.verdict)), *written)
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> list[Row]:
-    """Return each experiment's modes, its horizon and its data; on one screen of several a row each.
+def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
+    """Return each experiment's modes, its horizon, its data, and what its times are counted from.
 
     Parameters
     ----------
@@ -126,29 +113,21 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
         Number of experiments that are listed; the others are counted.
     where : str, optional
         Where to find the others, as the end of a sentence.
-    full : bool
-        Whether each of an experiment's data has a row of its own; it has one if there is a single experiment.
     """
     rows: list[Row] = []
-    single = len(fit.trajectories) == 1
-    names = ["experiment"] if single else fit.run_names
-    for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
+    names = ["experiment"] if len(fit.trajectories) == 1 else fit.run_names
+    origins = list(map(describe_origin, fit.trajectories))
+    for e, (name, trajectory) in enumerate(zip(names[:most], fit.trajectories, strict=False)):
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
-        horizon = format_span(trajectory.times[0], trajectory.times[-1], trajectory)
         jumps = list_jumps(trajectory.jump_times, trajectory)
-        horizon += f", {jumps}" if jumps else ""
-        data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
-        if full or single:
-            rows += [(name, f"{sequence}, {horizon}"), *(("", text) for text in data)]
-        else:
-            rows.append((name, "; ".join([f"{sequence}, {horizon}", *data])))
+        parts = [sequence, format_span(trajectory.times[0], trajectory.times[-1], trajectory), jumps]
+        rows.append((name, ", ".join(filter(None, parts))))
+        data = [_format_data(comparison) for comparison in fit.comparisons[e]]
+        rows += [("", text) for text in data or ["no data: a cost of the trajectory"]]
+        if origins[e] and origins[e] not in origins[e - 1 : e]:
+            rows.append(("times", origins[e]))
     if len(names) > most:
         rows.append(("", f"and {len(names) - most} more experiments{where}"))
-    origins = set(filter(None, map(describe_origin, fit.trajectories)))
-    if len(origins) > 1 and full:
-        rows += [(name, describe_origin(run)) for name, run in zip(names, fit.trajectories, strict=True) if run.origin]
-    elif origins:
-        rows.append(("times", "counted from a date of each experiment's own" if len(origins) > 1 else origins.pop()))
     return rows
 
 
@@ -164,32 +143,25 @@ def _format_data(comparison: Comparison) -> str:
     return f"{names}: {format_count(len(comparison.times), 'sample')}{note}"
 
 
-def list_course(fit: Fit, *, full: bool) -> list[Row]:
-    """Return the method, the effort, the strategies with the lowest J after each, and how the fit ended.
+def list_course(fit: Fit) -> list[Row]:
+    """Return the method, the effort, the engine, the strategies with the lowest J after each, and how the fit ended.
 
     Parameters
     ----------
     fit : Fit
-    full : bool
-        Whether to give the whole message, and the engine in a row of its own.
     """
     rows = [("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))]
     iterations, evaluations = format_count(fit.iterations, "iteration"), format_count(fit.evaluations, "evaluation")
     effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
     if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
         effort = f"{evaluations}, {fit.seconds:.3g} s in all, {iterations} in the last fit"
-    if fit.engine is None:
-        rows.append(("effort", effort))
-    else:
-        rows += [("effort", effort), ("", str(fit.engine))] if full else [("effort", f"{effort}. {fit.engine}")]
+    rows += [("effort", effort), *([("", str(fit.engine))] if fit.engine is not None else [])]
     if fit.steps:
         rows.append(("tried", "; ".join(map(_format_step, fit.steps))))
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
         rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
-    message = fit.message if full or not fit.status.successful else _shorten_status(fit)
-    rows.append(("status", add_dates(message, fit)))
-    return rows
+    return [*rows, ("status", add_dates(fit.message, fit))]
 
 
 _ENDED = {
@@ -213,24 +185,12 @@ def _format_step(step: Step) -> str:
     return f"{step.strategy}: {cost} ({step.seconds:.2g} s{', ' * bool(ended)}{ended})"
 
 
-def _shorten_status(fit: Fit) -> str:
-    """Return how a fit converged, without what is in the verdict, the table of unknowns and the warnings."""
-    where = {
-        Status.CONVERGED_AT_KINK: "Converged at a kink of the cost",
-        Status.CONVERGED_PRECISION: "Converged to the precision of the cost",
-    }.get(fit.status, "Converged")
-    side = "below" if fit.optimality <= fit.tolerance else "above"
-    return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."
-
-
-def list_quality(fit: Fit, *, full: bool) -> list[Row]:
+def list_quality(fit: Fit) -> list[Row]:
     """Return the cost, the optimality, the residual variance and the integration error.
 
     Parameters
     ----------
     fit : Fit
-    full : bool
-        Whether to include the optimality, which the status gives as well.
     """
     first = fit.initial_cost
     if np.isnan(first) and fit.history and not fit.steps:
@@ -238,8 +198,7 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     guess = f"{first:.8g}" if np.isfinite(first) else "not integrable" if fit.steps else ""
     start = f"   (first guess: {guess})" if guess else ""
     rows = [("cost J", f"{fit.cost:.8g}{start}")]
-    if full:
-        rows.append(("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})"))
+    rows.append(("KKT residual", f"{fit.optimality:.1e}   (tolerance: {fit.tolerance:.1e})"))
     rows += [(name, f"{value:.1e}   (multiplier {multiplier:.6g})") for name, value, multiplier in fit.constraints]
     variance, unknowns = fit.residual_variance, format_count(fit.free_basis.shape[1], "free unknown")
     if np.isfinite(variance):
@@ -254,43 +213,27 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     return rows
 
 
-def _format_channels(fit: Fit, most: int, where: str) -> list[str]:
-    """Return the table of the channels as lines; of more than `most`, those that are explained worst."""
-    table, shares = tabulate_channels(fit)
-    if not table.rows:
-        return []
-    kept = sorted(np.argsort(shares, kind="stable")[: _count_shown(len(table.rows), most)].tolist())
-    lines = format_table(*table._replace(rows=[table.rows[k] for k in kept]))
-    more = len(table.rows) - len(kept)
-    return ["", *lines] + ([f"  and {more} more channels, of which more is explained{where}"] if more else [])
+def tabulate_channels(fit: Fit) -> Table:
+    """Return the table of the channels, those that are explained worst first; one without variance is last.
 
-
-def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
-    """Return the table of the channels, and the share of the variance of each that is explained.
-
-    The table has the root mean square of the residuals, in units and in sigmas. The share is infinite if a channel has
-    no variance.
+    It has the root mean square of the residuals, in units and in sigmas.
 
     Parameters
     ----------
     fit : Fit
     """
-    single = len(fit.trajectories) == 1
     rows, shares = [], []
-    for name, trajectory, run in zip(fit.run_names, fit.trajectories, fit.comparisons, strict=True):
-        for comparison in run:
-            for k, channel in enumerate(comparison.names):
-                residual, sigma = comparison.residuals[:, k], comparison.sigma
-                count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
-                scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
-                share = explain_channel(comparison, k)
-                label = channel if single else f"{name} {channel}"
-                explained = "" if np.isnan(share) else format_share(share)
-                unit = get_unit(comparison, k, trajectory)
-                rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
-                shares.append(np.inf if np.isnan(share) else share)
+    for label, e, comparison, k in list_channels(fit.comparisons, fit.run_names):
+        residual, sigma = comparison.residuals[:, k], comparison.sigma
+        count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
+        scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
+        share = explain_channel(comparison, k)
+        explained = "" if np.isnan(share) else format_share(share)
+        unit = get_unit(comparison, k, fit.trajectories[e])
+        rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
+        shares.append(share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
-    return Table(rows, "<>><>>", titles), shares
+    return Table([rows[k] for k in np.argsort(shares, kind="stable")], "<>><>>", titles)
 
 
 def _format_size(values: FloatArray, digits: int) -> str:
@@ -329,7 +272,6 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
     dated = list_dated(fit)
-    intervals, plain_intervals = fit.confidence_intervals(), Fit.confidence_intervals(fit)
     wide = correct_intervals(fit)
     rows = []
     for i in shown:
@@ -341,15 +283,16 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         counted = "" if run is None else f"t = {value}"
         if run is not None:
             value, relative = format_time(fit.theta[i], run, errors[i]), ""
-        sided = i in joins and _is_sided(intervals[i], plain_intervals[i], fit.theta[i])
-        log_scaled = name in fit.log_scaled and wide[i][0] < wide[i][1]
-        shown_ends = f"95 % in {_format_interval(wide[i], run)}" if (sided or log_scaled) and not ends else ""
+        low, high = (format_end(end, wide[i], run) for end in wide[i])
+        sides = np.sort(np.abs(wide[i] - fit.theta[i]))
+        sided = i in joins and sides[0] > 0 and (np.isnan(errors[i]) or sides[1] > ONE_SIDED * sides[0])
+        shown_ends = f"95 % in [{low}, {high}]" if high and (sided or name in fit.log_scaled) and not ends else ""
         notes = [counted, joins.get(i, ""), prior, shown_ends, _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
-        low, high = (format_end(end, wide[i], run) if ends and known else "" for end in wide[i])
-        guess = f"{fit.initial_theta[i]:.6g}" if run is None else format_time(fit.initial_theta[i], run)
+        guess = format_time(fit.initial_theta[i], run)
         errors_shown = (error, relative, plain if corrected else "") if known else ("", "", "")
-        rows.append([name, value, *errors_shown, low, high, format_unit(fit.theta_units[i]), guess, note])
+        interval = (low, high) if ends and known else ("", "")
+        rows.append([name, value, *errors_shown, *interval, format_unit(fit.theta_units[i]), guess, note])
     titles = ["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]
     table = Table(rows, "<><><>><><", titles)
     if not known or corrected:
@@ -399,7 +342,7 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
     marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names]
     few = 2 * np.count_nonzero(fit.is_time) <= most
     order.sort(key=lambda i: (not marked[i], bool(fit.is_time[i]) != few))
-    return sorted(order[: _count_shown(len(order), most)])
+    return sorted(order[:most])
 
 
 def _compare_covariances(fit: Fit) -> str:
@@ -410,30 +353,10 @@ def _compare_covariances(fit: Fit) -> str:
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
 
 
-def _is_sided(ends: FloatArray, symmetric: FloatArray, value: float) -> bool:
-    """Return whether kinks at samples make the interval of a transition time asymmetric."""
-    below, above = value - ends[0], ends[1] - value
-    if not min(below, above) > 0 or np.array_equal(ends, symmetric):
-        return False
-    return not (np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above))
-
-
-def _format_interval(ends: FloatArray, run: Timed | None) -> str:
-    if run is None:
-        return f"[{ends[0]:.4g}, {ends[1]:.4g}]"
-    return f"[{format_end(ends[0], ends, run)}, {format_end(ends[1], ends, run)}]"
-
-
 def _mark_unknown(fit: Fit, name: str) -> str:
     """Return what holds an unknown, in capitals; "" if nothing does."""
     held = "mode does not occur" if name in fit.absent else next(list_holds(fit, name), "")
     return held.replace("idle", "mode collapsed").upper()
-
-
-def _format_fixed(fit: Fit, most: int) -> list[str]:
-    """Return the table of what was not estimated, as lines."""
-    rows, alignment, _ = tabulate_fixed(fit)
-    return format_table(rows[:most], alignment) + ([f"  and {len(rows) - most} more"] if len(rows) > most else [])
 
 
 def tabulate_fixed(fit: Fit) -> Table:
@@ -458,17 +381,7 @@ def tabulate_fixed(fit: Fit) -> Table:
     return Table(rows, "<<<<")
 
 
-def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
-    """Return the largest correlations as lines: a row each if `full`, else one sentence."""
-    rows = list_correlations(fit)
-    if full or not rows:
-        return format_table(rows, "<>")
-    listed = [f"{pair} {value}" for pair, value in rows[:most]]
-    listed += [f"and {len(rows) - most} more"] if len(rows) > most else []
-    return wrap_text("; ".join(listed), "  ", "    ")
-
-
-def list_correlations(fit: Fit) -> list[tuple[str, str]]:
+def tabulate_correlations(fit: Fit) -> Table:
     """Return the correlations of pairs of unknowns that are above `SMALL_CORRELATION` in size, the largest first.
 
     Parameters
@@ -479,7 +392,7 @@ def list_correlations(fit: Fit) -> list[tuple[str, str]]:
     above = np.argwhere(np.abs(correlation) > SMALL_CORRELATION)
     above = above[np.argsort(-np.abs(correlation[tuple(above.T)]), kind="stable")]
     names = fit.theta_names
-    return [(f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}") for i, j in above]
+    return Table([(f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}") for i, j in above], "<>")
 
 
 def _describe_weak(estimate: Estimate, most: int) -> list[str]:
@@ -521,11 +434,6 @@ def _format_warnings(estimate: Estimate, most: int, *, full: bool) -> list[str]:
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------
-
-
-def _count_shown(count: int, most: int) -> int:
-    """Return how many rows are shown of a table with room for `most`: two fewer if a line counts the rest."""
-    return count if count <= most else most - 2
 
 
 def _format_rows(rows: Sequence[Row]) -> list[str]:

@@ -7,23 +7,24 @@ from functools import partial
 
 import numpy as np
 
+from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.formats import (
     Table,
     Timed,
+    add_dates,
     describe_origin,
-    format_rounded,
+    format_estimate,
     format_table,
     format_time,
-    label_time,
     list_dated,
     wrap_text,
 )
 from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime import special
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.certificate import Certificate, DerivativeCheck, Direction, Identifiability
 from switchfit.uncertainty.profiles import Profile
 from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
@@ -48,14 +49,17 @@ def write_certificate(certificate: Certificate) -> str:
     return "\n".join(format_table(*tabulate_certificate(certificate), indent=""))
 
 
-def tabulate_certificate(certificate: Certificate) -> Table:
+def tabulate_certificate(certificate: Certificate, fit: Fit | None = None) -> Table:
     """Return every check with its number, and the verdict, without a header.
 
     Parameters
     ----------
     certificate : Certificate
+    fit : Fit, optional
+        Where it is given, active constraints of times have their dates.
     """
     held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
+    held = held if fit is None else add_dates(held, fit)
     failures = "; ".join(map(str, certificate.failures))
     error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
     rows = [
@@ -146,29 +150,22 @@ def write_identifiability(found: Identifiability) -> str:
     ----------
     found : Identifiability
     """
-    count = len(found.theta_names) - len(found.held)
-    where = _PLACES[found.where]
-    sentences = []
-    if others := [name for name in found.without if name not in (*found.unread, *found.absent)]:
-        sentences.append(f"{where} the cost does not depend on {', '.join(others)}, to second order.")
-    if found.unread or found.absent:
-        sentences.append(f"{capitalise(describe_unread(found.unread, found.absent))}.")
-    if found.idle:
-        sentences.append(
-            f"{where} the cost does not depend on {', '.join(found.idle)}, because a mode has collapsed: leave it out "
-            "of mode_sequence."
-        )
-    if not count:
-        sentences.append(f"{where} constraints, kinks and collapsed modes hold all unknowns.")
-    elif found.undetermined == 0:
-        sentences.append(
-            f"{where} the data determine all {count} unknowns; condition number of the scaled Hessian "
-            f"{found.condition_number:.3g}."
-        )
-    elif (many := found.undetermined - len(found.without)) > 0:
-        what = "one combination" if many == 1 else f"{many} combinations"
-        sentences.append(f"{where} the data do not determine {what} of the {count} unknowns.")
-    lines = [line for sentence in sentences for line in wrap_text(sentence, others="")]
+    count, many = len(found.theta_names) - len(found.held), found.undetermined - len(found.without)
+    others = ", ".join(name for name in found.without if name not in (*found.unread, *found.absent))
+    where, condition = _PLACES[found.where], f"condition number of the scaled Hessian {found.condition_number:.3g}"
+    collapsed = f"{', '.join(found.idle)}, because a mode has collapsed: leave it out of mode_sequence."
+    cases = (
+        (others, f"{where} the cost does not depend on {others}, to second order."),
+        (found.unread or found.absent, f"{capitalise(describe_unread(found.unread, found.absent))}."),
+        (found.idle, f"{where} the cost does not depend on {collapsed}"),
+        (not count, f"{where} constraints, kinks and collapsed modes hold all unknowns."),
+        (count and not found.undetermined, f"{where} the data determine all {count} unknowns; {condition}."),
+        (
+            count and many > 0,
+            f"{where} the data do not determine {format_count(many, 'combination')} of the {count} unknowns.",
+        ),
+    )
+    lines = [line for applies, sentence in cases if applies for line in wrap_text(sentence, others="")]
     for direction in found.directions if count else ():
         lines += wrap_text(write_direction(found, direction), "  - ", "    ")
     return "\n".join(lines)
@@ -240,12 +237,13 @@ def tabulate_diagnostics(diagnostics: ResidualDiagnostics) -> Table:
     for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
         size = [f"{len(channel.values)}", f"{channel.rms:.3g}", f"{channel.mean:+.2f}"]
         correlation = [f"{channel.correlation:+.2f}", f"{channel.effective:.0f}"]
-        tests = [_format_probability(channel.whiteness), _format_probability(channel.normality)]
+        tests = [format_probability(channel.whiteness), format_probability(channel.normality)]
         rows.append([label, *size, *correlation, *tests, f"{channel.outliers}"])
     return Table(rows, "<" + ">" * 8, titles)
 
 
-def _format_probability(value: float) -> str:
+def format_probability(value: float) -> str:
+    """Return a probability as text; a dash if it is not known."""
     return "-" if np.isnan(value) else f"{value:.3f}" if value >= 5e-4 else f"{value:.0e}"
 
 
@@ -260,41 +258,29 @@ def write_profile(profile: Profile) -> str:
     ----------
     profile : Profile
     """
-    unit = unit_suffix(profile.unit)
-    value, error, _ = format_rounded(profile.value, profile.standard_error)
-    percent = f"{100 * profile.level:.3g} %"
+    run, unit, percent = _find_run(profile), unit_suffix(profile.unit), f"{100 * profile.level:.3g} %"
+    value, error = format_estimate(profile.value, profile.standard_error, run)
     low, high = profile.interval()
-    sizes = (profile.standard_error, abs(high - low), abs(profile.value))
-    digits = next((size for size in sizes if np.isfinite(size) and size > 0), 0.0)
     law = "chi-square with 1 degree of freedom"
     law = law if profile.fit.sigma_known else f"F with 1 and {profile.fit.freedom} degrees of freedom"
     quadratic = profile.fit.confidence_intervals(profile.level)[profile.fit.theta_names.index(profile.name)]
-    intervals = [", ".join(_format_number(end, digits) for end in ends) for ends in ((low, high), quadratic)]
+    both = ((low, high), quadratic)
+    exact, other = (", ".join(format_time(end, run, (high - low) / 4) for end in ends) for ends in both)
+    end_unit = unit if run is None else ""
     lines = [
         f"Profile of {profile.name}",
-        f"  estimate              {value} {error}{unit}".rstrip(),
-        f"  {percent:<4} interval         [{intervals[0]}]{unit}   (likelihood ratio, {law})",
-        f"  quadratic             {f'[{intervals[1]}]{unit}' if np.isfinite(quadratic).all() else 'none'}",
+        f"  estimate              {value} {error}{unit if error or run is None else ''}".rstrip(),
+        f"  {percent:<4} interval         [{exact}]{end_unit}   (likelihood ratio, {law})",
+        f"  quadratic             {f'[{other}]{end_unit}' if np.isfinite(quadratic).all() else 'none'}",
         f"  points, fits          {len(profile.values)}, {profile.fits}",
     ]
-    run = _find_run(profile)
-    if run is not None:
-        dates = [format_time(end, run, digits) if np.isfinite(end) else str(end) for end in (profile.value, low, high)]
-        lines.insert(1, f"  {'date':<20}  {dates[0]}, {percent} from {dates[1]} to {dates[2]}")
-        lines.append(f"  {'times':<20}  {describe_origin(run)}")
+    lines += [f"  times                 {describe_origin(run)}"] if run is not None else []
     return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
 
 
 def _find_run(profile: Profile) -> Timed | None:
     """Return the run of a profile of a time that is a date; None for any other."""
     return list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
-
-
-def _format_number(value: float, error: float) -> str:
-    """Return a number to the second digit of an error."""
-    if not np.isfinite(value):
-        return {np.inf: "inf", -np.inf: "-inf"}.get(value, "?")
-    return format_rounded(value, error)[0] if error > 0 else f"{value:.6g}"
 
 
 _ENDS = {
@@ -369,8 +355,6 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     -------
     matplotlib.axes.Axes
     """
-    from scipy.interpolate import PchipInterpolator  # here, since importing it takes longer than a profile
-
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
@@ -383,11 +367,10 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     for a, b in np.clip(regions, low - margin, high + margin).tolist():
         ax.axvspan(a, b, color=SHADE, alpha=0.15, linewidth=0, label=label)
         label = ""
-    # zeta is near to a straight line: a curve through its points, squared, is the profile between them.
-    shown = slice(first, last + 1)
-    fine = np.linspace(values[first], values[last], 500) if last > first else values[shown]
-    between = PchipInterpolator(values[shown], profile.zeta[shown])(fine) if last > first else profile.zeta[shown]
-    ax.plot(fine, between**2, "-", color=FIT, linewidth=LINE, label="profile")
+    # zeta is near to a straight line: straight between its points, squared, it is the profile between them.
+    shown, fine = slice(first, last + 1), np.linspace(values[first], values[last], 500)
+    curve = np.interp(fine, values[shown], profile.zeta[shown]) ** 2
+    ax.plot(fine, curve, "-", color=FIT, linewidth=LINE, label="profile")
     ax.plot(values[shown], ratio[shown], "o", color=FIT, markersize=3.5)
     x = np.linspace(low - margin, high + margin, 400)
     if np.isfinite(profile.standard_error) and profile.standard_error > 0:
@@ -434,13 +417,9 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
         draw_autocorrelation(channel, row[1])
         draw_quantiles(channel, row[2])
         row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
+        style.label_axis(row[0], channel)
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
-    for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times of another kind
-        label = label_time(shown[k][1])
-        style.put_ticks(ax, shown[k][1])
-        if k + 1 == len(shown) or label_time(shown[k + 1][1]) != label:
-            ax.set_xlabel(label)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
     return style.turn_off_formulas(figure)

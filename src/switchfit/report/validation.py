@@ -17,6 +17,7 @@ from switchfit.report.formats import (
     format_table,
     format_time,
     get_unit,
+    join_sections,
     label_quantity,
     list_dated,
     suffix_time,
@@ -25,6 +26,7 @@ from switchfit.report.formats import (
 from switchfit.report.plot import plot_modes
 from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, SHADE, SMALL, THIN, TRANSITION
+from switchfit.report.uncertainty import format_probability
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text, join_first
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent
@@ -110,33 +112,32 @@ def write_validation(found: Validation) -> str:
     ----------
     found : Validation
     """
-    lines = wrap_text(str(found.verdict))
+    sections = [wrap_text(str(found.verdict))]
     errors, names = found.corrected_standard_errors, found.theta_names
     rows = {}
-    columns = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
-    for (name, value, error, unit), run in zip(columns, list_dated(found.problem), strict=True):
+    known = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
+    for (name, value, error, unit), run in zip(known, list_dated(found.problem), strict=True):
         shown, spread = format_estimate(float(value), float(error), run)
         rows[name] = [name, shown, spread if spread != "held" else "", unit]
     refit = () if found.refit is None else found.refit.theta_names
     estimated = [name for name in names if name in refit and name not in found.kept]
     given = [name for name in names if name not in (*found.kept, *estimated)]
     titles = {"Kept from the fit": found.kept, "Estimated from this run": estimated, "As given": given}
-    for title, listed in titles.items():
-        if listed:
-            lines += ["", title, *format_table([rows[name] for name in listed], "<>><")]
+    sections += [
+        [title, *format_table([rows[name] for name in listed], "<>><")] for title, listed in titles.items() if listed
+    ]
     if not np.array_equal(errors, found.standard_errors, equal_nan=True):
-        lines += ["", ALLOWED]
-    lines += ["", "Channels", *format_table(*tabulate_predicted(found))]
+        sections.append([ALLOWED])
+    sections.append(["Channels", *format_table(*tabulate_predicted(found))])
     if np.isfinite(found.chi_square):
         kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"
         chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
-        lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
+        sections.append([f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"])
     if found.inputs:
-        tests = []
-        for test in found.inputs:
-            tests.append([test.channel, test.input, "-" if np.isnan(test.probability) else f"{test.probability:.2g}"])
-        lines += ["", "Correlation with inputs", *format_table(tests, "<<>", ["residuals of", "and input", "P(none)"])]
-    return "\n".join(lines)
+        tests = [(test.channel, test.input, format_probability(test.probability)) for test in found.inputs]
+        columns = ["residuals of", "and input", "P(none)"]
+        sections.append(["Correlation with inputs", *format_table(tests, "<<>", columns)])
+    return join_sections(*sections)
 
 
 def tabulate_predicted(found: Validation) -> Table:
@@ -150,7 +151,7 @@ def tabulate_predicted(found: Validation) -> Table:
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     for label, _, comparison, k in list_channels(found.comparisons, found.run_names):
         explained, test = explain_channel(comparison, k), tests.get(label)
-        white = "" if test is None or np.isnan(test.whiteness) else f"{test.whiteness:.2g}"
+        white = "" if test is None else format_probability(test.whiteness)
         count = int(np.isfinite(comparison.measured[:, k]).sum())
         shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
         lag = "" if test is None else f"{test.correlation:+.2f}"
@@ -237,12 +238,11 @@ def write_comparison(found: ModelComparison) -> str:
     ----------
     found : ModelComparison
     """
-    lines = wrap_text(write_best(found))
-    lines += ["", *format_table(*tabulate_models(found))]
+    lines = format_table(*tabulate_models(found))
     ended = [name for name, fit in zip(found.names, found.estimates, strict=True) if not fit.status.successful]
     if ended:
         lines += wrap_text(f"Not converged: {', '.join(ended)}. Likelihoods of these may be too small.", "  ")
-    return "\n".join(lines)
+    return join_sections(wrap_text(write_best(found)), lines)
 
 
 _STRENGTHS = ((RULED_OUT, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
@@ -286,39 +286,24 @@ def tabulate_models(found: ModelComparison) -> Table:
 
 @draw_figure.register(ModelComparison)
 def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw the differences in AICc and BIC, and the Akaike weights.
-
-    Parameters
-    ----------
-    found : ModelComparison
-    ax : matplotlib.axes.Axes, optional
-        For the differences alone.
-    """
-    if ax is not None:
-        return style.draw_on(ax, lambda ax: draw_differences(found, ax))
-    figure = style.make_figure(7.8, 1.3 + 0.42 * len(found.names))
-    axes = figure.subplots(1, 2, sharey=True, width_ratios=[1.6, 1.0])
-    draw_differences(found, axes[0])
-    order, places = _list_best_first(found), np.arange(len(found.names))
-    axes[1].barh(places, found.weights[order], height=0.5, color=SHADE)
-    axes[1].set_xlim(0.0, 1.0)
-    axes[1].set_xlabel("Akaike weight")
-    return style.turn_off_formulas(figure)
-
-
-def draw_differences(found: ModelComparison, ax: Axes) -> Axes:
     """Draw by how much AICc and BIC of each model exceed the smallest, the best model on top.
 
     Parameters
     ----------
     found : ModelComparison
-    ax : matplotlib.axes.Axes
+    ax : matplotlib.axes.Axes, optional
     """
+    return style.draw_on(ax, lambda ax: _draw_differences(found, ax), (6.4, 1.3 + 0.42 * len(found.names)))
+
+
+def _draw_differences(found: ModelComparison, ax: Axes) -> Axes:
     order, places = _list_best_first(found), np.arange(len(found.names))
     ax.barh(places - 0.2, found.delta_bic[order], height=0.36, color=FIT, label="BIC")
     ax.barh(places + 0.2, found.delta_aicc[order], height=0.36, color=SHADE, label="AICc")
+    if np.nanmax([found.delta_bic, found.delta_aicc]) > 100:  # a hopeless model would hide the others
+        ax.set_xscale("symlog", linthresh=10.0)
+    ax.set_xlim(left=0.0)
     ax.set_xlabel("difference from the smallest")
-    _limit_differences(ax, np.append(found.delta_bic, found.delta_aicc))
     ax.axvline(RULED_OUT, color=TRANSITION, linewidth=THIN, linestyle=":", label=f"{RULED_OUT:g}: as good as ruled out")
     ax.set_ylim(len(places) - 0.5, -0.5)
     ax.set_yticks(places, [found.names[k] for k in order])
@@ -327,13 +312,6 @@ def draw_differences(found: ModelComparison, ax: Axes) -> Axes:
 
 def _list_best_first(found: ModelComparison) -> list[int]:
     return np.argsort(found.bic, kind="stable").tolist()
-
-
-def _limit_differences(ax: Axes, values: FloatArray) -> None:
-    """Let an axis of differences begin at 0, and be logarithmic where a hopeless model would hide the others."""
-    if np.nanmax(values) > 100:
-        ax.set_xscale("symlog", linthresh=10.0)
-    ax.set_xlim(left=0.0)
 
 
 MEANING = {"D": "log det", "A": "trace", "E": "largest eigenvalue"}
@@ -360,15 +338,17 @@ def write_design(design: Design) -> str:
     before, after = (f"{value:.4g}" for value in (design.criterion_before, design.criterion_after))
     rows.append((f"{MEANING[design.criterion]} of covariance", "", before, after, ""))
     head = f"{design.criterion}-optimal design of {design.run} for {join_first(design.names)}."
-    lines = [*wrap_text(head), "", *format_table(rows, "<>>><", titles)]
-    for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL)):
-        lines += ["", *wrap_text(template.format(", ".join(names)))] if names else []
+    texts = [
+        template.format(", ".join(names))
+        for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL))
+        if names
+    ]
     for name, values in design.inputs.items():
-        lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
+        texts.append(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")
     for sensor, times in design.sample_times.items():
         listed = ", ".join(format_time(time, path) for time in times.tolist()) + suffix_time(path)
-        lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
-    return "\n".join(lines)
+        texts.append(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")
+    return join_sections(wrap_text(head), format_table(rows, "<>>><", titles), *map(wrap_text, texts))
 
 
 _UNDETERMINED = (

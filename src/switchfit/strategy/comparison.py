@@ -183,7 +183,7 @@ class ModelComparison(Displayed):
         return self.names[int(np.argmin(self.bic))]
 
     def plot(self, *, ax: Drawn | None = None) -> Drawn:
-        """Draw the differences in AICc and BIC, and the Akaike weights.
+        """Draw the differences in AICc and BIC.
 
         Parameters
         ----------

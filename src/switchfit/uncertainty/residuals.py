@@ -44,7 +44,6 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
-from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Printed, format_line, join_first
 from switchfit.uncertainty.answers import HALF, NO_RESIDUALS, SERIOUS, UNLIKELY, compare_with_sigma
 
@@ -155,7 +154,7 @@ class ChannelResiduals:
 
 
 @dataclass(frozen=True, eq=False)
-class ResidualDiagnostics(Tabular, Printed):
+class ResidualDiagnostics(Printed):
     """Tests of the residuals of all channels; print it.
 
     Attributes

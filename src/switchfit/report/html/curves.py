@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.report.formats import describe_clock, format_estimate, format_unit, get_unit, list_dated
 from switchfit.report.plot import find_plane, has_bands, replace_infinities
 from switchfit.report.text import format_end
@@ -56,8 +56,6 @@ class Curves:
     samples : mapping of name to (K,)
         Empty for states. Times t; of channel k what is measured, m{k}, its residuals y{k}, sigma s{k} and n{k} = -s{k},
         outliers o{k}, and the derivatives d{i}_{k} of the residuals.
-    delay : int
-        Place in theta of the delay by which the curve moves in time; -1 where there is none to estimate.
     left_out : int
         Samples that are not drawn.
     """
@@ -67,12 +65,13 @@ class Curves:
     kind: str
     curve: Columns
     samples: Columns = field(default_factory=dict)
-    delay: int = -1
     left_out: int = 0
 
 
 def list_places(estimate: Estimate, e: int) -> list[int]:
-    """Return the places in theta of the unknowns that a run depends on; nothing where the model is not there.
+    """Return the places in theta of the unknowns that move the curves of a run; nothing where the model is not there.
+
+    Delays move their curve in time, and are left out.
 
     Parameters
     ----------
@@ -81,8 +80,9 @@ def list_places(estimate: Estimate, e: int) -> list[int]:
     """
     if estimate.problem is None:
         return []
-    places = estimate.problem.places[e]
-    return sorted(set(places[places >= 0].tolist()))
+    run, places = estimate.problem.experiments[e], estimate.problem.places[e]
+    delays = [run.parameter_map.get(item.delay, item.delay) for item in run.measurements]
+    return [place for place in sorted(set(places[places >= 0].tolist())) if estimate.theta_names[place] not in delays]
 
 
 def choose_points(estimate: Estimate, runs: Sequence[int], unknowns: int) -> int:
@@ -142,7 +142,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         return curve
 
     found, first = [], 0
-    for comparison, delay in zip(estimate.comparisons[e], _list_delays(estimate, e), strict=True):
+    for comparison in estimate.comparisons[e]:
         names, units = comparison.names, [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
         columns = range(first, first := first + len(names))
         late = float(comparison.curve_times[0] - trajectory.times[0])
@@ -154,10 +154,10 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         if find_plane(names, units) is not None:
             before_breaks = np.append(False, np.isnan(curve["t"][:-1]))
             curve["size"] = np.where(before_breaks, 13.0, 0.0).astype("f4")
-        moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late, delay)
+        moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late)
         samples = _list_samples(comparison, drawn, moved, places)
         left_out = count - len(drawn) if comparison.kind == "measurements" else 0
-        found.append(Curves(names, tuple(units), comparison.kind, curve, samples, delay, left_out))
+        found.append(Curves(names, tuple(units), comparison.kind, curve, samples, left_out))
     measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
     hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
     if hidden:
@@ -212,36 +212,16 @@ def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], ND
     return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
 
 
-def _list_delays(estimate: Estimate, e: int) -> list[int]:
-    """Return the place in theta of the delay of each of the data of a run; -1 where it is known, or there is none."""
-    if estimate.problem is None:
-        return [-1] * len(estimate.comparisons[e])
-    run = estimate.problem.experiments[e]
-    delays = [item.delay for item in run.data if isinstance(item, Measurements)]
-    names = [run.parameter_map.get(delay, delay) for delay in delays]
-    references = len(estimate.comparisons[e]) - len(names)  # they come first, and are never late
-    places = {name: i for i, name in enumerate(estimate.theta_names)}
-    return [-1] * references + [places.get(name, -1) for name in names]
-
-
 def _find_sample_slopes(
-    comparison: Comparison, nodes: Points, columns: Sequence[int], drawn: NDArray[np.intp], late: float, delay: int
+    comparison: Comparison, nodes: Points, columns: Sequence[int], drawn: NDArray[np.intp], late: float
 ) -> FloatArray:
     """Return the derivatives of what is fitted at the samples that are drawn, all of them nodes unless late: (K, Q, d).
 
     At a transition, that just before it.
     """
-    slopes, values = nodes.outputs_d[:, columns], nodes.outputs[:, columns]
-    if comparison.kind == "reference" and len(comparison.times) == len(nodes.times):
-        return slopes[drawn]
-    nearest = np.clip(np.searchsorted(nodes.times, comparison.times[drawn] - late), 0, len(nodes.times) - 1)
-    found = slopes[nearest].copy()
-    if delay >= 0:
-        before = np.maximum(nearest - 1, 0)
-        step = (nodes.times[nearest] - nodes.times[before])[:, None]
-        rise = values[nearest] - values[before]
-        found[..., delay] -= np.divide(rise, step, out=np.zeros_like(rise), where=step > 0)
-    return found
+    nearest = np.minimum(np.searchsorted(nodes.times, comparison.times[drawn] - late), len(nodes.times) - 1)
+    is_every_node = comparison.kind == "reference" and len(comparison.times) == len(nodes.times)
+    return nodes.outputs_d[drawn if is_every_node else nearest][:, columns]
 
 
 def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:

@@ -15,7 +15,7 @@ import base64
 import gzip
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jinja2
@@ -34,7 +34,7 @@ from switchfit.estimation.saved import Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.formats import Table, Timed, add_dates, describe_clock, format_span, label_quantity, label_time
+from switchfit.report.formats import Timed, add_dates, describe_clock, format_span, label_quantity, label_time
 from switchfit.report.html.curves import (
     Columns,
     Curves,
@@ -50,7 +50,7 @@ from switchfit.report.plot import choose_mode_colours, find_plane
 from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.residuals import explain_channel, explain_worst, rank_runs
+from switchfit.uncertainty.residuals import explain_worst, rank_runs
 from switchfit.uncertainty.verdict import find_issues
 
 FIT, DATA = "#d0392b", "#5b6470"
@@ -66,6 +66,8 @@ UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
 DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
 DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
 """Of shades below the curves, of what was measured, and of what it is compared with."""
+DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
+"""Of up to so many samples."""
 LABELS = {"measurements": "measured", "reference": "reference"}
 
 
@@ -93,7 +95,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
                 _draw_samples(panel, own, k, samples, run)
                 below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual", sources, run)
                 below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
-                _draw_residuals(below, own, k, samples, run)
+                _draw_residuals(below, own, k, samples)
                 panel.xaxis.visible = False
                 parts.append(below)
             parts[-1].xaxis.axis_label.text = label_time(run)
@@ -101,7 +103,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
             _put_legend_above(panel)
             blocks.append(column(*parts, name=f"channel-{c}-{k}", spacing=0, styles=UNBROKEN, **WIDE))
         if samples is not None and (plane := find_plane(own.names, own.units)) is not None:
-            blocks.append(_draw_path(own, plane, curve, samples, run))
+            blocks.append(_draw_path(own, plane, curve, samples))
     return column(*blocks, spacing=6, **WIDE)
 
 
@@ -114,11 +116,6 @@ def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
     columns : iterable of str
     """
     return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
-
-
-def _size_dots(curves: Curves) -> float:
-    """Return the size of the dots, smaller the more there are."""
-    return 6.0 if len(curves.samples["t"]) <= 150 else 4.0 if len(curves.samples["t"]) <= 600 else 2.5
 
 
 def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
@@ -200,7 +197,8 @@ def _draw_measured(
     """Draw what is measured as dots, or a reference signal as a dashed line."""
     if curves.kind == "reference":
         return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
-    return _tag(plot.scatter(x, y, source=source, size=scale * _size_dots(curves), **DOTS, **legend), "ink")
+    size = next(size for most, size in DOT_SIZES.items() if len(curves.samples["t"]) <= most)
+    return _tag(plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend), "ink")
 
 
 def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
@@ -212,26 +210,24 @@ def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSo
     _add_hover(plot, drawn, tips, run)
 
 
-def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
+def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
     for side in ("s", "n") if "s0" in curves.samples else ():
         _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
-    drawn = _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
-    _add_hover(plot, drawn, [("residual", f"@y{k}{{%.6g}}")], run)
+    _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
 
 
 def _draw_path(
-    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource, run: Timed
+    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource
 ) -> Any:
     """Draw two positions against one another, with the transitions on the fitted path."""
     x, y = plane
     labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
     plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
     _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
-    line = plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
+    plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
     mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
     _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
-    _add_hover(plot, line, [("mode", "@mode")], run)
     _put_legend_above(plot)
     return plot
 
@@ -261,14 +257,8 @@ MARGIN = 0.01
 """Part of the horizon that is shown before and after it."""
 MOST_SLIDERS = 24
 """Sliders of one run."""
-FIRST_ROWS = 40
-"""Unknowns that are listed first: those at a bound or a kink, parameters, transition times; all are behind them."""
-MOST_UNKNOWNS = 300
-"""Unknowns that are listed, and experiments; those left out are counted. Other tables are cut off there too."""
 MOST_CORRELATED = 60
-"""Unknowns in the heat map."""
-MOST_PAIRS = 12
-"""Correlations that are listed beside it."""
+"""Unknowns in the heat map, the first ones; the largest correlations of all are listed beside it."""
 
 
 def build_page(estimate: Estimate, origin: Provenance) -> str:
@@ -284,20 +274,23 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    content = _collect_content(estimate)
+    functions: list[Any] = [add_dates, certify, find_issues, format_span, join_words, list_reasons, unit_suffix]
+    functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
+    environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
     payload["drawings"] = drawings = {}
     if estimate.residuals.channels:
         drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
-    if content["iterated"]:
+    if any(record.optimality > 0 for record in estimate.history):
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
-    environment.globals |= {f.__name__: f for f in (list_reasons, write_reason, write_step, write_direction)}
-    content |= {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
+    known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
+    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
-    content |= {"sliders": payload["sliders"], "sliders_cut": cut}
-    content |= {"payload": _write_json(payload), "library": library}
-    return environment.get_template("report.html").render(content)
+    content |= {"sliders": payload["sliders"], "sliders_cut": cut, "drawings": drawings, "library": library}
+    content |= {"correlated": [estimate.theta_names[i] for i in known]}
+    content |= {"correlation": estimate.correlation[np.ix_(known, known)]}
+    return environment.get_template("report.html").render(content, payload=_write_json(payload))
 
 
 def _compress_svg(figure: Figure) -> str:
@@ -315,52 +308,6 @@ def _write_json(value: Any) -> str:
     """Return JSON that can stand inside a script element."""
     written = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-# --- sentences and tables ---------------------------------------------------------------------------------------------
-
-
-def _collect_content(estimate: Estimate) -> dict[str, Any]:
-    """Return what the template shows as text; the sentences are those of the report as text."""
-    listed = text.select_unknowns(estimate, MOST_UNKNOWNS)
-    everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
-    unknowns, _ = text.tabulate_unknowns(estimate, text.select_unknowns(estimate, FIRST_ROWS), ends=True)
-    channels, shares = text.tabulate_channels(estimate)
-    certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
-    pairs = text.list_correlations(estimate)
-    correlated = _list_correlated(estimate)
-    tried = []
-    for step in estimate.steps:
-        cost = f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed"
-        tried.append([step.strategy, cost, f"{step.evaluations}", f"{step.seconds:.2g}"])
-    course_rows = text.list_course(estimate, full=True) + text.list_quality(estimate, full=True)
-    return {
-        "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
-        "unknowns": unknowns,
-        "all_unknowns": everything,
-        "more_unknowns": len(estimate.theta) - len(listed),
-        "unknowns_note": note,
-        "fixed": text.tabulate_fixed(estimate),
-        "course": text.list_experiments(estimate, MOST_UNKNOWNS, full=True) + course_rows,
-        "steps_tried": Table(tried, "<>>>", ["strategy", "lowest J after it", "evaluations", "seconds"]),
-        "channels": channels._replace(rows=[channels.rows[k] for k in np.argsort(shares, kind="stable")]),
-        "diagnostics": tabulate_diagnostics(estimate.residuals),
-        "correlations": Table(pairs[:MOST_PAIRS], "<>"),
-        "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
-        "certificate": Table([[add_dates(cell, estimate) for cell in row] for row in certificate.rows], "<<"),
-        "correlated": [estimate.theta_names[i] for i in correlated],
-        "correlation": estimate.correlation[np.ix_(correlated, correlated)],
-        "iterated": any(record.optimality > 0 for record in estimate.history),
-    }
-
-
-def _list_correlated(fit: Fit) -> list[int]:
-    """Return the unknowns in the heat map: of too many those with the largest correlations."""
-    known = np.flatnonzero(np.isfinite(np.diag(fit.correlation)))
-    if len(known) < 2:
-        return []
-    strength = np.abs(np.nan_to_num(fit.correlation - np.eye(len(fit.theta))))[np.ix_(known, known)].max(axis=1)
-    return sorted(known[np.argsort(-strength, kind="stable")[:MOST_CORRELATED]].tolist())
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -391,8 +338,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         margin = MARGIN * (last - first)
         written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
         ranges = {"times": {"start": first - margin, "end": last + margin}}
-        delays = {f"curve-{c}": part.delay for c, part in enumerate(own) if part.delay >= 0}
-        figures.append({"template": template, "sources": written, "ranges": ranges, "delays": delays})
+        figures.append({"template": template, "sources": written, "ranges": ranges})
     sliders: list[dict[str, Any]] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
         movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
@@ -408,33 +354,19 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
-    """Return what the template shows of a run; at first it shows the channels that are explained worst."""
-    trajectory, comparisons, worst = fit.trajectories[e], fit.comparisons[e], explain_worst(fit, e)
-    channels, shares = [], []
+    """Return what the template shows of a run; at first it shows some of the channels that are measured."""
+    channels: list[tuple[str, str, bool]] = []
     for c, own in enumerate(curves):
-        hidden = own.kind == "states" and bool(comparisons)
+        shown = own.kind != "states" or not fit.comparisons[e]
         for k, name in enumerate(own.names):
-            channels.append((f"{c}-{k}", f"{name}, not measured" if hidden else name, not hidden))
-            shares.append(np.inf if own.kind == "states" else explain_channel(comparisons[c], k))
-    first = np.argsort(shares, kind="stable")[:MOST_CHANNELS]
+            first = shown and len(channels) < MOST_CHANNELS
+            channels.append((f"{c}-{k}", name if shown else f"{name}, not measured", first))
+    worst = explain_worst(fit, e)
     return {
         "name": fit.run_names[e] if len(fit.trajectories) > 1 else "",
         "explained": format_share(worst) if np.isfinite(worst) else "",
-        "modes": [(mode, colours[mode], format_span(a, b, trajectory)) for mode, a, b in trajectory.mode_spans],
-        "channels": [(name, label, can and k in first) for k, (name, label, can) in enumerate(channels)],
-        "notes": list(_list_notes(fit, e, curves)),
+        "trajectory": fit.trajectories[e],
+        "colours": colours,
+        "channels": channels,
+        "curves": curves,
     }
-
-
-def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
-    """Yield what is not to be seen in the figures of a run: samples that are not drawn, sensors that are late."""
-    unit = unit_suffix(fit.trajectories[e].time_unit)
-    for own in curves:
-        channels = join_words(list(own.names))
-        if own.left_out:
-            drawn = len(own.samples["t"])
-            yield f"Of {channels} {drawn} of {drawn + own.left_out} samples are drawn."
-        late = own.curve["t"][0] - fit.trajectories[e].times[0]
-        if late != 0:
-            where = "its curve stands at the times of the sensor, the modes and transitions at those of the model"
-            yield f"{channels} is late by {late:.6g}{unit}: {where}."

@@ -236,7 +236,6 @@ window.switchfitDates = switchfitDates;
           const d = place === undefined ? 0 : shift(Number(place));
           if (d !== 0) data[`y${k}`].forEach((_, i, values) => { values[i] += slope[i] * d; });
         }
-        if (name in run.delays) data.t = Float64Array.from(data.fit_t, (t) => t + shift(run.delays[name]));
       });
     }
     const still = moved.some((d) => d !== 0);
