@@ -52,6 +52,7 @@ DESIGN = """
 [design]
 criterion = "A"
 samples = { T = 3 }
+sensors = 1
 starts = 0
 
 [design.names]
@@ -84,15 +85,14 @@ def test_a_design_is_printed_and_written(folder):
     problem = load_problem(folder / "problem.toml").problem
     plan = sf.design(
         problem, free={"power": [0.0, 1.5]}, names={"k": 0.1, "b": 0.5}, criterion="A", samples={"T": 3},
-        starts=0,
+        sensors=1, starts=0,
     )  # fmt: skip
     assert str(plan) == result.stdout.rstrip("\n")
     np.testing.assert_array_equal(sf.read_log(out / "input.csv")["power"], plan.inputs["power"])
     np.testing.assert_array_equal(sf.read_log(out / "input.csv").times, np.linspace(0.0, 4.0, 9))
     rows = [line.split(",") for line in (out / "samples.csv").read_text().splitlines()]
-    assert {row[rows[0].index("sensor")] for row in rows[1:]} == {"T", "fine"}
-    times = [float(row[rows[0].index("t")]) for row in rows[1:] if row[rows[0].index("sensor")] == "T"]
-    np.testing.assert_array_equal(times, plan.sample_times["T"])
+    assert {row[rows[0].index("sensor")] for row in rows[1:]} == {"T"}
+    np.testing.assert_array_equal([float(row[rows[0].index("t")]) for row in rows[1:]], plan.sample_times["T"])
     saved = json.loads((out / "design.json").read_text())["design"]
     assert saved["sample_times"]["T"] == plan.sample_times["T"].tolist()
 

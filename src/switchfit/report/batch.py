@@ -166,6 +166,7 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
     for k in shown:
         ends = ", ".join(format_time(end, clocks[k], error[k]) for end in intervals[k])
         spread = f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends}]"
+        spread = spread if study.resampled[k] else ("-", "-", "of one run alone")
         rows.append((_label(study, k), format_time(study.estimate[k], clocks[k], error[k]), *spread))
     titles = ("", "estimate", "bias", "standard error", "95 % interval (BCa)")
     return Table(rows, "<" + ">" * 4, titles), _count_rest(study, shown)

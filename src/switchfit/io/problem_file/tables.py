@@ -334,6 +334,8 @@ class DesignTable(Table):
     samples: OrTable[int, int] | None = None
     """most sample times of each sensor, or a table with a number for each, which is called by its channels, such as
     'X, Y'; left out, all"""
+    sensors: int | None = None
+    """most sensors; left out, all"""
     starts: int | None = Field(default=None, ge=0)
     """inputs at random from which the search begins; left out, 8"""
 
