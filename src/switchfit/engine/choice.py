@@ -350,7 +350,7 @@ class SplitEngine:
                 seen.append((mode, sides, np.array(here), values))
         for mode, sides, own, values in seen:
             of_end, slides = course.list_ends(mode, sides)
-            least = MAY_END * np.wown(slides, 1.0, scales[mode][of_end])
+            least = MAY_END * np.where(slides, 1.0, scales[mode][of_end])
             if (values < -least).any():
                 return False
             # Between two rows, in a branch that goes on at both sides of them.
