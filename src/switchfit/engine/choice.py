@@ -348,16 +348,16 @@ class SplitEngine:
                 values = course.evaluate_ends(mode, sides, found.end[here], found.after[here])
                 np.maximum.at(scales[mode], of_end, np.where(slides, 0.0, np.abs(values).max(axis=0)))
                 seen.append((mode, sides, np.array(here), values))
-        for mode, sides, here, values in seen:
+        for mode, sides, own, values in seen:
             of_end, slides = course.list_ends(mode, sides)
             least = MAY_END * np.where(slides, 1.0, scales[mode][of_end])
             if (values < -least).any():
                 return False
             # Between two rows, in a branch that goes on at both sides of them.
             moves = np.abs(np.diff(values, axis=0)) > least
-            dips = (find_dips(values)[1:-1] & (moves[:-2] | moves[2:])).any(axis=1) & (here[3:] - here[:-3] == 3)
+            dips = (find_dips(values)[1:-1] & (moves[:-2] | moves[2:])).any(axis=1) & (own[3:] - own[:-3] == 3)
             for row in np.flatnonzero(dips).tolist():
-                step = here[row + 1 : row + 3]
+                step = own[row + 1 : row + 3]
                 if course.leaves(mode, sides, found.end[step], found.after[step], -least):
                     return False
         return True
