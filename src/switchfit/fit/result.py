@@ -749,7 +749,8 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     """
     diagonal = np.abs(np.diag(hessian))
     size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
-    basis = np.linalg.qr(Z / size[:, None])[0] * Z.any(axis=1)[:, None]  # exactly 0 for what is held
+    basis = np.linalg.qr(Z / size[:, None])[0]
+    basis[~Z.any(axis=1)] = 0.0  # exactly, for what is held
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = basis.T @ (hessian * np.outer(size, size)) @ basis
     if not np.isfinite(scaled).all():
