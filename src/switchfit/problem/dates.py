@@ -35,7 +35,10 @@ FIRST, LAST = np.datetime64("0001-01-01"), np.datetime64("9999-12-31")
 SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Length of a unit of time in seconds."""
 
-LENGTHS = {unit: np.timedelta64(1, {"min": "m", "d": "D"}.get(unit, unit)) for unit in SECONDS}
+LENGTHS: dict[str, np.timedelta64] = {
+    unit: np.timedelta64(1, "ns") if unit == "ns" else np.timedelta64(round(1e6 * seconds), "us")
+    for unit, seconds in SECONDS.items()
+}
 """The same, by which a difference of dates is divided."""
 
 _SPELLINGS = {
@@ -106,7 +109,7 @@ def _name_tzinfo(tz: Any) -> str:
     return str(name)
 
 
-def _read_date(value: Any, what: str, place: str = "") -> tuple[np.datetime64, str]:
+def _read_date(value: Any, what: str, place: str = "") -> tuple[Any, str]:
     """Return the instant and the zone of one date; `place` says where it stands among several."""
     if isinstance(value, str):
         found = read_date_text(value)
@@ -383,7 +386,7 @@ class Origin:
     time_zone: str
 
     @cached_property
-    def instant(self) -> np.datetime64:
+    def instant(self) -> Any:
         """The date in microseconds: in UTC, or on the wall clock if it has no zone."""
         return _read_date(self.date, "origin")[0]
 

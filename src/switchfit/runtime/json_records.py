@@ -149,7 +149,7 @@ def _read(kind: Any, content: Any) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (UnionType, Union):
         return _read_either(inner, content)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         hints = _get_hints(kind)
         if hints.keys() != content.keys():
             raise KeyError
