@@ -14,7 +14,9 @@ from matplotlib.figure import Figure
 import switchfit as sf
 from switchfit.models import bicycle, differential_drive, lugre, rolling_body, skid_steer
 from switchfit.models.magic_formula import (
+    ALIGNING_MOMENT,
     MAGIC_FORMULA,
+    compute_aligning_moment,
     lateral_force,
     longitudinal_force,
 )
@@ -153,16 +155,17 @@ def draw_lugre(figure: Figure) -> None:
 
 def draw_magic_formula(figure: Figure) -> None:
     """The curves of 1987 at four loads."""
-    axes = figure.subplots(1, 2)
+    axes = figure.subplots(1, 3)
     slip, angle = np.linspace(0, 30, 121), np.linspace(0, 15, 121)
     curves = (
-        (longitudinal_force, slip, "slip ratio (%)", "F_x (N)"),
-        (lateral_force, angle, "slip angle (degrees)", "F_y (N)"),
+        (longitudinal_force, slip, MAGIC_FORMULA, "slip ratio (%)", "F_x (N)"),
+        (lateral_force, angle, MAGIC_FORMULA, "slip angle (degrees)", "F_y (N)"),
+        (compute_aligning_moment, angle, ALIGNING_MOMENT, "slip angle (degrees)", "M_z (N m)"),
     )
     with jax.enable_x64(True):
-        for ax, (function, x, name, label) in zip(axes, curves, strict=True):
+        for ax, (function, x, coefficients, name, label) in zip(axes, curves, strict=True):
             for k, load in enumerate((2.0, 4.0, 6.0, 8.0)):
-                force = function(x, load, MAGIC_FORMULA)
+                force = function(x, load, coefficients)
                 ax.plot(x, force, color=LINE_COLOURS[k], linestyle=STYLES[k], label=f"{load:.0f} kN")
             ax.set_xlabel(name)
             ax.set_title(label, fontsize=9)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from models import STILL, curve
+from models import RAMP, STILL, curve
 
 import switchfit as sf
-from switchfit.batch.program import CHUNK
+from switchfit.batch.program import CHUNK, Limits
+from switchfit.batch.resampling import StudyOfRuns
 
 TIMES = np.linspace(0.1, 4.0, 40)
 
@@ -91,6 +94,34 @@ def test_blocks_follow_noise_that_is_correlated():
     assert sf.bootstrap(fit, 5, resample="blocks", block=7).block == 7
 
 
+def ramps(slopes, sigma=0.05, seed=0):
+    """Runs whose slopes differ from one to the next by more than the noise explains."""
+    rng = np.random.default_rng(seed)
+    runs = []
+    for slope in slopes:
+        values = slope * np.minimum(TIMES, 2.05) + sigma * rng.standard_normal(40)
+        runs.append(sf.Experiment(sf.Measurements(TIMES, values, sigma=sigma), ("up", "rest"), (2.0,), 0.0, 4.0))
+    return sf.Problem(RAMP, runs, {"v": 1.0})
+
+
+def test_a_run_weighs_as_often_as_it_was_drawn():
+    problem = ramps([0.9, 1.0, 1.2])
+    fit = sf.estimate(problem, strategy="local")
+    study = sf.bootstrap(fit, 6, resample="runs", seed=2)
+    work = StudyOfRuns(problem, list(fit.evaluator.meshes), fit.theta[None], Limits(1e-7, 200), 2)
+    for k in range(6):
+        weights = np.round(work.weigh([k])[0]).astype(int)
+        assert weights.sum() == 3
+        drawn = np.repeat(np.arange(3), weights)
+        again = sf.estimate(replace(problem, experiments=[problem.experiments[e] for e in drawn]), strategy="local")
+        assert study.theta[k][-1] == pytest.approx(again.theta[-1], rel=1e-6)
+    assert study.resampled.tolist() == [False] * 3 + [True]
+    assert np.isnan(study.intervals()).all(axis=1).tolist() == [True] * 3 + [False]
+    np.testing.assert_allclose(study.standard_deviation, [np.nan] * 3 + [study.theta[:, 3].std(ddof=1)], rtol=1e-12)
+    assert "of one run alone" in str(study)
+    assert [ax.get_xlabel() for ax in study.plot().axes if ax.get_visible()] == ["v"]
+
+
 def test_missing_values_stay_missing_and_channels_stay_together():
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((40, 1)) * np.array([1.0, -2.0])
@@ -114,6 +145,9 @@ def test_seeds_and_folders(tmp_path):
     np.testing.assert_array_equal(sf.bootstrap(fit, CHUNK + 8, folder=tmp_path).theta, one.theta)
     with pytest.raises(ValueError, match="holds the results of another run"):
         sf.bootstrap(fit, CHUNK + 8, folder=tmp_path, resample="wild")
+    runs = sf.estimate(ramps([0.9, 1.0, 1.2]))
+    with pytest.raises(ValueError, match="holds the results of another run"):
+        sf.bootstrap(runs, CHUNK + 8, folder=tmp_path, resample="runs")
 
 
 def made(**settings):
@@ -126,10 +160,11 @@ def with_reference():
 
 
 REFUSED = {
-    "resample must be 'residuals', 'wild' or 'blocks'; got 'pairs'": made(resample="pairs"),
+    "resample must be one of residuals, wild, blocks, runs; got 'pairs'": made(resample="pairs"),
     "block is the length of blocks: give it with resample='blocks'": made(block=3),
     "block must lie between 1 and the 40 samples there are; got 41": made(resample="blocks", block=41),
     "runs must be 1 or more; got 0": made(runs=0),
+    "resample='runs' needs two experiments or more": made(resample="runs"),
     r"bootstrap needs the result of sf.estimate; got Problem": lambda: sf.bootstrap(mean_of(skewed()).problem),
     "a bootstrap begins at a minimum": lambda: sf.bootstrap(sf.estimate(mean_of(skewed()).problem, max_iterations=0)),
     "resamples Measurements; this problem has a ReferenceSignal": lambda: sf.bootstrap(with_reference()),

@@ -1,4 +1,4 @@
-"""Experiment design: information, criteria, samples and inputs, against closed forms and brute force."""
+"""Experiment design: information, criteria, samples, sensors and inputs, against closed forms and brute force."""
 
 import json
 from dataclasses import replace
@@ -173,7 +173,7 @@ def test_standard_errors_beyond_the_next_transition_are_doubtful():
     assert "The standard error of tau_1, k is larger than the distance to a bound" in " ".join(str(plan).split())
 
 
-# Samples
+# Samples and sensors
 
 
 def test_samples_of_a_decay_are_taken_at_0_and_at_1_over_k():
@@ -206,6 +206,17 @@ def test_samples_against_all_choices(kind, names):
     np.testing.assert_array_equal(plan.problem.experiments[0].data[0].sigma, sigma[list(best)])
 
 
+def sensors_of_a_line():
+    """Three sensors: the value, its slope, and the value again with less noise."""
+    value = lambda t, x, p: jnp.stack([p["a"] + p["b"] * t])  # noqa: E731
+    items = [
+        planned(TIMES, observe=value, names=("value",)),
+        planned(TIMES[::2], observe=lambda t, x, p: jnp.stack([p["b"] + 0.0 * t]), names=("slope",)),
+        planned(TIMES, observe=value, sigma=0.05, names=("fine",)),
+    ]
+    return sf.Problem(STILL, sf.Experiment(items, ("still",), (), 0.0, 4.0), {"a": 1.0, "b": 2.0})
+
+
 def test_no_exchange_of_one_sample_is_better():
     """Of random candidates of two sensors; dropping those that are missed least does not get there by itself."""
     rng, sensor = np.random.default_rng(0), np.arange(14) % 2
@@ -216,20 +227,40 @@ def test_no_exchange_of_one_sample_is_better():
         def rate(F):
             return -np.linalg.slogdet(F)[1]
 
-        value, taken = choose_samples(candidates, np.array([2, 3]), rate)
+        value, taken = choose_samples(candidates, [np.array([2, 3])], rate)
         np.testing.assert_array_equal(np.bincount(sensor, taken), [2, 3])
         for out, into in product(np.flatnonzero(taken), np.flatnonzero(~taken)):
             if sensor[out] == sensor[into]:
                 assert rate(candidates.add(taken) - each[out] + each[into]) > value - 1e-6
 
 
+def test_sensors_by_number_and_by_cost():
+    problem = sensors_of_a_line()
+    each = {
+        "value": line_information(TIMES),
+        "slope": np.diag([0.0, len(TIMES[::2]) / 0.1**2]),
+        "fine": line_information(TIMES, 0.05),
+    }
+    costs = {"value": 1.0, "slope": 1.5, "fine": 2.5}
+    for settings, most, price in (
+        ({"sensors": 2}, 2, dict.fromkeys(each, 1)),
+        ({"sensors": costs, "budget": 3.5}, 3.5, costs),
+    ):
+        plan = sf.design(problem, **settings)
+        found = {}
+        for taken in product((0, 1), repeat=3):
+            names = [name for name, use in zip(each, taken, strict=True) if use]
+            F = sum((each[name] for name in names), np.zeros((2, 2)))
+            if sum(price[name] for name in names) <= most and np.linalg.det(F) > 1e-6:
+                found[tuple(names)] = measure("D", np.linalg.inv(F))
+        assert tuple(plan.sample_times) == min(found, key=found.get)
+        assert plan.criterion_after == pytest.approx(min(found.values()), rel=1e-9)
+        assert len(plan.problem.experiments[0].data) == len(plan.sample_times)
+
+
 def test_samples_of_each_sensor():
-    value = lambda t, x, p: jnp.stack([p["a"] + p["b"] * t])  # noqa: E731
-    slope = planned(TIMES[::2], observe=lambda t, x, p: jnp.stack([p["b"] + 0.0 * t]), names=("slope",))
-    items = [planned(TIMES, observe=value, names=("value",)), slope, planned(TIMES, observe=value, sigma=0.05)]
-    problem = sf.Problem(STILL, sf.Experiment(items, ("still",), (), 0.0, 4.0), {"a": 1.0, "b": 2.0})
-    plan = sf.design(problem, samples={"value": 2, "slope": 1})
-    assert {name: len(times) for name, times in plan.sample_times.items()} == {"value": 2, "slope": 1, "sensor 3": 9}
+    plan = sf.design(sensors_of_a_line(), samples={"value": 2, "slope": 1})
+    assert {name: len(times) for name, times in plan.sample_times.items()} == {"value": 2, "slope": 1, "fine": 9}
 
 
 def test_shares_of_the_information_add_up_to_one():
@@ -372,6 +403,8 @@ def test_text_figure_and_file(tmp_path):
 
 # Bad input
 
+ONE_SENSOR = "sensor 1"
+
 
 @pytest.mark.parametrize(
     ("settings", "message"),
@@ -383,6 +416,11 @@ def test_text_figure_and_file(tmp_path):
         ({"free": {"u": (0.0, 1.0)}}, "free must name inputs of the run: none; got 'u'"),
         ({"samples": 0}, "samples of sensor 1 must be"),
         ({"samples": {"X": 3}}, "samples names 'X'; the sensors are sensor 1"),
+        ({"sensors": {"X": 3.0}, "budget": 1.0}, "sensors names 'X'"),
+        ({"sensors": {ONE_SENSOR: 3.0}}, "budget and the costs of sensors belong together"),
+        ({"sensors": 1, "budget": 2.0}, "budget and the costs of sensors belong together"),
+        ({"sensors": {ONE_SENSOR: 3.0}, "budget": 2.0}, "no sensor is within the budget of 2"),
+        ({"sensors": {ONE_SENSOR: -3.0}, "budget": 2.0}, "cost of sensor 1 must be positive"),
         ({"experiment": 1}, "experiment must lie in 0..0; got 1"),
         ({"theta": [1.0]}, "theta must have shape"),
         ({"starts": -1}, "starts must not be negative"),

@@ -22,7 +22,14 @@ from switchfit.models import (
     skid_steer,
     sliding_block,
 )
-from switchfit.models.magic_formula import MAGIC_FORMULA, _curve, lateral_force, longitudinal_force
+from switchfit.models.magic_formula import (
+    ALIGNING_MOMENT,
+    MAGIC_FORMULA,
+    _curve,
+    compute_aligning_moment,
+    lateral_force,
+    longitudinal_force,
+)
 
 MASS, LENGTH, WIDTH, GRAVITY = 80.0, 0.25, 0.23, 9.81
 
@@ -212,6 +219,11 @@ def test_magic_formula_against_values_worked_out_apart():
     np.testing.assert_allclose(longitudinal, [2191.82, 4234.44, 6090.57, 7736.34], rtol=0, atol=0.006)
 
 
+def test_aligning_moment_against_a_value_worked_out_apart():
+    """With the coefficients of Bakker, Nyborg and Pacejka (1987): 3 degrees at 4 kN."""
+    assert float(compute_aligning_moment(3.0, 4.0, ALIGNING_MOMENT)) == pytest.approx(-52.605, abs=5e-4)
+
+
 def test_derivatives_of_the_curve_in_closed_form_are_those_of_its_operations():
     def plain(z):
         return jnp.sin(1.65 * jnp.arctan(z[0] + z[1] * (jnp.arctan(z[0]) - z[0])))
@@ -229,7 +241,8 @@ def test_derivatives_of_the_curve_in_closed_form_are_those_of_its_operations():
 
 def turn_on_tyres(x, treads, **settings):
     drive = magic_formula(wheel_radius=0.2, **settings).modes["drive"]
-    return evaluate(drive, np.array(x), MAGIC_FORMULA, np.array(treads) / 0.2)[[1, 3, 5, *range(6, len(x))]]
+    p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
+    return evaluate(drive, np.array(x), p, np.array(treads) / 0.2)[[1, 3, 5, *range(6, len(x))]]
 
 
 def test_forces_of_tyres_do_not_depend_on_the_heading():
@@ -265,6 +278,16 @@ def test_loads_balance_the_moments_of_the_accelerations():
     expected = [*forces, (ahead @ F_y - left @ F_x) / inertia, *(forces - [along, across]) / 0.05]
     np.testing.assert_allclose(found, expected, rtol=1e-4)
     assert np.abs(turn_on_tyres(x, treads)[2] - found[2]) > 1e-2  # loads matter
+
+
+def test_aligning_moments_turn_the_body_into_its_velocity():
+    V, angle, load = 4.0, np.radians(3.0), 1e-3 * GRAVITY * MASS / 4
+    x = [0.0, V, 0.0, V * np.tan(angle), 0.0, 0.0]
+    without, with_moment = (turn_on_tyres(x, [V] * 4, low_speed=1e-6, aligning=a) for a in (False, True))
+    np.testing.assert_array_equal(without[:2], with_moment[:2])
+    inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (LENGTH**2 + WIDTH**2)
+    expected = -4 * float(compute_aligning_moment(3.0, load, ALIGNING_MOMENT)) / inertia
+    assert with_moment[2] - without[2] == pytest.approx(expected, rel=2e-3)
 
 
 WRONG = [

@@ -160,8 +160,8 @@ def test_a_study_with_more_noise_than_sigma_says_so():
 def test_an_end_in_another_minimum_is_found(study):
     theta = study.theta.copy()
     theta[17] += 30 * study.standard_deviation
-    away = replace(study, theta=theta)
-    assert np.flatnonzero(measure_distances(away) > FAR_AWAY).tolist() == [17]
+    away, every = replace(study, theta=theta), np.ones(theta.shape[1], dtype=bool)
+    assert np.flatnonzero(measure_distances(away, every) > FAR_AWAY).tolist() == [17]
     assert away.verdict.level == "doubtful"
     assert "1 of 200 fits ended in another minimum, fit 17 farthest off" in str(away.verdict)
 
@@ -186,6 +186,15 @@ def test_a_bootstrap_of_a_bad_fit_is_bad():
     fine = sf.bootstrap(sf.estimate(room(wave(0.03)), strategy="local"), 20)
     assert fine.origin.level == "doubtful"  # sigma is too small, which is what a bootstrap is for
     assert fine.verdict.level == "good"
+
+
+def test_a_bootstrap_of_runs_is_judged_by_what_runs_share():
+    problem = sf.Problem(ROOM, [room(seed=seed).experiments[0] for seed in range(5)], {"k": 1.0})
+    found = sf.bootstrap(sf.estimate(problem), 40, resample="runs")
+    assert found.verdict.level == "good"
+    theta = found.theta.copy()
+    theta[3, 0] += 1.0  # the time of a run that was not drawn
+    assert replace(found, theta=theta).verdict.level == "good"
 
 
 # --- starts -----------------------------------------------------------------------------------------------------------

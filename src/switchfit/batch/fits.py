@@ -63,11 +63,10 @@ def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 
 def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[str, Any]) -> Any:
-    """Return fits of a kind from the content of a file; arrays that this version does not have are left out."""
-    names, rest = _split_fields(kind)
+    """Return fits of a kind from the content of a file."""
+    _, rest = _split_fields(kind)
     nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
-    known = {name: array for name, array in arrays.items() if name in names}
-    return kind(**known, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
+    return kind(**arrays, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:

@@ -1,6 +1,6 @@
 """Bootstrap: the spread of the estimates over data that are made of the data themselves.
 
-The fitted values stay, and residuals are added to them that were drawn from the fit's own. They are
+*Residuals*: the fitted values stay, and residuals are added to them that were drawn from the fit's own. They are
 centred and multiplied by sqrt(n / (n - d)), as fitting takes that much of the noise away ([1]_, section 6.2.3), and
 drawn
 
@@ -9,6 +9,9 @@ drawn
 - "wild": each at its own place with a random sign ([2]_); where the size of the noise varies in an unknown way;
 - "blocks": as blocks of neighbours from random places, round the end ([3]_); for noise that is correlated in time. The
   length of a block is, with r the correlation of neighbours, (sqrt(6) r / (1 - r^2))^(2/3) n^(1/3) ([4]_), or is given.
+
+*Runs*: whole experiments are drawn with replacement, an experiment that was drawn k times weighs k times. It takes what
+varies from run to run into account, the model's errors among it, but says nothing of a run's own transition times.
 
 A bootstrap in which the model itself makes the noise is `switchfit.monte_carlo`.
 
@@ -24,7 +27,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -33,9 +36,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.program import Varying
 from switchfit.batch.simulated import build_study
+from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_study
 from switchfit.estimation.estimator import Estimate
+from switchfit.fit.evaluator import measure_variation
 from switchfit.fit.result import inverse_on
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
@@ -45,7 +51,10 @@ from switchfit.uncertainty.prediction import collect_sample_derivatives
 from switchfit.uncertainty.residuals import compute_autocorrelation
 from switchfit.uncertainty.verdict import Verdict
 
-Resample = Literal["residuals", "wild", "blocks"]
+Resample = Literal["residuals", "wild", "blocks", "runs"]
+
+LEFT_OUT = 1e-8
+"""Weight of a run that was not drawn: its own transition times stay determined, and nothing else depends on it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,6 +70,8 @@ class Bootstrap(Fits):
         Length of the blocks, in samples; 1 if single residuals are drawn.
     acceleration : (d,)
         How the standard error changes with the estimate, for "bca" intervals.
+    resampled : (d,) bool
+        Of which unknowns something is said: with "runs" only of those that several runs share.
     origin : Verdict
         On the fit that was resampled.
 
@@ -83,6 +94,7 @@ class Bootstrap(Fits):
     resample: str
     block: int
     acceleration: FloatArray
+    resampled: np.ndarray[Any, np.dtype[np.bool_]]
     origin: Verdict
 
     @cached_property
@@ -90,20 +102,20 @@ class Bootstrap(Fits):
         """Whether to believe the spread: how many fits converged, in the same minimum as the others, without collapsed
         modes, and whether the fit that was resampled is bad. Print it for a line.
         """
-        return judge_study(self, origin=self.origin)
+        return judge_study(self, origin=self.origin, considered=self.resampled)
 
     @property
     def standard_deviation(self) -> FloatArray:
         """Of the estimates of the runs that converged, the bootstrap's standard error: (d,)."""
-        return self.theta[self.success].std(0, ddof=1)
+        return np.where(self.resampled, self.theta[self.success].std(0, ddof=1), np.nan)
 
     @property
     def bias(self) -> FloatArray:
         """Mean of the estimates less the estimate: (d,)."""
-        return self.theta[self.success].mean(0) - self.estimate
+        return np.where(self.resampled, self.theta[self.success].mean(0) - self.estimate, np.nan)
 
     def intervals(self, level: float = 0.95) -> FloatArray:
-        """Return confidence intervals: (d, 2); NaN if fewer than two fits converged.
+        """Return confidence intervals: (d, 2); NaN where nothing was resampled.
 
         They are quantiles of the estimates, shifted for bias and for acceleration (BCa, Efron 1987). The sum of the
         acceleration over the leave-one-out estimates is taken to first order, from exact derivatives, instead of
@@ -133,7 +145,7 @@ class Bootstrap(Fits):
         if len(theta) < 2:
             return found
         tails = np.array([0.5 - level / 2, 0.5 + level / 2])
-        for k in range(len(self.estimate)):
+        for k in np.flatnonzero(self.resampled):
             below = (np.sum(theta[:, k] < self.estimate[k]) + np.sum(theta[:, k] <= self.estimate[k])) / 2
             # Where all lie on one side, as at a bound, there is no shift to be found.
             inside = float(np.clip(below / len(theta), 0.5 / len(theta), 1 - 0.5 / len(theta)))
@@ -156,15 +168,15 @@ def bootstrap(
     folder: str | Path | None = None,
     callback: Callable[[int, int], object] | None = None,
 ) -> Bootstrap:
-    """Fit data again that are resampled from the residuals of a fit.
+    """Fit data again that are resampled from the residuals of a fit or from its runs.
 
     Parameters
     ----------
     estimate : Estimate
         With its problem, whose data are `Measurements`.
     runs : int
-    resample : {"residuals", "wild", "blocks"}
-        Residuals independently, with random signs at their places, or in blocks of neighbours.
+    resample : {"residuals", "wild", "blocks", "runs"}
+        Residuals independently, with random signs at their places, in blocks of neighbours; or whole experiments.
     block : int, optional
         Samples in a block; from the correlation of neighbouring residuals if left out. Only with "blocks".
     seed : int
@@ -180,8 +192,8 @@ def bootstrap(
     TypeError
         If this is no estimate, or an argument is of the wrong type.
     ValueError
-        For an estimate that has no problem or did not converge, data that cannot be resampled, or a folder
-        that holds something else.
+        For an estimate that has no problem or did not converge, data that cannot be resampled, fewer than two
+        experiments for "runs", or a folder that holds something else.
 
     See Also
     --------
@@ -208,14 +220,26 @@ def bootstrap(
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
     _check_data(problem)
-    draw = _Draw(estimate, problem, resample, block)
-    study, _ = build_study(problem, runs, estimate.theta, estimate.theta, draw, seed, how.limits)
+    size = 1
+    resampled = np.ones(len(estimate.theta), dtype=bool)
+    if resample == "runs":
+        if len(problem.experiments) < 2:
+            raise ValueError("resample='runs' needs two experiments or more; this problem has one. Take 'residuals'.")
+        meshes = list(estimate.evaluator_at_solution().meshes)
+        study: Study = StudyOfRuns(problem, meshes, estimate.theta[None], how.limits, seed)
+        resampled[np.concatenate([where[where >= 0] for where in problem.unknowns.times])] = False
+    else:
+        draw = _Draw(estimate, problem, resample, block)
+        size = draw.block
+        study, _ = build_study(problem, runs, estimate.theta, estimate.theta, draw, seed, how.limits)
+    acceleration = _compute_acceleration(estimate, by_run=resample == "runs")
     return Bootstrap(
         **repeat(problem, study, runs, "Bootstrap", how),
         estimate=estimate.theta.copy(),
         resample=resample,
-        block=draw.block,
-        acceleration=_compute_acceleration(estimate),
+        block=size,
+        acceleration=acceleration,
+        resampled=resampled,
         origin=estimate.verdict,
     )
 
@@ -234,13 +258,17 @@ def _check_data(problem: Problem) -> None:
         )
 
 
-def _compute_acceleration(estimate: Estimate) -> FloatArray:
-    """Return ``sum l^3 / (6 (sum l^2)^(3/2))`` over the influence l of each sample on each unknown ([5]_): (d,).
+def _compute_acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
+    """Return ``sum l^3 / (6 (sum l^2)^(3/2))`` over the influence l of each sample, or run, on each unknown ([5]_):
+    (d,).
 
     A sample's influence is to first order ``-H^-1 g``, g being the gradient of its part of the cost.
     """
     found = collect_sample_derivatives(estimate.evaluator_at_solution().problem, estimate.sensitivities)
     gradients = (found.weight * found.residual)[:, None] * found.derivative
+    if by_run:
+        runs = len(estimate.trajectories)
+        gradients = np.array([gradients[found.experiment == e].sum(0) for e in range(runs)])
     influence = -gradients @ inverse_on(estimate.free_basis, estimate.hessian)
     spread = np.sum(influence**2, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -302,3 +330,28 @@ class _Draw:
 def _get_sigma(item: Measurements) -> FloatArray:
     """Return the standard deviation of each sample, 1 where it is unknown: (K, q)."""
     return np.broadcast_to(1.0 if item.sigma is None else item.sigma, item.values.shape)
+
+
+@dataclass
+class StudyOfRuns(Study):
+    """Fits with the experiments weighted by how often they were drawn."""
+
+    is_finished = False  # of the times of single runs it says nothing
+
+    def weigh(self, runs: Iterable[int]) -> FloatArray:
+        """Return how often each experiment was drawn: (R, E)."""
+        count = len(self.problem.experiments)
+        drawn = [np.random.default_rng([self.seed, run]).integers(count, size=count) for run in runs]
+        return np.array([np.maximum(np.bincount(each, minlength=count), LEFT_OUT) for each in drawn])
+
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
+        """Return the weights of all samples (R, K, q), times those of their experiments."""
+        weights, (leaves, places), changed = self.weigh(runs), self.leaves, {}
+        for e, own in enumerate(places):
+            for samples in own.samples:
+                changed[samples.weight] = weights[:, e, None, None] * np.asarray(leaves[samples.weight])[None]
+        return changed, {}
+
+    def measure_variation(self, runs: range) -> FloatArray:
+        """Return J of data that are met by their means: (R,)."""
+        return self.weigh(runs) @ measure_variation(self.problem)

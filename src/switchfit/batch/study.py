@@ -205,6 +205,7 @@ class Study:
     seed: int
 
     shares_problem = True  # whether bounds, sample times and meshes are those of `problem`
+    is_finished = True  # whether fits are done again that need it, and get pieces
 
     @property
     def size(self) -> int:
@@ -248,12 +249,13 @@ class Study:
         chunk = batch.fit(self.list_starts(runs))
         for k, error in errors.items():
             chunk.clear_fit(k, error)
-        self._redo_unresolved(chunk, runs, batch)
-        if self.problem.constraint_names:
-            self._redo_doubted(chunk, runs, batch)
         pieces = make_no_pieces(self.problem, len(runs))
-        if not any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
-            pieces = trace_chunk(chunk, self.group_fits(runs), batch)
+        if self.is_finished:
+            self._redo_unresolved(chunk, runs, batch)
+            if self.problem.constraint_names:
+                self._redo_doubted(chunk, runs, batch)
+            if not any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
+                pieces = trace_chunk(chunk, self.group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
 
     def list_starts(self, runs: range) -> FloatArray:

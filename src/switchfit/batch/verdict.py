@@ -171,6 +171,7 @@ def judge_study(
     intervals: FloatArray | None = None,
     error: float = 0.0,
     origin: Verdict | None = None,
+    considered: NDArray[np.bool_] | None = None,
 ) -> Verdict:
     """Return the verdict on fits whose spread is what they are for.
 
@@ -185,8 +186,11 @@ def judge_study(
         Integration error of J, relative.
     origin : Verdict, optional
         On the fit that the data are made of.
+    considered : (d,) bool, optional
+        Unknowns whose spread means something; all if left out.
     """
     R, ended = len(fits.status), fits.success
+    shared = np.ones(len(fits.theta_names), dtype=bool) if considered is None else considered
     found: list[Finding] = []
     if origin is not None and origin.level == "bad":
         found.append(Finding("bad", Issue("resampled fit", (origin.level,)), ("look at the fit",)))
@@ -194,7 +198,7 @@ def judge_study(
     if failed > MINOR * R:
         level: Level = "bad" if failed >= HALF * R else "doubtful"
         found.append(Finding(level, _count(fits, Doubt("not converged", level, ~ended)), ("see failures",)))
-    distances = measure_distances(fits)
+    distances = measure_distances(fits, shared)
     elsewhere = distances > FAR_AWAY
     if elsewhere.any():
         farthest = str(fits.runs[int(np.argmax(distances))])
@@ -227,11 +231,11 @@ def judge_failed_starts(fits: Any) -> Verdict:
     return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
 
 
-def measure_distances(fits: Any) -> FloatArray:
+def measure_distances(fits: Any, considered: NDArray[np.bool_]) -> FloatArray:
     """Return how far fits converged from the others, in spreads; 0 for those that did not converge: (R,).
 
     An unknown's deviation from the median is measured by the median of these deviations, or by the median standard
-    error, or 1e-3 of the unknown's size where most are held. The largest counts.
+    error, or 1e-3 of the unknown's size where most are held. Of some unknowns (d,), the largest counts.
     """
     ended = fits.success
     found = np.zeros(len(ended))
@@ -244,7 +248,7 @@ def measure_distances(fits: Any) -> FloatArray:
     usual = np.array([np.median(e[np.isfinite(e)]) if np.isfinite(e).any() else 0.0 for e in errors.T])
     spread = np.maximum(1.4826 * np.median(deviation, axis=0), usual)
     spread = np.where(spread > 0, spread, 1e-3 * np.maximum(np.abs(centre), 1e-300))
-    found[ended] = np.max(deviation / spread, axis=1)
+    found[ended] = np.max(deviation / spread * considered, axis=1)
     return found
 
 

@@ -178,7 +178,7 @@ def design(
 ) -> None:
     """Find the experiment that will determine unknowns best.
 
-    Chooses inputs within limits and sample times of the last run of the file, at the first guess of the
+    Chooses inputs within limits, sample times and sensors of the last run of the file, at the first guess of the
     unknowns, and prints the standard errors to expect. [design] of the problem file says what is free; options override
     it. The values of the run's data are not used: a log with the possible times and zeros will do.
 

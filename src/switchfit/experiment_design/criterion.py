@@ -9,7 +9,7 @@ the eigenvalues v_1, ..., v_s of C, the mean variance of power q,
 is Kiefer's criterion ([1]_, chapter 6): D for q = 0, A for q = 1, and E for infinity. Where an experiment is done n
 times, m is 1/n of its value: m of the best design over m of another one is the *efficiency* of that.
 
-Choose sample times from candidates, each of which adds its information.
+Choose sample times and sensors from candidates, each of which adds its information.
 
 An exchange algorithm (Cook and Nachtsheim, [2]_): candidates are dropped one by one, that which is missed least first,
 until as many are left as are allowed; then each of them is exchanged for the best that is left out, until no exchange
@@ -146,18 +146,25 @@ class Candidates(NamedTuple):
 
 
 def choose_samples(
-    candidates: Candidates, most: NDArray[np.intp], rate: Callable[[FloatArray], FloatArray]
+    candidates: Candidates, limits: Sequence[NDArray[np.intp]], rate: Callable[[FloatArray], FloatArray]
 ) -> tuple[float, NDArray[np.bool_]]:
-    """Return log m and the candidates (n,) of a choice that no exchange of one sample improves.
+    """Return the lowest log m within any of several limits, and the candidates that are taken for it (n,).
 
     Parameters
     ----------
     candidates : Candidates
-    most : (S,) int
-        Samples of each sensor.
+    limits : sequence of (S,) int arrays
+        Most samples of each sensor.
     rate : callable
         log m (...,) for information (..., d, d).
     """
+    return min((_exchange(candidates, most, rate) for most in limits), key=lambda choice: choice[0])
+
+
+def _exchange(
+    candidates: Candidates, most: NDArray[np.intp], rate: Callable[[FloatArray], FloatArray]
+) -> tuple[float, NDArray[np.bool_]]:
+    """Return a choice within one limit that no exchange of one sample improves."""
     sensor, each = candidates.sensor, candidates.information
     taken = most[sensor] > 0
     while (over := np.flatnonzero(taken & (np.bincount(sensor, taken, len(most)) > most)[sensor])).size:

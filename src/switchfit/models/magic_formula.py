@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from switchfit.models.constants import Constant, Constants, Values, check_constants, check_length, is_absent, read_input
 from switchfit.models.skid_steer import STATES, UNITS
 from switchfit.problem.system import HybridSystem
+from switchfit.problem.validation import as_flag
 
 #: Coefficients a_1 to a_8 of the longitudinal (x) and the lateral (y) force of 1987, by the parameter's name.
 MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
@@ -24,10 +25,15 @@ MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
     }
 )
 
+#: Coefficients a_1 to a_8 of the aligning moment of 1987, by the parameter's name.
+ALIGNING_MOMENT: Mapping[str, float] = MappingProxyType(
+    {f"a_z{i}": a for i, a in enumerate((-2.72, -2.28, -1.86, -2.73, 0.110, -0.070, 0.643, -4.04), start=1)}
+)
+
 #: Channels of the input: angular velocities of the wheels.
 WHEELS = ("w1", "w2", "w3", "w4 (rad/s)")
 #: Shape factors C, which are not among the fitted coefficients.
-C_X, C_Y = 1.65, 1.30
+C_X, C_Y, C_Z = 1.65, 1.30, 2.40
 #: Slip below which a wheel's force is linear in the slip: at zero, the direction of the slip is undefined.
 SMALL_SLIP = 1e-3
 #: Part of the static load that a wheel keeps, about, where it would lift.
@@ -50,6 +56,15 @@ def lateral_force(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
     BCD = a_3 * jnp.sin(a_4 * jnp.arctan(a_5 * load))
     E = (a_6 * load + a_7) * load + a_8
     return _magic_formula(angle, BCD / (C_Y * D), C_Y, D, E)
+
+
+def compute_aligning_moment(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
+    """Return the aligning moment of a tyre (N m) at a slip angle in degrees and a load in kN, from a_z1 to a_z8."""
+    a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_z{i}"] for i in range(1, 9))
+    D = a_1 * load**2 + a_2 * load
+    BCD = (a_3 * load**2 + a_4 * load) * jnp.exp(-a_5 * load)
+    E = a_6 * load**2 + a_7 * load + a_8
+    return _magic_formula(angle, BCD / (C_Z * D), C_Z, D, E)
 
 
 def _magic_formula(X: Any, B: Any, C: float, D: Any, E: Any) -> Any:
@@ -111,6 +126,7 @@ def magic_formula(
     low_speed: Constant = 0.1,
     height: Constant = 0.0,
     load_lag: Constant = 0.05,
+    aligning: bool = False,
     initial_state: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     m_b: Constant = 70.0,
     m_w: Constant = 2.5,
@@ -141,7 +157,8 @@ def magic_formula(
 
     which balances the moments of the forces at the ground. The body follows them with a lag, that of its pitch and
     roll: (a_x, a_y) are two more states, ``a' = (F / m - a) / load_lag``. A wheel that would lift keeps some of its
-    load: the limit is smooth, and changes a load above a tenth of the static one by less than 1e-4 of that.
+    load: the limit is smooth, and changes a load above a tenth of the static one by less than 1e-4 of that. With
+    `aligning` the aligning moments of the tyres, each times its wheel's share of s, act on the vehicle too.
 
     Parameters
     ----------
@@ -151,6 +168,8 @@ def magic_formula(
         Height h of the center of mass (m); 0: no transfer of load.
     load_lag : float or str, optional
         Time constant of the transfer of load (s).
+    aligning : bool, optional
+        Add the aligning moments.
     low_speed : float or str, optional
         Speed (m/s) below which slip becomes viscous friction, with a force proportional to velocity.
     initial_state : (6,) array_like, optional
@@ -161,7 +180,8 @@ def magic_formula(
     Returns
     -------
     HybridSystem
-        Its parameters are a_x1 to a_x8 and a_y1 to a_y8; `MAGIC_FORMULA` holds their published values.
+        Its parameters are a_x1 to a_x8 and a_y1 to a_y8; `MAGIC_FORMULA` holds their published values. With `aligning`
+        a_z1 to a_z8 too, whose published values `ALIGNING_MOMENT` holds.
 
     Raises
     ------
@@ -201,10 +221,11 @@ def magic_formula(
     if not is_absent(constants["height"]):
         start = [*np.asarray(initial_state, dtype=float), 0.0, 0.0]
         names, units = (*STATES, "a_x", "a_y"), (*UNITS, "m/s^2", "m/s^2")
-    return HybridSystem({"drive": partial(_drive, constants)}, start, state_names=names, state_units=units)
+    drive = partial(_drive, constants, as_flag(aligning, "aligning"))
+    return HybridSystem({"drive": drive}, start, state_names=names, state_units=units)
 
 
-def _drive(constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
+def _drive(constants: Constants, aligning: bool, t: Any, x: Any, p: Any, u: Any) -> Any:
     c = Values(constants, p)
     a, b, height = c["a"], c["b"], c["height"]
     m = c["m_b"] + 4 * c["m_w"]
@@ -233,6 +254,8 @@ def _drive(constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
     F_y = lateral_force(angle, load, p) * share_y
     along, across = jnp.sum(F_x) / m, jnp.sum(F_y) / m
     torque = jnp.sum(ahead * F_y - left * F_x)
+    if aligning:
+        torque = torque + jnp.sum(compute_aligning_moment(angle, load, p) * share_y)
     rates = [dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia]
     if len(x) > 6:
         rates += [(along - x[6]) / c["load_lag"], (across - x[7]) / c["load_lag"]]

@@ -42,6 +42,7 @@ BOOTSTRAP_TITLES = {
     "residuals": "Bootstrap of residuals",
     "wild": "Bootstrap of residuals with random signs",
     "blocks": "Bootstrap of blocks of residuals",
+    "runs": "Bootstrap of runs",
 }
 
 OTHERS = "#bbbbbb"
@@ -177,6 +178,7 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
     for k in shown:
         ends = ", ".join(format_time(end, clocks[k], error[k]) for end in intervals[k])
         spread = f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends}]"
+        spread = spread if study.resampled[k] else ("-", "-", "of one run alone")
         rows.append((_label(study, k), format_time(study.estimate[k], clocks[k], error[k]), *spread))
     titles = ("", "estimate", "bias", "standard error", "95 % interval (BCa)")
     return Table(rows, "<" + ">" * 4, titles), _count_rest(study, shown)
@@ -294,7 +296,7 @@ def plot_bootstrap(study: Bootstrap, *, unknown: str | None = None, ax: Axes | N
     ax : matplotlib.axes.Axes, optional
         For one unknown.
     """
-    shown = range(len(study.theta_names))
+    shown = np.flatnonzero(study.resampled).tolist()
     draw = draw_bootstrap if study.success.sum() > 1 else _say_too_few
     return _plot_panels(study, shown, draw, BOOTSTRAP_TITLES[study.resample], unknown, ax)
 
