@@ -52,7 +52,8 @@ DESIGN = """
 [design]
 criterion = "A"
 samples = { T = 3 }
-sensors = 1
+sensors = { T = 1.0, fine = 3.0 }
+budget = 2.0
 starts = 0
 
 [design.names]
@@ -85,7 +86,7 @@ def test_a_design_is_printed_and_written(folder):
     problem = load_problem(folder / "problem.toml").problem
     plan = sf.design(
         problem, free={"power": [0.0, 1.5]}, names={"k": 0.1, "b": 0.5}, criterion="A", samples={"T": 3},
-        sensors=1, starts=0,
+        sensors={"T": 1.0, "fine": 3.0}, budget=2.0, starts=0,
     )  # fmt: skip
     assert str(plan) == result.stdout.rstrip("\n")
     np.testing.assert_array_equal(sf.read_log(out / "input.csv")["power"], plan.inputs["power"])
@@ -109,7 +110,7 @@ def test_options_override_the_file(folder, monkeypatch):
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
     assert given == {"criterion": "E", "samples": 5}
     run("design", folder / "problem.toml", "--criterion", "D")
-    assert (given["criterion"], given["samples"], given["starts"]) == ("D", {"T": 3}, 0)
+    assert (given["criterion"], given["samples"], given["budget"]) == ("D", {"T": 3}, 2.0)
 
 
 def test_json_and_what_cannot_be_estimated(folder):
@@ -127,8 +128,8 @@ def test_json_and_what_cannot_be_estimated(folder):
         ('criterion = "A"', 'criterion = "T"', "design.criterion"),
         ("power = [0.0, 1.5]", "moon = [0.0, 1.5]", "free must name inputs of the run: power, sun; got 'moon'"),
         ("k = 0.1", "c = 0.1", "names has 'c', which is no unknown of the problem: k, b"),
-        ("starts = 0", "starts = -1", "design.starts"),
-        ("starts = 0", "cost = 2.0", "cost"),
+        ("budget = 2.0", "budget = -2.0", "design.budget"),
+        ("budget = 2.0", "cost = 2.0", "cost"),
     ],
 )
 def test_mistakes_in_the_file(folder, old, new, message):

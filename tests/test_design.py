@@ -234,19 +234,28 @@ def test_no_exchange_of_one_sample_is_better():
                 assert rate(candidates.add(taken) - each[out] + each[into]) > value - 1e-6
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_sensors_by_number(count):
+def test_sensors_by_number_and_by_cost():
+    problem = sensors_of_a_line()
     each = {
         "value": line_information(TIMES),
         "slope": np.diag([0.0, len(TIMES[::2]) / 0.1**2]),
         "fine": line_information(TIMES, 0.05),
     }
-    plan = sf.design(sensors_of_a_line(), sensors=count)
-    sets = [names for names in combinations(each, min(count, 3)) if names != ("slope",)]  # which knows nothing of a
-    found = {names: measure("D", np.linalg.inv(sum(each[name] for name in names))) for names in sets}
-    assert tuple(plan.sample_times) == min(found, key=found.get)
-    assert plan.criterion_after == pytest.approx(min(found.values()), rel=1e-9)
-    assert len(plan.problem.experiments[0].data) == len(plan.sample_times)
+    costs = {"value": 1.0, "slope": 1.5, "fine": 2.5}
+    for settings, most, price in (
+        ({"sensors": 2}, 2, dict.fromkeys(each, 1)),
+        ({"sensors": costs, "budget": 3.5}, 3.5, costs),
+    ):
+        plan = sf.design(problem, **settings)
+        found = {}
+        for taken in product((0, 1), repeat=3):
+            names = [name for name, use in zip(each, taken, strict=True) if use]
+            F = sum((each[name] for name in names), np.zeros((2, 2)))
+            if sum(price[name] for name in names) <= most and np.linalg.det(F) > 1e-6:
+                found[tuple(names)] = measure("D", np.linalg.inv(F))
+        assert tuple(plan.sample_times) == min(found, key=found.get)
+        assert plan.criterion_after == pytest.approx(min(found.values()), rel=1e-9)
+        assert len(plan.problem.experiments[0].data) == len(plan.sample_times)
 
 
 def test_samples_of_each_sensor():
@@ -394,6 +403,8 @@ def test_text_figure_and_file(tmp_path):
 
 # Bad input
 
+ONE_SENSOR = "sensor 1"
+
 
 @pytest.mark.parametrize(
     ("settings", "message"),
@@ -405,7 +416,11 @@ def test_text_figure_and_file(tmp_path):
         ({"free": {"u": (0.0, 1.0)}}, "free must name inputs of the run: none; got 'u'"),
         ({"samples": 0}, "samples of sensor 1 must be"),
         ({"samples": {"X": 3}}, "samples names 'X'; the sensors are sensor 1"),
-        ({"sensors": 0}, "sensors must be 1 or more; got 0"),
+        ({"sensors": {"X": 3.0}, "budget": 1.0}, "sensors names 'X'"),
+        ({"sensors": {ONE_SENSOR: 3.0}}, "budget and the costs of sensors belong together"),
+        ({"sensors": 1, "budget": 2.0}, "budget and the costs of sensors belong together"),
+        ({"sensors": {ONE_SENSOR: 3.0}, "budget": 2.0}, "no sensor is within the budget of 2"),
+        ({"sensors": {ONE_SENSOR: -3.0}, "budget": 2.0}, "cost of sensor 1 must be positive"),
         ({"experiment": 1}, "experiment must lie in 0..0; got 1"),
         ({"theta": [1.0]}, "theta must have shape"),
         ({"starts": -1}, "starts must not be negative"),

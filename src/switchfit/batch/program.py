@@ -437,7 +437,8 @@ class Batch:
         problem, limits = self.evaluator.problem, self.limits
         unknowns, variables = problem.unknowns, problem.unknowns.variables
         bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
-        constraints = Constraints(unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
+        numbers: list[Any] = [unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes)]
+        constraints = Constraints(*numbers)
         # What it does not settle has as many iterations left for the optimiser that finishes it.
         limits = limits._replace(max_iterations=limits.max_iterations // 2)
         padded = pad_fits(variables.inward(starts), self.layout.size)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -224,7 +224,8 @@ def design(
     names: str | Sequence[str] | Mapping[str, float] | None = None,
     criterion: Literal["D", "A", "E"] = "D",
     samples: int | Mapping[str, int] | None = None,
-    sensors: int | None = None,
+    sensors: int | Mapping[str, float] | None = None,
+    budget: float | None = None,
     experiment: int | None = None,
     starts: int = 8,
     seed: int = 0,
@@ -250,9 +251,11 @@ def design(
         trace, that is the sum of variances; the largest eigenvalue. A and E depend on units, or on the scales.
     samples : int or mapping of sensor to int, optional
         Most sample times of each sensor, chosen among those of the problem; all of them if left out.
-        A sensor is one of the `Measurements` of the run, called by the names of its channels, such as "X, Y".
-    sensors : int, optional
-        Most sensors that are used; all if left out.
+    sensors : int or mapping of sensor to float, optional
+        Most `Measurements` of the run that are used, or what each costs; all are used if left out. A sensor is called
+        by the names of its channels, such as "X, Y".
+    budget : float, optional
+        Most that the sensors may cost together.
     experiment : int, optional
         Index of the run that is designed, from 0; the last one if left out.
     starts : int, optional
@@ -305,7 +308,7 @@ def design(
     _check_data(problem)
     run, (chosen, scales) = problem.experiments[e], _find_chosen(problem, names)
     labels = name_sensors(run)
-    most = _list_limits(run, labels, samples, sensors)
+    most = _list_limits(run, labels, samples, sensors, budget)
     lower, upper = read_limits(run, {} if free is None else free)
     if free and (problem.constraint_names or has_corners(problem.structures[e])):
         raise ValueError(
@@ -397,11 +400,17 @@ def _build_criterion(before: Nominal, chosen: NDArray[np.intp], scales: FloatArr
     return Criterion(chosen, scales, before.basis, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
 
 
-def _list_limits(run: Experiment, labels: tuple[str, ...], samples: Any, sensors: Any) -> list[NDArray[np.intp]]:
-    """Return the most samples of each sensor, (S,), for each set of as many sensors as are allowed."""
+def _list_limits(
+    run: Experiment, labels: tuple[str, ...], samples: Any, sensors: Any, budget: float | None
+) -> list[NDArray[np.intp]]:
+    """Return the most samples of each sensor, (S,), for each largest set of sensors that number or costs allow."""
     counts = samples if isinstance(samples, Mapping) else dict.fromkeys(labels, samples)
-    if unknown := [name for name in counts if name not in labels]:
-        raise ValueError(f"samples names {shorten(unknown[0])}; the sensors are {join_names(labels)}.")
+    costs = sensors if isinstance(sensors, Mapping) else dict.fromkeys(labels, 1.0)
+    for what, given in (("samples", counts), ("sensors", costs)):
+        if unknown := [name for name in given if name not in labels]:
+            raise ValueError(f"{what} names {shorten(unknown[0])}; the sensors are {join_names(labels)}.")
+    if (budget is None) == isinstance(sensors, Mapping):
+        raise ValueError("budget and the costs of sensors belong together: give sensors={name: cost} and budget.")
     whole = np.array([len(item.times) for item in run.data])
     for s, name in enumerate(labels):
         if counts.get(name) is not None:
@@ -410,5 +419,11 @@ def _list_limits(run: Experiment, labels: tuple[str, ...], samples: Any, sensors
         return [whole]
     if len(labels) > MOST_SENSORS:
         raise ValueError(f"sensors can be chosen among {MOST_SENSORS}; there are {len(labels)}.")
-    count, every = as_count(sensors, "sensors", at_least=1), range(len(labels))
-    return [whole * np.isin(every, chosen) for chosen in combinations(every, min(count, len(labels)))]
+    prices = np.array([as_positive(costs[name], f"cost of {name}") if name in costs else 0.0 for name in labels])
+    most = as_count(sensors, "sensors", at_least=1) if budget is None else as_positive(budget, "budget")
+    every = np.array(list(product((0, 1), repeat=len(labels))))
+    allowed = every[every @ prices <= most]
+    largest = [own for own in allowed if not any(np.all(other >= own) and np.any(other > own) for other in allowed)]
+    if not np.any(largest):
+        raise ValueError(f"no sensor is within the budget of {most:g}; got costs {shorten(dict(costs))}.")
+    return [whole * own for own in largest]

@@ -83,7 +83,7 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = l
             say(f"{place}: done before the interruption")
         else:
             began = time.perf_counter()
-            found = part.compute(quick, unfinished / name, lambda text, place=place: say(f"{place}: {text}"))  # type: ignore[misc]  # mypy cannot infer the default
+            found = part.compute(quick, unfinished / name, lambda text, place=place: say(f"{place}: {text}"))
             entry = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
             write_atomically(json.dumps(entry), kept)
         results[name] = entry

@@ -332,10 +332,11 @@ class DesignTable(Table):
     names: OrTable[NameOrNames, Positive] | None = None
     """unknowns that count, or a table with the scale of each; left out, all"""
     samples: OrTable[int, int] | None = None
-    """most sample times of each sensor, or a table with a number for each, which is called by its channels, such as
-    'X, Y'; left out, all"""
-    sensors: int | None = None
-    """most sensors; left out, all"""
+    """most sample times of each sensor, or a table with a number for each; left out, all"""
+    sensors: OrTable[int, Positive] | None = None
+    """most sensors, or a table with the cost of each, which is called by its channels, such as 'X, Y'; left out, all"""
+    budget: Positive | None = None
+    """most that the sensors may cost together"""
     starts: int | None = Field(default=None, ge=0)
     """inputs at random from which the search begins; left out, 8"""
 
