@@ -292,11 +292,11 @@ def read_text(path: Path, options: Options) -> Log:
         May be compressed by gzip.
     options : Options
     """
-    columns, time = options.columns, options.time
-    table = _read_table(path, options.drop_broken)
+    columns, time, drop_broken = options.columns, options.time, "drop-broken-lines" in options.repair
+    table = _read_table(path, drop_broken)
     wanted = None if columns is None else _find_columns(table, columns)
     column = _find_time(table, wanted or ()) if time is None else _find_column(table, time)
-    if options.drop_broken:
+    if drop_broken:
         table = _drop_text(table, column, wanted)
     log = _read_times(table, column, options)
     values: dict[str, FloatArray] = {}
