@@ -172,6 +172,7 @@ def test_a_bad_log_does_not_end_the_run(folder):
     monday, sunday = json.loads(result.stdout)["logs"]
     assert (monday["log"], monday["verdict"]) == (str(folder / "logs" / "monday.csv"), "good")
     assert (sunday["verdict"], sunday["message"]) == ("refused", rows["sunday.csv"]["message"])
+    assert run("fit", folder / "logs" / "friday.csv", *problem).exit_code == 1
 
 
 def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):

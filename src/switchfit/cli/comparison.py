@@ -80,16 +80,15 @@ def compare(
         import switchfit as sf
         from switchfit.io.command_line import summarize_comparison
         from switchfit.io.logs import name_files
-        from switchfit.io.saved_problem import list_changed_models, load_with_problem
+        from switchfit.io.saved_problem import load_with_problem
 
         terminal.make_folder(out)
         names = name_files(saved)
         estimates, changes = [], []
         for name, path in zip(names, saved, strict=True):
-            estimate, loaded = load_with_problem(path, folder)
+            estimate, changed = load_with_problem(path, folder)
             estimates.append(estimate)
-            if estimate.provenance is not None:
-                changes += [f"{name}: {change}" for change in list_changed_models(estimate.provenance, loaded)]
+            changes += [f"{name}: {change}" for change in changed]
         terminal.print_list("Changed since", changes)
         found = sf.compare(estimates, names=names)
         _show(found, summarize_comparison(found) | {"changes": changes, "out": out}, out, "comparison", figures)

@@ -114,16 +114,12 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     if prepare_figures:
         importing.join()  # two threads that import modules of one package in different orders find some half made
     if terminal.is_verbose():
-        for line in _describe_course(estimate):
-            terminal.print_note(line)
+        terminal.print_note(estimate.engine)
+        for step in estimate.steps:
+            terminal.print_note(f"{step.strategy}: lowest J = {step.cost:.6g} after {step.seconds:.2g} s")
+        counts = f"{estimate.iterations} iterations, {estimate.evaluations} evaluations"
+        terminal.print_note(f"{counts}, {estimate.seconds:.2g} s")
     return estimate
-
-
-def _describe_course(estimate: Any) -> list[str]:
-    """Return the engine and the strategies that were tried, a line each."""
-    lines = [str(estimate.engine)]
-    lines += [f"{step.strategy}: lowest J = {step.cost:.6g} after {step.seconds:.2g} s" for step in estimate.steps]
-    return [*lines, f"{estimate.iterations} iterations, {estimate.evaluations} evaluations, {estimate.seconds:.2g} s"]
 
 
 def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:

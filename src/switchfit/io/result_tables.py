@@ -144,11 +144,8 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
     InputError
         If a pattern matches nothing.
     """
-    found: list[str] = []
-    for path in paths:
-        logs = find_logs(Path(), str(path))
-        found += [str(path)] if logs is None else logs
-    found = list(dict.fromkeys(found))
+    named = [log for path in paths for log in find_logs(Path(), str(path)) or [str(path)]]
+    found = list(dict.fromkeys(named))
     return list(zip(name_files(found), map(Path, found), strict=True))
 
 

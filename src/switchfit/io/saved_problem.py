@@ -95,8 +95,8 @@ def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Pa
     return rebuild_problem(path, check_provenance(path, given), folder, other)[0]
 
 
-def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, ProblemFile]:
-    """Return a saved estimate with its problem, and the problem file.
+def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, list[str]]:
+    """Return a saved estimate with its problem, and the files of the model that have changed, a line for each.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):
         raise InputError(f"{path} was fitted to other values than the files in {where} have now: fit them again.")
-    return estimate, loaded
+    return estimate, list_changed_models(given, loaded)
 
 
 def _has_data(estimate: Estimate, problem: Problem) -> bool:

@@ -108,11 +108,6 @@ class Options(NamedTuple):
     repair: str | Sequence[str] = ()
     keep_epoch: bool = False
 
-    @property
-    def drop_broken(self) -> bool:
-        """Whether to drop lines with another number of fields, or with text in a column of numbers."""
-        return "drop-broken-lines" in self.repair
-
 
 class Event(NamedTuple):
     """Something that a log says in words.

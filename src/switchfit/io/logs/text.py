@@ -88,10 +88,13 @@ def find_delimiter(lines: Sequence[Line]) -> str:
 
 def split_lines(lines: Sequence[Line], delimiter: str) -> list[Row]:
     """Return the number and the cells of each line; of lines that quotes join, the number of the last one."""
-    source = (text.strip() if delimiter == " " else text for _, text in lines)
-    reader = csv.reader(source, delimiter=delimiter, skipinitialspace=True)
+    texts = [text.strip() if delimiter == " " else text for _, text in lines]
+    reader = csv.reader(texts, delimiter=delimiter, skipinitialspace=True)
     try:
-        return [(lines[reader.line_num - 1][0], [cell.rstrip() for cell in cells]) for cells in reader]
+        rows = [(lines[reader.line_num - 1][0], cells) for cells in reader]
+        if any(" " in text or "\t" in text for text in texts):
+            rows = [(line, [cell.rstrip() for cell in cells]) for line, cells in rows]
+        return rows
     except csv.Error as error:
         line = lines[min(reader.line_num, len(lines)) - 1][0]
         raise ValueError(f"line {line}: {error}; is a quotation mark missing?") from error
@@ -237,10 +240,7 @@ class _Table:
     ----------
     source : str
     header : Header
-    lines : (K,) array of int
-        Number of the line of each row.
-    columns : list of sequences of str
-        The cells of each column.
+    rows : list of (line, cells)
     comma : bool
         Whether decimals are behind commas.
     broken : list of int
@@ -249,19 +249,22 @@ class _Table:
 
     source: str
     header: Header
-    lines: NDArray[np.intp]
-    columns: Sequence[Sequence[str]]
+    rows: list[Row]
     comma: bool
     broken: list[int]
 
+    def list_cells(self, column: int) -> list[str]:
+        """Return the cells of a column."""
+        return [cells[column] for _, cells in self.rows]
+
     def parse_column(self, column: int) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return a column as numbers, NaN for missing ones, and which of its cells are something else."""
-        cells = self.columns[column]
+        cells = self.list_cells(column)
         if self.comma:
             cells = [cell.replace(",", ".") for cell in cells]
         try:
             if "_" not in "".join(cells):  # Python would read 1_5 as 15
-                return np.array(list(map(float, cells))), np.zeros(len(cells), dtype=bool)
+                return np.fromiter(map(float, cells), dtype=np.float64), np.zeros(len(cells), dtype=bool)
         except ValueError:
             pass
         found = list(map(_parse_number, cells))
@@ -289,11 +292,11 @@ def read_text(path: Path, options: Options) -> Log:
         May be compressed by gzip.
     options : Options
     """
-    columns, time = options.columns, options.time
-    table = _read_table(path, options.drop_broken)
+    columns, time, drop_broken = options.columns, options.time, "drop-broken-lines" in options.repair
+    table = _read_table(path, drop_broken)
     wanted = None if columns is None else _find_columns(table, columns)
     column = _find_time(table, wanted or ()) if time is None else _find_column(table, time)
-    if options.drop_broken:
+    if drop_broken:
         table = _drop_text(table, column, wanted)
     log = _read_times(table, column, options)
     values: dict[str, FloatArray] = {}
@@ -310,20 +313,22 @@ def read_text(path: Path, options: Options) -> Log:
         if not bad.any() and names.count(names[k]) == 1:
             values[names[k]] = found
         elif wanted is not None:
-            _refuse_cell(table, k, table.columns[k], int(bad.argmax()), NO_NUMBER)
+            _refuse_cell(table, k, table.list_cells(k), int(bad.argmax()), NO_NUMBER)
         elif names.count(names[k]) > 1:
             issues.append(Issue("log: repeated name", (table.source, names[k])))
-        elif _is_text(table.columns[k], bad):
-            events += _list_changes(names[k], table.columns[k], log.times)
+        elif _is_text(table.list_cells(k), bad):
+            events += _list_changes(names[k], table.list_cells(k), log.times)
         else:
             first = int(bad.argmax())
-            figures = {"line": float(table.lines[first]), "count": float(bad.sum())}
-            issues.append(Issue("log: text", (table.source, "line", names[k], table.columns[k][first]), figures))
+            line, cells = table.rows[first]
+            figures = {"line": float(line), "count": float(bad.sum())}
+            issues.append(Issue("log: text", (table.source, "line", names[k], cells[k]), figures))
     units = {name: table.header.units[names.index(name)] for name in values}
     labels = {label: names[k] for label, k in table.header.labels.items() if names[k] in values}
     events.sort(key=lambda event: event.time)
+    rows = np.array([line for line, _ in table.rows], dtype=np.intp)
     return replace(
-        log, values=values, units=units, issues=tuple(issues), events=tuple(events), labels=labels, rows=table.lines,
+        log, values=values, units=units, issues=tuple(issues), events=tuple(events), labels=labels, rows=rows,
         place="line",
     )  # fmt: skip
 
@@ -378,8 +383,7 @@ def _read_table(path: Path, drop_broken: bool) -> _Table:
     if not rows:
         raise InputError(f"{path} has a header but no rows; there is nothing to read.")
     comma = delimiter != "," and _use_decimal_commas(path, rows)  # between commas, 1,234 is rather a thousand
-    places = np.array([line for line, _ in rows], dtype=np.intp)
-    return _Table(str(path), header, places, list(zip(*(cells for _, cells in rows), strict=True)), comma, broken)
+    return _Table(str(path), header, rows, comma, broken)
 
 
 def _check_widths(path: Path, header: Header, rows: list[Row], drop: bool) -> tuple[list[Row], list[int]]:
@@ -388,6 +392,8 @@ def _check_widths(path: Path, header: Header, rows: list[Row], drop: bool) -> tu
     Empty cells at the end do not count.
     """
     width = len(header.names)
+    if all(len(cells) == width for _, cells in rows):
+        return rows, []
     kept: list[Row] = []
     broken: list[int] = []
     for line, cells in rows:
@@ -460,7 +466,7 @@ def _find_time(table: _Table, channels: Sequence[int]) -> int:
 
 def _read_times(table: _Table, column: int, options: Options) -> Log:
     """Return a log with the times of a table, and no channels."""
-    name, cells = table.header.names[column], table.columns[column]
+    name, cells = table.header.names[column], table.list_cells(column)
     unit, zone = table.header.units[column], ""
     times: NDArray[Any]
     sample = next((cell for cell in cells if not is_missing(cell)), "")
@@ -499,28 +505,27 @@ def _list_days(table: _Table) -> list[str]:
     """Return the cells of the column with the dates of times of day; none if there is no such column."""
     lower = [name.lower() for name in table.header.names]
     day = next((lower.index(name) for name in _DATE_NAMES if name in lower), None)
-    return [] if day is None else list(table.columns[day])
+    return [] if day is None else table.list_cells(day)
 
 
 def _refuse_cell(table: _Table, column: int, cells: Sequence[str], row: int, what: str) -> NoReturn:
     raise InputError(
-        f"{table.source}, line {table.lines[row]}, column {table.header.names[column]!r}: {cells[row]!r} {what}"
+        f"{table.source}, line {table.rows[row][0]}, column {table.header.names[column]!r}: {cells[row]!r} {what}"
     )
 
 
 def _drop_text(table: _Table, time: int, wanted: list[int] | None) -> _Table:
     """Return the table without the lines that have text in a column of numbers, or no time."""
-    broken = np.zeros(len(table.lines), dtype=bool)
+    broken = np.zeros(len(table.rows), dtype=bool)
     for k in range(len(table.header.names)) if wanted is None else {time, *wanted}:
-        cells = table.columns[k]
+        cells = table.list_cells(k)
         bad = table.parse_column(k)[1]
         if k == time and is_date(cells[0]):
             bad = np.array([not is_date(cell) for cell in cells])
         if not _is_text(cells, bad):
             broken |= bad
-    columns = [list(compress(column, ~broken)) for column in table.columns]
-    lines = table.broken + table.lines[broken].tolist()
-    return replace(table, columns=columns, lines=table.lines[~broken], broken=lines)
+    lines = table.broken + [line for line, _ in compress(table.rows, broken)]
+    return replace(table, rows=list(compress(table.rows, ~broken)), broken=lines)
 
 
 def _is_text(cells: Sequence[str], bad: NDArray[np.bool_]) -> bool:
