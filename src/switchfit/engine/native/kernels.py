@@ -243,7 +243,7 @@ class Kernels:
                 # D_2 f t_j' + D_p f p', the part of K_j' that does not depend on X_j'.
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
             tangent: Callable[..., explicit_rows.Tangent] = explicit_rows.tangent
-            if k:
+            if factors is not None:
                 tangent = partial(implicit_rows.tangent, factors=factors)
             # Without `moving` h_d is None: the graph then has none of the products with h', which all other rows would
             # pay for.
