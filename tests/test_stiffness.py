@@ -14,8 +14,9 @@ from derivatives import differentiate
 from test_implicit import SQUARE, robertson, van_der_pol
 
 import switchfit as sf
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.engine.native.templates import Order
+from switchfit.engine.protocol import runs_of
 from switchfit.engine.stiffness import Choice, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.command_line import describe_steps
@@ -146,7 +147,7 @@ def test_what_neither_can_integrate_is_refused():
 
 
 def test_the_look_at_eigenvalues_survives_a_model_that_is_undefined_beside_the_trajectory():
-    watch = Watch({}, ())
+    watch = Watch()
     watch.enter("m")
 
     def slopes(times, y):
@@ -160,7 +161,7 @@ def test_eigenvalues_are_those_of_the_vector_field():
     """Complex ones by their size, growing ones not at all, whatever the size of the states."""
     A = np.array([[-3.0, 400.0, 0.0], [-400.0, -3.0, 0.0], [0.0, 0.0, 5000.0]])
     for size in (1e-6, 1.0, 1e6):
-        watch = Watch({}, ())
+        watch = Watch()
         watch.enter("m")
         y = size * np.array([1.0, -2.0, 0.5, 0.0])
         watch.look(0.01, lambda t, y: np.pad(y[:, :3] @ A.T, [(0, 0), (0, 1)]), 0.0, y, 1e-2 * size)
@@ -334,6 +335,9 @@ def test_modes_that_are_stiff_at_one_of_several_thetas():
     assert [each.mode for each in mesh.stiffness] == ["m0"]
     for thetas in ((before, after), (after, before)):
         assert {each.mode for each in refine_mesh(problem, 0, *thetas).stiffness} == {"m0", "m1"}
+    found = refine_if_unstable(runs_of(problem)[0], mesh, before, after)
+    assert {each.mode for each in found.stiffness} == {"m0", "m1"}
+    assert refine_if_unstable(runs_of(problem)[0], found, before, after) is None
 
 
 # Where the choice goes
@@ -376,6 +380,15 @@ def test_a_mode_that_becomes_stiff_during_the_fit(sigma):
     assert len(fit.evaluator_at_solution().stiffness) == 1
     assert str(fit.engine) == "Evaluated in machine code, with implicit steps in 'm'."
     assert fit.integration_error < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("guess", "there", "solver"), [(2.0, 3.0, "auto"), (100.0, 1e5, "explicit"), (100.0, 1e5, "stiff")]
+)
+def test_steps_stay_where_they_are_stable_or_insisted_on(guess, there, solver):
+    problem = fitted_to(there, guess, EARLY, solver=solver)
+    mesh = refine_mesh(problem, 0, problem.initial_theta)
+    assert refine_if_unstable(runs_of(problem)[0], mesh, problem.initial_theta, np.array([there])) is None
 
 
 def test_each_experiment_has_steps_of_its_own():

@@ -43,7 +43,7 @@ from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
-from switchfit.engine.stiffness import STEPS_BETWEEN, Choice, TooManyStepsError, Watch
+from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.inspection import find_undefined
@@ -372,7 +372,7 @@ class _Solve:
         course, natively = self._course, isinstance(steps, _NativeSteps)
         accepted, x = [stretch.start], stretch.x
         # Between two calls Python looks: for corners that the steps have passed, and for stiffness.
-        at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, STEPS_BETWEEN if watch else STEPS_AT_ONCE)
+        at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
         while steps.is_running:
             if len(accepted) > most_of_branch:
                 raise BranchError
@@ -559,6 +559,27 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     return runs[0].coarse.refine(kept, stiffness)
 
 
+def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
+    """Return a mesh that meets the tolerances at each theta, with implicit steps in the modes whose explicit ones are
+    unstable.
+
+    It is called after a fit on `mesh` has failed, at the last of the thetas. None if the problem sets the solver; if
+    all explicit steps are stable; or if implicit ones take longer.
+    """
+    if run.problem.solver != "auto":
+        return None
+    watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), Choice(mesh.stiffness)
+    with suppress(NotIntegrableError):
+        solve_adaptively(run, thetas[-1], Settings(choice.found, watch))
+    if not choice.add(watch.find_unstable(mesh), watch, 0):
+        return None
+    try:
+        found = _solve_at(run, thetas[::-1], choice)
+    except NotIntegrableError:
+        return None
+    return run.coarse.refine(*found) if choice.found.keys() - {each.mode for each in mesh.stiffness} else None
+
+
 def _solve_at(
     run: Run, thetas: Sequence[FloatArray], choice: Choice, most: int = MAX_STEPS
 ) -> tuple[list[FloatArray], tuple[Stiffness, ...]]:
@@ -578,7 +599,7 @@ def _solve_at(
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
         refused = failure is None and choice.count_steps(watch, k)
-        again = choice.add(watch, k) or refused
+        again = choice.add(watch.find_stiff(), watch, k) or refused
         if again or (failure is not None and choice.refuse(watch.current)):
             solutions = []  # again, with other steps in some mode
         elif failure is not None:

@@ -13,6 +13,9 @@ steps all the same. The time of a row is its *work*, in additions: the operation
 that the choice is the same in each process. The implicit rows of small models have three to five times the work of
 explicit ones, and take 0.65 to 0.9 times as long as their work says; those of 12 states that all depend on one another
 have eighteen times the work.
+
+A fit may reach a theta where a mode is stiff and the explicit steps of its mesh are unstable: it then cannot go on.
+After such a failure, the eigenvalues at that theta are compared with the mesh.
 """
 
 from __future__ import annotations
@@ -26,13 +29,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.discretization.mesh import Stiffness
+from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.problem.data import FloatArray
 
 log = logging.getLogger("switchfit")
 
 STEPS_BETWEEN = 250
 """Accepted steps in a mode between two states at which its eigenvalues are computed."""
+
+STEPS_BETWEEN_AFTER_FAILURE = 64
+"""The same after a fit has failed, to find out whether its mesh is unstable."""
 
 FEW_STEPS = 1000
 """A mode with fewer steps is not called stiff, and its eigenvalues are not computed: its rows take less than a
@@ -115,10 +121,12 @@ class Watch:
 
     Parameters
     ----------
-    most : mapping of str to float
-        Time in a mode, in explicit rows, after which `add` raises `TooManyStepsError`.
-    refused : container of str
-        Modes that take explicit steps although they are stiff.
+    most : mapping of str to float, optional
+        Work in a mode after which `add` raises `TooManyStepsError`.
+    between : int
+        Steps in a mode between two looks.
+    refused : container of str, optional
+        Modes that take explicit steps although they are stiff; by default all do.
 
     Attributes
     ----------
@@ -127,9 +135,35 @@ class Watch:
         The mode that is being solved; "" before the first.
     """
 
-    def __init__(self, most: Mapping[str, float], refused: Container[str]) -> None:
+    def __init__(
+        self,
+        most: Mapping[str, float] | None = None,
+        between: int = STEPS_BETWEEN,
+        refused: Container[str] | None = None,
+    ) -> None:
         self.modes: dict[str, _ModeSteps] = {}
-        self.most, self.refused, self.current = most, refused, ""
+        self.most, self.between, self.refused = most or {}, between, refused
+        self.current = ""
+
+    def find_stiff(self) -> dict[str, float]:
+        """Return the stiff modes, and ``|lambda| h`` where stability limits the steps of each."""
+        return {name: float(np.median(mode.limited)) for name, mode in self.modes.items() if mode.is_stiff}
+
+    def find_unstable(self, mesh: Mesh) -> dict[str, float]:
+        """Return the modes in which explicit steps of a mesh are beyond `LIMITED`, and the largest ``|lambda| h`` of
+        each.
+        """
+        last = len(mesh.times) - 2
+        found: dict[str, float] = {}
+        for name, mode in self.modes.items():
+            for rate, look in zip(mode.rates, mode.looks, strict=True):
+                # The steps of the fixed mesh, not those of the solve: |lambda| of the look times the length of the cell
+                # it is in.
+                cell = min(int(np.searchsorted(mesh.times, look.t)) - 1, last)
+                ratio = float(rate * (mesh.times[cell + 1] - mesh.times[cell]))
+                if ratio > max(LIMITED, found.get(name, 0.0)):
+                    found[name] = ratio
+        return found
 
     def enter(self, name: str, row_work: float = 1.0) -> None:
         """Begin the solve of a mode whose rows have this work, in additions, in an evaluation of (J, g, H)."""
@@ -142,13 +176,13 @@ class Watch:
         Raises
         ------
         TooManyStepsError
-            If they take longer than the `most` of this mode.
+            If their work is more than the `most` of this mode.
         """
         mode = self.modes[self.current]
         mode.count += accepted
         if mode.row_work * mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
-        return mode.count - mode.looked >= STEPS_BETWEEN
+        return mode.count - mode.looked >= self.between
 
     def look(self, step: float, slopes: Slopes, t: float, y: FloatArray, smallest: float) -> None:
         """Keep a state of the current mode, for its eigenvalues; they are computed only if it takes many steps.
@@ -172,7 +206,7 @@ class Watch:
         """Return whether the current mode is stiff, however its solve goes on, and may take implicit steps."""
         looks = self.modes[self.current].looks
         # 20 of at most 60 looks are more than a quarter of them.
-        if self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
+        if self.refused is None or self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
             return False
         last = looks[-LOOKS_TO_STOP:]
         rates = _measure_rates(last)
@@ -188,7 +222,7 @@ class Watch:
 
 
 class TooManyStepsError(Exception):
-    """More steps in a mode than a `Watch` allows."""
+    """More work in a mode than a `Watch` allows."""
 
 
 class Choice:
@@ -207,7 +241,7 @@ class Choice:
 
     def __init__(self, stiffness: Iterable[Stiffness] = ()) -> None:
         self.found = {each.mode: each for each in stiffness}
-        self._most: dict[str, tuple[int, float]] = {}  # where a mode was found, and how long it may take there
+        self._most: dict[str, tuple[int, float]] = {}  # where a mode was found, and the work it may have there
         self._refused: set[str] = set()
 
     @property
@@ -216,21 +250,27 @@ class Choice:
         return tuple(self.found.values())
 
     def watch(self, k: int) -> Watch:
-        """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its time is limited."""
-        return Watch({name: most for name, (at, most) in self._most.items() if at == k}, self._refused)
+        """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its work is limited."""
+        return Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
 
-    def add(self, explicit: Watch, k: int) -> bool:
-        """Let the stiff modes of a solve at the k-th theta take implicit steps, and return whether there is one among
-        them that did not.
+    def add(self, stiff: Mapping[str, float], explicit: Watch, k: int) -> bool:
+        """Let modes take implicit steps, and return whether there is one among them that did not.
 
         They keep them if these take less time there than the explicit ones.
+
+        Parameters
+        ----------
+        stiff : mapping of str to float
+            ``|lambda| h`` of their explicit steps.
+        explicit : Watch
+            Of the explicit solve at the k-th theta.
+        k : int
         """
-        others = {name: mode for name, mode in explicit.modes.items() if name not in {*self.found, *self._refused}}
-        stiff = {name: mode for name, mode in others.items() if mode.is_stiff}
-        for name, mode in stiff.items():
-            self.found[name] = Stiffness(name, mode.total, 0, float(np.median(mode.limited)))
-            self._most[name] = k, UNSTABLE * mode.work
-        return bool(stiff)
+        new = {name: ratio for name, ratio in stiff.items() if name not in self.found and name not in self._refused}
+        for name, ratio in new.items():
+            steps = explicit.modes[name]
+            self.found[name], self._most[name] = Stiffness(name, steps.total, 0, ratio), (k, UNSTABLE * steps.work)
+        return bool(new)
 
     def refuse(self, name: str) -> bool:
         """Let a mode take explicit steps after its implicit ones have failed; return whether it took implicit ones."""
@@ -242,7 +282,8 @@ class Choice:
         """Record the implicit steps that a solve at the k-th theta took in the modes that were found there; refuse
         those whose rows take longer than explicit ones, and return whether there is one.
         """
-        # Only where a mode was found stiff are both kinds of steps known, at one theta: there they are compared.
+        # Only where a mode was found stiff are both kinds of steps known, at one theta: there they are compared by
+        # work.
         found = {name: most for name, (at, most) in self._most.items() if at == k and name in watch.modes}
         for name in found:
             self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)

@@ -114,10 +114,14 @@ def fit_locally(
         if _is_within_error(problem, result, abs(fine_cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-        if attempt == REFINEMENTS or result.status in STOPPED or not excess > 1:
+        if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
+            break
+        failed = not result.status.successful or excess > 2**ORDER
+        stable = evaluator.stabilize(first, theta) if failed else None
+        if stable is None and (result.status in STOPPED or not excess > 1):
             break
         try:
-            finer = refine_meshes(evaluator, first, theta, excess, first=first_meshes)
+            finer = stable or refine_meshes(evaluator, first, theta, excess, first=first_meshes)
         except NotIntegrableError:  # what was found stays, with its integration error
             break
     result = _drop_noise_of_times(problem, result)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh, Stiffness
-from switchfit.engine.adaptive import refine_mesh_of_run
+from switchfit.engine.adaptive import refine_if_unstable, refine_mesh_of_run
 from switchfit.engine.choice import SplitEngine, engine_of, summarize
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.protocol import Engine, Evaluation, Matrix, Run, Simulation, runs_of
@@ -97,6 +97,17 @@ class Evaluator:
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
         meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
         return Evaluator(self.problem, meshes=meshes)
+
+    def stabilize(self, *thetas: FloatArray) -> Evaluator | None:
+        """Return the same problem with implicit steps where explicit ones are unstable near the last of some thetas;
+        None if all are stable.
+
+        A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
+        """
+        found = [refine_if_unstable(run, mesh, *thetas) for run, mesh in zip(self.runs, self.meshes, strict=True)]
+        if not any(found):
+            return None
+        return Evaluator(self.problem, meshes=[new or mesh for new, mesh in zip(found, self.meshes, strict=True)])
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
