@@ -24,6 +24,7 @@ from switchfit.problem.data import Input, Measurements, ReferenceSignal, Running
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.cache import use_compilation_cache
 
@@ -142,12 +143,14 @@ def padded_mesh(times: np.ndarray, cells: int = CELLS) -> Mesh:
     return Mesh(np.concatenate([times, np.full(cells + 1 - len(times), times[-1])]), len(times) - 1)
 
 
-def weighted(arguments: Arguments, kind: str, equal: float = 0.0) -> Arguments:
+def weighted(structure: Structure, arguments: Arguments, kind: str, equal: float = 0.0) -> Arguments:
     """Arguments of `problem_of` that leave one kind of cost, or all; `equal` = 1 makes mode B equal to mode A."""
     on = {name: float(kind in (name, "all")) for name in KINDS}
+    values = {"equal": equal, "w_running": on["running"], "w_terminal": on["terminal"]}
+    names = [name for name, _, read in structure.parameters if not read]
     with use_float64():
         return arguments._replace(
-            fixed=(arguments.fixed[0], *(jnp.asarray(q) for q in (equal, on["running"], on["terminal"]))),
+            fixed=tuple(jnp.asarray(values.get(name, q)) for name, q in zip(names, arguments.fixed, strict=True)),
             weights=tuple(W * on["reference"] for W in arguments.weights),
             samples=tuple(s._replace(weight=s.weight * on["samples"]) for s in arguments.samples),
         )
@@ -197,7 +200,7 @@ class Case:
         times = np.unique(LAYERED) if any(self.structure.implicit) else NODES
         for _ in range(halvings):
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
-        return weighted(build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
+        return weighted(self.structure, build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
 
     def _differentiate(self, method: Any) -> Callable[..., Any]:
         return lambda *at: derivatives(*at, structure=self.structure, method=method)

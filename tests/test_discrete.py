@@ -111,5 +111,5 @@ def test_splitting_a_mode_changes_nothing(split: float) -> None:
 def test_shift_of_time_changes_nothing(name: str) -> None:
     this, shift = case(name), 4.0
     moved = build_arguments(problem_of(name, shift), 0, padded_mesh(NODES + shift))
-    found = this.discrete(weighted(moved, "all"), np.array(INSIDE[name]) + shift, P0)
+    found = this.discrete(weighted(this.structure, moved, "all"), np.array(INSIDE[name]) + shift, P0)
     assert_same(found, this.discrete(this.arguments(), INSIDE[name], P0), 1e-11)

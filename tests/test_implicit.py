@@ -173,7 +173,7 @@ def test_constraints_costates_and_simulations_are_those_of_jax():
     tau, p = native.problem.vectors(theta, 0)
     one, other = (each.engines[0].costates(tau, p, np.array([0.7])) for each in (native, by_jax))
     assert_close(one.costates, other.costates, 1e-11)
-    one, other = (each.simulate(theta, tangents=True)[0] for each in (native, by_jax))
+    one, other = (each.engines[0].simulate(tau, p, tangents=True) for each in (native, by_jax))
     for name in ("nodes", "first_cell", "start", "end"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     for name in ("before", "after", "y_before", "y_after"):
