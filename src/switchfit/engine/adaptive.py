@@ -72,8 +72,8 @@ STEPS_OF_BRANCH = 16
 """The same in a mode with corners: steps behind the end of a branch are lost."""
 
 
-IMPLICIT_ROW, IMPLICIT_ROW_BY_JAX = 4.0, 10.0
-"""Time of an implicit row, in explicit ones: 2 to 5 for small models in machine code."""
+ROWS_BY_JAX = {True: 20_000, False: 200_000}
+"""Work of an explicit and of an implicit row in JAX, in additions of machine code: 5 and 50 us, for 2 to 4 states."""
 
 
 @dataclass(frozen=True)
@@ -270,8 +270,7 @@ class _Solve:
             name = structure.mode_names[mode]
             is_explicit = not structure.implicit[mode] and name not in self._settings.implicit
             if watch is not None:
-                by_jax = self._native is None or self._problem.engine == "jax"
-                watch.enter(name, 1.0 if is_explicit else IMPLICIT_ROW_BY_JAX if by_jax else IMPLICIT_ROW)
+                watch.enter(name, self._find_row_work(name, is_explicit))
             if self._course is not None:
                 self._course.enter(mode, ends[i], x, 0.5 * (stops[0] + stops[1]))
             for start, end in pairwise(stops.tolist()):
@@ -310,6 +309,15 @@ class _Solve:
             what = "the map of a Jump" if i in structure.jumps else f"reset map {names}"
             raise _report_infinite(f"{what} at t = {t:.6g}{self._unit}, x = {x.tolist()}", after)
         return after
+
+    def _find_row_work(self, name: str, is_explicit: bool) -> float:
+        """Return the work of a row of a mode on the engine that will evaluate it."""
+        native = self._native
+        if native is not None and self._problem.engine != "jax" and name in native.structure.mode_names:
+            place = native.structure.mode_names.index(name)
+            if native.structure.implicit[place] is not is_explicit:
+                return native.row_work[place]
+        return ROWS_BY_JAX[is_explicit]
 
     def _follow(self, stretch: _Stretch) -> tuple[list[FloatArray], FloatArray]:
         """Return the accepted times after the start of a stretch, from branch to branch, and the state at its end."""

@@ -9,7 +9,9 @@ mesh is unstable.
 A `Watch` counts the steps of each mode in a solve. For a mode with many explicit steps, the eigenvalues are computed at
 every `STEPS_BETWEEN` of them. If stability limits more than a quarter of the steps, the mode is solved by the implicit
 method too, which it keeps if its rows take less time; a `Choice` holds what was found. The other modes take explicit
-steps all the same.
+steps all the same. The time of a row is its *work*, in additions: the operations of its machine code are counted, so
+that the choice is the same in each process. The implicit rows of small models have three to five times the work of
+explicit ones, and take 0.65 to 0.9 times as long as their work says.
 """
 
 from __future__ import annotations
@@ -70,7 +72,7 @@ class _Look(NamedTuple):
 @dataclass
 class _ModeSteps:
     """Accepted steps in one mode, so far and at the last look, the projected total of a solve that was given up, the
-    rows of a mesh with these steps, and the time of a row, in explicit ones.
+    rows of a mesh with these steps, and the time of a row: its work, in additions.
     """
 
     of_row: float = 1.0
@@ -113,7 +115,7 @@ class Watch:
     Parameters
     ----------
     most : mapping of str to float
-        Time in a mode, in explicit rows, after which `add` raises `TooManyStepsError`.
+        Time in a mode, in additions, after which `add` raises `TooManyStepsError`.
     refused : container of str
         Modes that take explicit steps although they are stiff.
 
@@ -129,7 +131,7 @@ class Watch:
         self.most, self.refused, self.current = most, refused, ""
 
     def enter(self, name: str, of_row: float = 1.0) -> None:
-        """Begin the solve of a mode whose rows take as long as so many explicit ones."""
+        """Begin the solve of a mode whose rows have this work, in additions, in an evaluation of (J, g, H)."""
         self.current = name
         self.modes.setdefault(name, _ModeSteps()).of_row = of_row
 

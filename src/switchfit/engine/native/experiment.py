@@ -132,7 +132,7 @@ class NativeExperiment:
         times: FloatArray,
         order: Order,
     ) -> None:
-        self.sizes, self.order, self.times = sizes, order, times
+        self.sizes, self.order, self.times, self.row_work = sizes, order, times, program.row_work
         self._program, self._prefix = program, PREFIX[order]
         N, cells = sizes.N, len(times) - 1
         self._inner_nodes, self._cells = times[1:-1], cells

@@ -37,7 +37,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.scalars import FROM_LIBM, OPERATIONS, Node, Operation, list_needed
+from switchfit.engine.native.scalars import FROM_LIBM, LONG, OPERATIONS, Node, Operation, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 Found = TypeVar("Found")
@@ -390,6 +390,10 @@ NEEDED_NEXT = "scipy.linalg.lapack", "scipy.special"
 """What a fit and its report will import, which takes a few tenths of a second."""
 
 
+EFFORT = dict.fromkeys(LONG, 20) | {"div": 4, "sqrt": 4, "lookup": 3}
+"""Cost of operations, in additions, where it is not 1."""
+
+
 class Module:
     """Text of LLVM functions, collected one by one and taken in parts.
 
@@ -402,8 +406,10 @@ class Module:
 
     Attributes
     ----------
-    pointers : dict
-        The pointers that each straight-line function takes.
+    work, pointers : dict
+        Cost of each straight-line function, in additions, and the pointers that it takes.
+    row_work : list of int
+        Cost of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
     """
 
     def __init__(self, width: int, prefix: str = "") -> None:
@@ -412,6 +418,8 @@ class Module:
         self._functions: list[str] = []
         self._declared: dict[str, str] = {}
         self._written: dict[str, str] = {}
+        self.work: dict[str, int] = {}
+        self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
 
     def write_straight_line(
@@ -423,8 +431,10 @@ class Module:
         are the `pointers`; by default those that it uses.
         """
         writer = _Writer(self)
-        for node in list_needed([node for _, _, node in stores]):
+        nodes = list_needed([node for _, _, node in stores])
+        for node in nodes:
             writer.value(node)
+        self.work[name] = sum(_estimate_cost(node) * (1 + self.width // 4 if node.vector else 1) for node in nodes)
         for pointer, offset, node in stores:
             if node.truth:
                 raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
@@ -453,6 +463,14 @@ class Module:
         # A later module needs the declarations of those that it calls in earlier ones.
         self._written |= {name: f"declare {header}" for header, name in _HEADER.findall(written)}
         return "\n".join([*declared.values(), *called.values(), written])
+
+
+def _estimate_cost(node: Node) -> int:
+    """Return the cost of a node, in additions, so that rows of 7 to 10 states have about the work of their time."""
+    if node.op == "factors":
+        m = int(node.args[0]) * len(node.args[1])
+        return m**3 // 3 + 10 * m**2 if len(node.args) > 3 else 1
+    return 2 * len(node.args) ** 2 if node.op == "solution" else EFFORT.get(node.op, 1)
 
 
 _CALLED = re.compile(r"call \w+ @([\w.]+)\(")
@@ -575,6 +593,8 @@ class Program:
     lock : held during a call, since ctypes releases the GIL
     memory : array of doubles
         Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.
+    row_work : list of int
+        That of the module with the highest derivatives.
     pointers : dict
         Names of the pointers that each straight-line function takes.
     """
@@ -582,6 +602,7 @@ class Program:
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
         self.lock, self.memory = threading.Lock(), np.zeros(0)
+        self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
         self._functions: dict[str, Any] = {}
 

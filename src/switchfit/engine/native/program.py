@@ -30,6 +30,7 @@ from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variab
 from switchfit.engine.native.segments import (
     constraint_pointers,
     count_rows,
+    estimate_row,
     solve_stages,
     state_pointers,
     write_backward,
@@ -256,6 +257,7 @@ def _program_of(
         reason = f"internal: {type(error).__name__}: {error}"
         log.info("%s: %s.", otherwise, reason, exc_info=True)
     else:
+        program.row_work = modules[-1].row_work
         program.pointers = {f"{each.prefix}{name}": given for each in modules for name, given in each.pointers.items()}
         return program
     return reason
@@ -276,6 +278,8 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     curvatures = []
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
+        if order > Order.COST:
+            module.row_work.append(estimate_row(writer, mode, curvatures[mode]["inner"]))
         yield module.take()
     kernels.nodes()
     for k in range(len(library.measurements)):

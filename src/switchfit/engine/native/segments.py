@@ -100,6 +100,9 @@ def state_pointers(writer: Writer, found: Pointers, index: Operand) -> Pointers:
 NEWTON_ITERATIONS = 15
 """Largest number of Newton's iterations; where it converges at all, the sharpest models take 10."""
 
+USUAL_ITERATIONS = 5
+"""Iterations that count for the work of a row."""
+
 
 def write_newton(writer: Writer, name: str) -> str:
     """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
@@ -122,6 +125,13 @@ def write_newton(writer: Writer, name: str) -> str:
 def solve_stages(writer: Writer, name: str, given: Pointers) -> None:
     """Emit the call that computes the increments of an implicit row by the iterations of `write_newton`."""
     writer.invoke(f"solve_{name}", *(given[key] for key in (*writer.module.pointers[name], "J")))
+
+
+def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
+    """Return the work of a row of a mode in an evaluation with second derivatives, in additions."""
+    names = [f"forward_inner_{mode}", f"backward_inner_{mode}", *(curvature.name for _ in curvature.stages)]
+    newton = USUAL_ITERATIONS * writer.module.work[f"newton_{mode}"] if writer.library.implicit[mode] else 0
+    return newton + sum(writer.module.work[name] for name in names)
 
 
 def add_curvature(writer: Writer, curvature: Curvature, given: Pointers, moving: bool) -> None:
