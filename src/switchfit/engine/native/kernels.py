@@ -45,7 +45,9 @@ from switchfit.discretization.rows import (
     EXPLICIT_ERROR,
     STIFF,
     STIFF_BEND,
+    Stages,
     Tableau,
+    Tangent,
     combine,
     cost_of_row,
     invert_stages,
@@ -235,7 +237,7 @@ class Kernels:
                 # D_2 f t_j' + D_p f p', the part of K_j' that does not depend on X_j'.
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
             of_x = [J[1] for J in jacobians]
-            tangent: Callable[..., explicit_rows.Tangent] = explicit_rows.tangent
+            tangent: Callable[..., Tangent] = explicit_rows.tangent
             if k:
                 # That the backward step reads them takes 12 to 15 % off (J, g, H) where 8 states depend on each other,
                 # 5 % where 4 do. With fewer, or a sparse Jacobian, to compute them again would take as long.
@@ -258,13 +260,7 @@ class Kernels:
         return factors
 
     def _add_to_row(
-        self,
-        graph: Graph,
-        stage: Template,
-        tableau: Tableau,
-        found: explicit_rows.Stages,
-        along: explicit_rows.Tangent,
-        costs: bool,
+        self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
     ) -> list[Store]:
         """Return what else a step with derivatives stores: nothing, if a backward one follows it."""
         return []
