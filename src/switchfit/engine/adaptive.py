@@ -280,7 +280,8 @@ class _Solve:
                     accepted, x = self._follow(_Stretch(mode, start, end, x, is_explicit))
                     steps += accepted
                     if watch is not None:
-                        watch.add_rows(_count_rows(np.concatenate([[start], *accepted]), self._coarse.times))
+                        ends_of_steps = np.concatenate([[start], *accepted])
+                        watch.modes[name].rows += _count_rows(ends_of_steps, self._coarse.times)
         return np.concatenate(steps)
 
     def _find_initial_state(self) -> FloatArray:

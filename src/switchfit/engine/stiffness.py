@@ -212,10 +212,6 @@ class Watch:
         rates = _measure_rates(last)
         return all(rate * look.step > LIMITED for rate, look in zip(rates, last, strict=True))
 
-    def add_rows(self, rows: int) -> None:
-        """Count rows of a mesh in the current mode."""
-        self.modes[self.current].rows += rows
-
     def give_up(self, steps: float) -> None:
         """Record the steps that the current mode, whose solve was given up, would have taken at its pace."""
         self.modes[self.current].projected = steps

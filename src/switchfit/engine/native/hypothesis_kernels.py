@@ -19,8 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from switchfit.discretization import implicit_rows
-from switchfit.discretization import rows as explicit_rows
-from switchfit.discretization.rows import EXPLICIT_ERROR, Tableau, combine, times_vector
+from switchfit.discretization.rows import EXPLICIT_ERROR, Stages, Tableau, Tangent, combine, times_vector
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels, Store, as_vector, list_entries, store_all
 from switchfit.engine.native.scalars import Graph, Namespace, Node, Objects, Template
@@ -46,13 +45,7 @@ class HypothesisKernels(Kernels):
         return self._chosen
 
     def _add_to_row(
-        self,
-        graph: Graph,
-        stage: Template,
-        tableau: Tableau,
-        found: explicit_rows.Stages,
-        along: explicit_rows.Tangent,
-        costs: bool,
+        self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
     ) -> list[Store]:
         """Return stores of the largest error so far, and of what the running costs add to g and H."""
         at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)

@@ -45,7 +45,9 @@ from switchfit.discretization.rows import (
     EXPLICIT_ERROR,
     STIFF,
     STIFF_BEND,
+    Stages,
     Tableau,
+    Tangent,
     combine,
     cost_of_row,
     invert_stages,
@@ -261,13 +263,7 @@ class Kernels:
         return factors
 
     def _add_to_row(
-        self,
-        graph: Graph,
-        stage: Template,
-        tableau: Tableau,
-        found: explicit_rows.Stages,
-        along: explicit_rows.Tangent,
-        costs: bool,
+        self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
     ) -> list[Store]:
         """Return what else a step with derivatives stores: nothing, if a backward one follows it."""
         return []

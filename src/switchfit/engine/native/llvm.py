@@ -37,7 +37,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.scalars import FROM_LIBM, OPERATIONS, Node, Operation, list_needed
+from switchfit.engine.native.scalars import FROM_LIBM, LONG, OPERATIONS, Node, Operation, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 Found = TypeVar("Found")
@@ -393,6 +393,10 @@ LOOKUP = 3
 """Cost of a table lookup, in additions."""
 
 
+EFFORT = dict.fromkeys(LONG, 20) | {"div": 4, "sqrt": 4, "lookup": 3}
+"""Cost of operations, in additions, where it is not 1."""
+
+
 class Module:
     """Text of LLVM functions, collected one by one and taken in parts.
 
@@ -597,6 +601,8 @@ class Program:
     lock : held during a call, since ctypes releases the GIL
     memory : array of doubles
         Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.
+    row_work : list of int
+        That of the module with the highest derivatives.
     pointers : dict
         Names of the pointers that each straight-line function takes.
     """
