@@ -343,7 +343,8 @@ def test_docstrings_name_only_what_is_there(name):
     lines = re.findall(r"^(\w+(?:, \w+)*)(?: :|$)", "\n".join(sections), re.MULTILINE)
     documented = {each for line in lines for each in line.split(", ")}
     assert documented
-    assert documented <= {*inspect.signature(thing).parameters, *dir(thing)}
+    set_by_itself = re.findall(r"self\.(\w+)", inspect.getsource(thing))
+    assert documented <= {*inspect.signature(thing).parameters, *dir(thing), *set_by_itself}
 
 
 def test_a_problem_that_is_no_longer_used_is_freed(compiled):
