@@ -22,6 +22,7 @@ from switchfit.modes.hunt import Hunt, Improver, Sequences, compute_criterion
 from switchfit.modes.result import Certifier, ModeEnding, ModeFit, ModeStatus, ModeWarning
 from switchfit.modes.schedule import Schedule, list_insertions, list_removals, list_substitutions, merge_neighbours
 from switchfit.problem.data import FloatArray
+from switchfit.problem.validation import as_number
 from switchfit.strategy.beam import list_sample_times
 from switchfit.strategy.library import Library
 
@@ -197,7 +198,7 @@ class Judge:
         if not callable(self.chooser):
             return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
         fits = [fit for fit in self.pool.by_switches.values() if fit.has_unknowns]
-        pairs = [(fit, float(self.chooser(self.certifier.estimate(fit)))) for fit in fits]
+        pairs = [(fit, as_number(self.chooser(self.certifier.estimate(fit)), "criterion(estimate)")) for fit in fits]
         return sorted((pair for pair in pairs if np.isfinite(pair[1])), key=lambda pair: pair[1])
 
     def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:

@@ -84,7 +84,7 @@ def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[st
             "successions must be a dict of mode -> the modes that may follow it, such as "
             f"{{'flight': ('slide',), 'slide': ('stick',)}}; got {shorten(given)}."
         )
-    _require_known([str(name) for name in given], "successions", names)
+    _require_known(list(given), "successions", names)
     found: dict[str, tuple[str, ...]] = dict.fromkeys(names, ())
     for name, after in given.items():
         what = f"successions of {shorten(name)}"
@@ -101,7 +101,7 @@ def _check_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> di
         return {name: get_min_duration(problem.min_duration, name) for name in names}
     if not isinstance(given, Mapping):
         return dict.fromkeys(names, _as_duration(given, "min_duration"))
-    _require_known([str(name) for name in given], "min_duration", names)
+    _require_known(list(given), "min_duration", names)
     own = {name: _as_duration(value, f"min_duration of {shorten(name)}") for name, value in given.items()}
     return {name: own.get(name, get_min_duration(problem.min_duration, name)) for name in names}
 
