@@ -562,6 +562,35 @@ def test_a_cost_without_any_curvature(hessian):
     assert corner.status.successful
 
 
+def test_a_step_back_to_the_point_itself_is_no_progress():
+    """Past the iterations after which a failed step may be followed by another one, at the limit of precision."""
+
+    def noisy(theta):
+        J, g, H = rosenbrock(theta)
+        error = np.random.default_rng(np.frombuffer(theta.tobytes(), np.uint8)).normal(size=2)
+        return 1e4 + J, np.asarray(g) + 1e-9 * error, H
+
+    result = minimize(smooth(noisy), [-1.2, 1.0], constraints=free(2), hessian="auto", tolerance=1e-12)
+    assert result.status is Status.CONVERGED_PRECISION, result.status
+    assert 15 < result.iterations < 60
+
+
+def test_in_a_narrow_curved_valley_a_step_that_failed_is_followed_by_one_back_to_its_floor():
+    """(1 - x)² + 1e4 (y - x²)²: 84 iterations where the trust region shrinks instead."""
+
+    def valley(theta):
+        x, y = theta
+        J, g, H = rosenbrock(theta)
+        more = 9900.0 * (y - x**2)
+        steep = np.array([[-4.0 * more + 79200.0 * x**2, -39600.0 * x], [-39600.0 * x, 19800.0]])
+        return J + more * (y - x**2), g + np.array([-4.0 * x * more, 2.0 * more]), H + steep
+
+    result = minimize(smooth(valley), [-1.2, 1.0], constraints=free(2), hessian="auto")
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(result.theta, 1.0, atol=1e-6)
+    assert result.iterations < 40
+
+
 def test_iterations_the_callback_and_ctrl_c_end_it():
     """With the lowest point so far, also where Ctrl-C comes during an evaluation."""
     calls, seen = [], []

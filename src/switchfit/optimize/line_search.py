@@ -18,6 +18,8 @@ References
    SIAM J. Optim. 16 (2005) 170-192 (line searches below the rounding error of the cost).
 .. [3] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
 .. [4] J. J. More, S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011) 1292-1314.
+.. [5] R. M. Chamberlain, M. J. D. Powell, C. Lemarechal, H. C. Pedersen, The watchdog technique for forcing convergence
+   in algorithms for constrained optimization, Math. Program. Study 16 (1982) 1-17.
 """
 
 from __future__ import annotations
@@ -57,6 +59,8 @@ from switchfit.optimize.threads import one_thread
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
 MAX_HALVINGS = 200
+#: Iterations after which a step that fails in a trust region is followed by one more before the region shrinks.
+PATIENCE = 15
 
 
 def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -96,6 +100,9 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
             accepted = _attempt_merit(oracle, state, direction, fraction, k == 0)
         else:
             accepted = _attempt_in_box(oracle, state, direction, fraction)
+            # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
+            if accepted is None and k == 0 and state.iteration >= PATIENCE:
+                accepted = _step_back(oracle, state, direction)
         if accepted is not None:
             part = measure_in_box(problem, direction.step) / measure_in_box(problem, whole) if k else 1.0
             return accepted._replace(step_length=part)
@@ -114,6 +121,22 @@ def _attempt_in_box(oracle: Oracle, state: State, direction: Direction, fraction
         return None
     decrease, noise = state.point.cost - accepted.point.cost, NOISE * abs(state.point.cost)
     return accepted._replace(radius=next_radius(oracle.problem, direction, decrease, direction.reduction, noise))
+
+
+def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Take one more step from where a step has failed: in a curved valley it leads back to the valley's floor ([5]_).
+
+    The point of the failed step is evaluated once more, for the line search keeps none that it refuses.
+    """
+    problem, point = oracle.problem, state.point
+    trial = oracle.point(move(problem, point.theta, direction.step, state.scale), state.scale)
+    if trial is None:
+        return None
+    radius = min(direction.radius, measure_in_box(problem, direction.step))
+    second = find_direction(problem, state._replace(point=trial, radius=radius))
+    back = move(problem, trial.theta, second.step, state.scale)
+    end = _judge(oracle, state, back, -direction.slope, ARMIJO_ACROSS)  # None where it leads back to the point itself
+    return None if end is None else Accepted(end, 1.0, direction.radius)
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
