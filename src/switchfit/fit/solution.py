@@ -75,7 +75,7 @@ def _list_idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[n
         sequence, where = experiment.mode_sequence, problem.unknowns.times[e]
         for first, last in _list_coincident(problem, theta, e):
             passed = [*zip(sequence[first : last + 1], sequence[first + 1 : last + 2], strict=True)]
-            smooth = all(system.reset_map(*pair) is None and system.guard(*pair) is None for pair in passed)
+            smooth = not any(pair in system.reset_maps or pair in system.guards for pair in passed)
             smooth = smooth and not np.any((experiment.passed_by_jumps > first) & (experiment.passed_by_jumps <= last))
             if smooth and sequence[first] == sequence[last + 1] and np.all(where[first : last + 1] >= 0):
                 yield where[first : last + 1]

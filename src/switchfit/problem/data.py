@@ -177,22 +177,6 @@ class TransitionCost:
             if getattr(self, name) is not None:
                 as_name(getattr(self, name), name, "the name of a mode")
 
-    def counts_between(self, before: str, after: str) -> bool:
-        """Return whether this cost counts at a transition from a mode to another.
-
-        See Also
-        --------
-        TransitionCost
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> cost = sf.TransitionCost(lambda t, x, p: x[0], before="push")
-        >>> cost.counts_between("push", "brake"), cost.counts_between("brake", "push")
-        (True, False)
-        """
-        return self.before in (None, before) and self.after in (None, after)
-
 
 @dataclass(frozen=True, eq=False)
 class TerminalConstraint:

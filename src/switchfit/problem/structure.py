@@ -397,7 +397,7 @@ def _choose_transition_costs(items: list[TransitionCost], modes: tuple[str, ...]
     """Return the cost of each transition that may happen and has one."""
     found = {}
     for before, after in product(modes, modes):
-        here = [item.mu for item in items if item.counts_between(before, after)]
+        here = [item.mu for item in items if item.before in (None, before) and item.after in (None, after)]
         if len(here) > 1:
             raise ValueError(
                 f"{len(here)} TransitionCosts count at a transition from {before!r} to {after!r}, where one may: give "

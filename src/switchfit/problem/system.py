@@ -130,41 +130,6 @@ class HybridSystem:
                     f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shorten(labels)}."
                 )
 
-    def reset_map(self, before: str, after: str) -> ResetMap | None:
-        """Return the map applied at a transition from mode `before` to mode `after`; None if x is continuous.
-
-        See Also
-        --------
-        HybridSystem.guard
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> def bounce(t, x, p):
-        ...     return -p["restitution"] * x
-
-        >>> system = sf.HybridSystem({"fly": lambda t, x, p: -9.81 + 0 * x}, [1.0], {("fly", "fly"): bounce})
-        >>> system.reset_map("fly", "fly") is bounce
-        True
-        """
-        return self.reset_maps.get((before, after))
-
-    def guard(self, before: str, after: str) -> Guard | None:
-        """Return the function that is zero at a transition from mode `before` to mode `after`; None without a guard.
-
-        See Also
-        --------
-        HybridSystem.reset_map
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> system = sf.HybridSystem({"fall": lambda t, x, p: -x, "rest": lambda t, x, p: 0 * x}, [1.0])
-        >>> system.guard("fall", "rest") is None
-        True
-        """
-        return self.guards.get((before, after))
-
 
 def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
     """Return `value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` if it contains any.
