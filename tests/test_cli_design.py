@@ -128,8 +128,6 @@ def test_json_and_what_cannot_be_estimated(folder):
         ('criterion = "A"', 'criterion = "T"', "design.criterion"),
         ("power = [0.0, 1.5]", "moon = [0.0, 1.5]", "free must name inputs of the run: power, sun; got 'moon'"),
         ("k = 0.1", "c = 0.1", "names has 'c', which is no unknown of the problem: k, b"),
-        ("budget = 2.0", "budget = -2.0", "design.budget"),
-        ("budget = 2.0", "cost = 2.0", "cost"),
     ],
 )
 def test_mistakes_in_the_file(folder, old, new, message):

@@ -405,7 +405,7 @@ def test_vectors(write_mat):
 
 def test_structs(write_mat):
     drive = {"Time": TIMES, "Data": X, "signals": {"values": 2 * X}}
-    path = write_mat(drive=drive, still={"t": np.arange(3.0), "x": np.arange(3.0)}, note="calibrated")
+    path = write_mat(drive=drive, still={"t": TIMES, "x": X}, note="calibrated")
     with pytest.raises(InputError, match=r"several structs with times \(drive, still\).*Name one: topic"):
         sf.read_log(path)
     log = sf.read_log(path, topic="drive")
