@@ -411,6 +411,8 @@ def test_the_file_of_unknowns_is_the_table_to_the_last_digit(estimate):
         assert [row[name] for row in rows] == cells
     free = table["held"] == ""
     np.testing.assert_array_equal(table.loc[free, ["low", "high"]], correct_intervals(estimate)[free])
+    np.testing.assert_array_equal(table.loc[free, "std_error"], estimate.corrected_standard_errors[free])
+    np.testing.assert_array_equal(table.loc[free, "naive_std_error"], estimate.standard_errors[free])
     assert dict(zip(table["unknown"], table["held"], strict=True))["power_4"] == "at upper bound"
 
 

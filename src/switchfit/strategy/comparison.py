@@ -188,7 +188,7 @@ class ModelComparison(Displayed):
         Parameters
         ----------
         ax : matplotlib.axes.Axes, optional
-            Axes for the differences alone, which are returned; without them, a Figure of all is made and returned.
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
 
         See Also
         --------
@@ -200,8 +200,8 @@ class ModelComparison(Displayed):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> len(sf.compare([fit, fit], names=("one", "same")).plot().axes)
-        2
+        >>> sf.compare([fit, fit], names=("one", "same")).plot().axes[0].get_xlabel()
+        'difference from the smallest'
         """
         return draw_figure(self, ax=ax)
 
