@@ -67,7 +67,8 @@ def test_there_are_examples_and_references_and_what_is_described_is_there(name):
         assert set(inspect.signature(item).parameters) <= described
     elif name in sf.__all__ and not issubclass(type(item), EnumType):
         assert described
-        assert described <= {*inspect.signature(item).parameters, *dir(item)}
+        set_by_itself = re.findall(r"self\.(\w+)", inspect.getsource(item))
+        assert described <= {*inspect.signature(item).parameters, *dir(item), *set_by_itself}
 
 
 @pytest.mark.parametrize("name", [name for name, item in PUBLIC.items() if section(item, "Examples")])
