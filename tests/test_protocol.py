@@ -184,12 +184,12 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
         native = Evaluator(room, meshes=own.meshes)
         theta = room.initial_theta
         found, cost = evaluate(native), native.cost(theta)
-        simulation = native.simulate(theta, tangents=True)[0]
+        simulation = native.engines[0].simulate(*native.problem.vectors(theta, 0), tangents=True)
         compiled.append(programs() - before)
         for other in others:
             assert_same(found, evaluate(other))
             assert cost == pytest.approx(found.cost, rel=1e-12)
-            its = other.simulate(theta, tangents=True)[0]
+            its = other.engines[0].simulate(*other.problem.vectors(theta, 0), tangents=True)
             np.testing.assert_allclose(simulation.after, its.after, rtol=1e-11, atol=1e-12)
             slopes = slopes_of(native, simulation), slopes_of(other, its)
             np.testing.assert_allclose(*slopes, rtol=1e-10, atol=1e-11)

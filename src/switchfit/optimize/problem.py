@@ -89,9 +89,14 @@ class Problem:
     accuracy: Callable[[], float] | None
 
     @cached_property
+    def row_size(self) -> FloatArray:
+        """Size of the terms of each row of the constraints, to which rounding errors are relative: (m,)."""
+        return np.asarray(self.constraints.sizes[0] @ self.size)
+
+    @cached_property
     def row_rounding(self) -> FloatArray:
         """Rounding error of the rows: (m,)."""
-        return np.asarray(16 * EPS * (self.constraints.sizes[0] @ self.size))
+        return np.asarray(16 * EPS * self.row_size)
 
     @cached_property
     def largest_size(self) -> float:
@@ -266,18 +271,18 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
         return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True
-    return Trial.at(problem, _snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
+    return Trial.at(problem, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
 
 
-def _snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray) -> FloatArray:
-    """Return theta (d,) with the slack of rows removed that is rounding beside the size of what they join.
+def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: float = 16 * EPS) -> FloatArray:
+    """Return theta (d,) with the slack of rows removed that is at most `reach` of the size of what they join.
 
     Only of rows that can hold exactly: that bound one coordinate, ``+-theta_i >= b``, or keep two in order,
     ``theta_i - theta_j >= 0``. Coordinates that are pinned (d,) stay where they are.
     """
     constraints = problem.constraints
     slack = constraints.A @ theta - constraints.b
-    close = np.abs(slack) <= problem.row_rounding
+    close = np.abs(slack) <= reach * problem.row_size
     if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()
