@@ -282,8 +282,8 @@ def with_a_mode_too_many(sequence, times):
 
 
 def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
-    # In a trust region the fit ends at a lower cost, where the mode has a duration.
-    problem = with_a_mode_too_many(("charge", "discharge", "drain", "discharge"), (0.6, 1.3, 1.5))
+    # From other guesses the fit ends at a lower cost, where the mode has a duration.
+    problem = with_a_mode_too_many(("charge", "discharge", "drain", "discharge"), (0.6, 1.4, 1.5))
     found = sf.estimate(problem, hessian="exact")
     plain = sf.estimate(capacitor(voltage(TIMES) + noise(1), tau=0.6))
     assert found.status is sf.Status.COLLAPSED
