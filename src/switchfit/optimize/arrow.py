@@ -23,7 +23,14 @@ from functools import cached_property
 
 import numpy as np
 
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR, BoolArray, FloatArray, IntArray, unit_rows
+from switchfit.optimize.algebra import (
+    EIGENVALUE_FLOOR,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    positive_eigenvalues,
+    unit_rows,
+)
 from switchfit.optimize.matrix import (
     STIFFENINGS,
     Curvature,
@@ -31,7 +38,6 @@ from switchfit.optimize.matrix import (
     Spectrum,
     SymmetricMatrix,
     diagonal_scaling,
-    make_absolute,
 )
 from switchfit.optimize.qp import CholeskyFactor, Room, newton_step, solve_programme
 
@@ -323,7 +329,7 @@ class ArrowFactor:
 
 def _replace_eigenvalues(scaled: Arrow) -> Arrow:
     """Return the matrix with eigenvalues of its blocks, and of the Schur complement, that are not positive replaced."""
-    blocks = make_absolute(scaled.blocks)
+    blocks = _convex_blocks(scaled)
     tie = np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(blocks, scaled.borders))
     # B has the borders of H: its Schur complement C - sum_e G_e' B_e^-1 G_e is convex with the tie added to the corner.
     complement = scaled.corner - tie
@@ -332,6 +338,21 @@ def _replace_eigenvalues(scaled: Arrow) -> Arrow:
         symmetric = Dense(0.5 * (complement + complement.T))
         corner = symmetric.convexify(np.zeros((0, len(tie))))[0].array + tie
     return Arrow(scaled.layout, blocks, scaled.borders, 0.5 * (corner + corner.T))
+
+
+def _convex_blocks(scaled: Arrow) -> FloatArray:
+    """Return positive definite blocks: (R, k, k)."""
+    values, vectors = np.linalg.eigh(scaled.blocks)
+    # An eigenvalue that is replaced is made large enough for the shared unknowns not to lose their own curvature to it.
+    # (v' G)^2 / lam is what an eigenvalue lam takes from the diagonal of the Schur complement, which is 1 at most after
+    # scaling: with lam >= 2 sum_s (v' G_s)^2 one eigenvalue takes half of it at most.
+    coupling = (np.swapaxes(vectors, 1, 2) @ scaled.borders) ** 2
+    positive = positive_eigenvalues(values)
+    changed = np.where(values > EIGENVALUE_FLOOR, values, np.maximum(positive, 2.0 * coupling.sum(2)))
+    convex = (vectors * changed[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    # Blocks that are positive definite stay as they are, to the last bit.
+    indefinite = values[:, 0] <= EIGENVALUE_FLOOR
+    return np.where(indefinite[:, None, None], 0.5 * (convex + np.swapaxes(convex, 1, 2)), scaled.blocks)
 
 
 def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatArray | None]:
