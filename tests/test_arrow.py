@@ -131,6 +131,16 @@ def test_what_is_made_positive_definite(seed):
     assert np.linalg.cond(convex / np.outer(scale, scale)) < 1e7
 
 
+def test_an_indefinite_block_leaves_the_shared_unknowns_their_curvature():
+    """In place of -1e-4 its eigenvalue is made 1e-2, not 1e-4: the curvature of the shared unknown becomes 49, not 5000."""
+    full = np.eye(11)
+    full[0, 0], full[0, 9], full[9, 0] = -1e-4, 0.5, 0.5
+    convex = arrow_of(full).convexify(NONE, NO_FLOOR)[0].dense()
+    assert convex[0, 0] > 5e-3
+    assert convex[9, 9] < 100.0
+    assert np.linalg.eigvalsh(convex)[0] > 0.0
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_curvature_on_the_face_of_active_constraints_is_kept(seed):
     """H is indefinite only across the active constraints: Newton's step along them must not be spoiled."""
