@@ -132,7 +132,7 @@ def test_what_is_made_positive_definite(seed):
 
 
 def test_an_indefinite_block_leaves_the_shared_unknowns_their_curvature():
-    """In place of -1e-4 its eigenvalue is made 1e-2, not 1e-4: the curvature of the shared unknown becomes 49, not 5000."""
+    """In place of -1e-4 its eigenvalue is made 1e-2, not 1e-4: the shared unknown gets a curvature of 49, not 5000."""
     full = np.eye(11)
     full[0, 0], full[0, 9], full[9, 0] = -1e-4, 0.5, 0.5
     convex = arrow_of(full).convexify(NONE, NO_FLOOR)[0].dense()
