@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import decay, fishing, heated_room
@@ -364,3 +365,56 @@ def test_a_fit_that_goes_on_is_no_search(monkeypatch):
     monkeypatch.setattr(Search, "_list_strategies", lambda self: strategies)
     fit = sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=None))
     assert [step.strategy for step in fit.steps] == ["local", choice.MORE, "elsewhere"]
+
+
+def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found():
+    """The fields of a mass on two springs differ by nothing where it passes 0, at 6.8 s: a switch as long before it
+    as the right one is behind leaves noise of the right size, too, and is 16 standard errors off."""
+    times = np.arange(0.0, 16.0, 0.1)
+    springs = {
+        "soft": lambda t, x, p: jnp.stack([x[1], -p["soft"] * x[0] - p["damping"] * x[1]]),
+        "hard": lambda t, x, p: jnp.stack([x[1], -p["hard"] * x[0] - p["damping"] * x[1]]),
+    }
+
+    def build(values, switch, guesses):
+        log = sf.Measurements(times, values, sigma=0.03, observe=lambda t, x, p: x[0])
+        run = sf.Experiment(log, ("hard", "soft"), (switch,), 0.0, 16.0)
+        names = ("hard", "soft", "damping")
+        return sf.Problem(sf.HybridSystem(springs, [1.0, 0.0]), run, dict(zip(names, guesses, strict=True)))
+
+    truth = np.array([7.0, 9.0, 4.0, 0.1])
+    exact = sf.simulate(build(np.zeros(160), truth[0], truth[1:]))
+    values = np.interp(times, exact.times, exact.states[:, 0]) + 0.03 * np.random.default_rng(10).normal(size=160)
+    problem = build(values, 6.66, (9.01, 4.02, 0.105))
+    near = sf.estimate(problem, strategy="local")
+    fit = sf.estimate(problem)
+    assert abs(near.theta[0] - truth[0]) > 10 * near.standard_errors[0]
+    assert near.verdict.level == "good"
+    assert [step.strategy for step in fit.steps] == ["local", choice.OTHER]
+    assert fit.cost < near.cost - 1.0
+    assert abs(fit.theta[0] - truth[0]) < 3 * fit.standard_errors[0]
+    again = sf.estimate(problem, start=fit.theta)
+    assert not again.steps, "of two minima that are known the lower one is left as it is"
+
+
+def test_starts_are_drawn_where_an_unknown_has_no_effect():
+    """At the guess the level does not reach the weir: no derivative, and no hypothesis of the beam, leads there."""
+    times = np.arange(0.0, 60.0, 1.0)
+    flows = {
+        "on": lambda t, x, p: p["inflow"] - p["rate"] * jnp.maximum(x - p["height"], 0.0) - 0.02 * x,
+        "off": lambda t, x, p: -p["rate"] * jnp.maximum(x - p["height"], 0.0) - 0.02 * x,
+    }
+
+    def build(values, switch, guesses):
+        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("on", "off"), (switch,))
+        names = ("inflow", "rate", "height")
+        parameters = {n: sf.Parameter(v, lower=0.0) for n, v in zip(names, guesses, strict=True)}
+        return sf.Problem(sf.HybridSystem(flows, [0.2]), run, parameters)
+
+    truth = (0.1, 0.25, 1.2)
+    exact = sf.simulate(build(np.zeros(60), 31.0, truth))
+    values = np.interp(times, exact.times, exact.states[:, 0]) + 0.01 * np.random.default_rng(1).normal(size=60)
+    fit = sf.estimate(build(values, 31.7, (0.076, 0.622, 3.6)))
+    assert fit.steps[1].cost == fit.steps[0].cost, "the beam"
+    assert fit.verdict.level == "good"
+    np.testing.assert_allclose(fit.theta, (31.0, *truth), rtol=0.05)

@@ -25,7 +25,7 @@ from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
-from switchfit.strategy.hops import can_reinsert, reinsert_modes
+from switchfit.strategy.hops import can_reinsert, choose_hops, reinsert_modes
 from switchfit.strategy.known_order import explain_no_beam, find_times
 from switchfit.strategy.starts import (
     End,
@@ -35,11 +35,13 @@ from switchfit.strategy.starts import (
     is_late,
     is_minimum_time,
     limit_time,
+    make_feasible,
     try_shorter_horizons,
     try_starts,
 )
 from switchfit.uncertainty.answers import NEARLY_ALL, UNLIKELY, compare_with_sigma
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
+from switchfit.uncertainty.verdict import find_without_effect
 
 MORE_STARTS = "next: more starts"
 """Step that a verdict advises where the fit may be better elsewhere."""
@@ -71,7 +73,11 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
             return False
         answer = fit.verdict.answers[-1]
         return not is_doubted(fit) and answer.kind == "fits" and answer.figures.get("known") == 1.0
-    return not is_doubted(fit) or (steps[-1].cost == steps[-2].cost and not steps[-1].ended)
+    if not is_doubted(fit):
+        return True
+    # The beam has no derivative to follow where an unknown has no effect, as the height of a weir that is not reached.
+    is_blind = len(steps) == 2 and any(issue.kind == "without effect" for issue in find_without_effect(fit))
+    return steps[-1].cost == steps[-2].cost and not steps[-1].ended and not is_blind
 
 
 def _is_model_at_fault(fit: Estimate) -> bool:
@@ -143,6 +149,7 @@ logger = logging.getLogger("switchfit")
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
 
+OTHER = "another minimum in a time"
 BEAM, REINSERT, STARTS = "beam along the log", "removal and re-insertion", "many starts"
 """Names of strategies. The re-insertion is for costs without data: of the fishing of the benchmark a fit takes 40 ms
 with it, and 690 ms by many starts."""
@@ -264,9 +271,12 @@ def estimate(
             failure = error
         if best is not None and (strategy == "local" or (strategy == "auto" and hessian != "auto")):
             return best
+        other = None
         if best is not None and strategy == "auto" and _is_settled(problem, best, max_iterations):
-            return best
-        search = Search(problem, best, problem.check_theta(start), strategy, fit, began)
+            other = find_other_minimum(best)
+            if other is None:
+                return best
+        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, other)
         search.run(line, callback, budget)
         if failure is not None and search.best is None:
             raise failure
@@ -276,6 +286,17 @@ def estimate(
 def _is_settled(problem: Problem, best: Estimate, max_iterations: int) -> bool:
     """Return whether the first fit is all that "auto" makes: it is enough, or only a few iterations were asked for."""
     return (best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS) or is_enough(problem, best)
+
+
+def find_other_minimum(fit: Estimate) -> FloatArray | None:
+    """Return a start at another minimum in a transition time that may be lower than the end of a fit to data, if any.
+
+    Not where the state meets corners: each place of a scan takes a search for where it does.
+    """
+    corners = any(run.branches is not None for run in fit.evaluator.runs)
+    if corners or not fit.problem.is_least_squares or fit.status is not Status.CONVERGED:
+        return None
+    return next(iter(choose_hops(fit.evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
 
 
 def _write_to(
@@ -317,9 +338,10 @@ class Search:
         strategy: Strategy,
         fit: Callable[..., Estimate],
         began: float,
+        other: FloatArray | None,
     ) -> None:
         self.problem, self.best, self.theta = problem, best, theta
-        self.strategy, self.fit, self.began = strategy, fit, began
+        self.strategy, self.fit, self.began, self.other = strategy, fit, began, other
         self.evaluations = 0 if best is None else best.evaluations
         proposed = any(run.is_guess_proposed for run in problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
@@ -381,6 +403,8 @@ class Search:
     def _list_strategies(self) -> list[tuple[str, Callable[[FloatArray], End]]]:
         """Return the strategies that apply to the problem, the cheapest first."""
         problem, best = self.problem, self.best
+        if self.other is not None:  # what the first fit has found is enough
+            return [(OTHER, lambda theta: fit_briefly(problem, make_feasible(problem, self.other)))]
         reason = explain_no_beam(problem)
         if not reason:
             return [(BEAM, lambda theta: find_times(problem, self.theta, self._is_good)), (STARTS, self._try_starts)]

@@ -4,6 +4,10 @@ Between two samples J is smooth in a transition time. The quadratic model about 
 how low J may be there, with all other unknowns following. Of the best intervals a second model is made about that
 minimum.
 
+Farther away J may have another minimum, too: where the difference of two vector fields changes its sign, as it does of
+a mass on a spring, a switch on the other side of that has nearly the same effect. What is left may be noise by its size
+at both.
+
 Removal and re-insertion of modes: what local minima in switching times are made of is undone.
 
 A mode that is not where it should be often cannot get there: on its way it would have to pass other modes, or to
@@ -48,6 +52,10 @@ the middle of an interval errs by 1e-4 of J: of five fits that began there with 
 
 ROUNDS = 12
 
+SCAN_FIRST, SCAN_RATIO = 3.0, 1.6
+"""Distance of the first place of a scan of J over a time, in standard errors, and of each place to that before it.
+Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other."""
+
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
 
@@ -76,7 +84,11 @@ def is_lower(cost: float, than: float) -> bool:
 
 
 def choose_hops(
-    evaluator: Evaluator, theta: FloatArray, cost: float, free: NDArray[np.bool_] | None = None
+    evaluator: Evaluator,
+    theta: FloatArray,
+    cost: float,
+    free: NDArray[np.bool_] | None = None,
+    errors: FloatArray | None = None,
 ) -> list[FloatArray]:
     """Return starts in sample intervals near by where J may be lower than the cost at theta, the best first.
 
@@ -87,36 +99,48 @@ def choose_hops(
     cost : float
     free : (d,) bool, optional
         Unknowns that may move; those at a bound do not.
+    errors : (d,), optional
+        Standard errors: J is scanned for minima farther away instead.
     """
     unknowns = evaluator.problem.unknowns
     inside = (unknowns.lower < theta) & (theta < unknowns.upper)
-    hops = list(_list_hops(evaluator, theta, inside if free is None else inside & free))
+    hops = list(_list_hops(evaluator, theta, inside if free is None else inside & free, errors))
     near = sorted(hops, key=lambda hop: hop[0])[:MOST]
     again = [find_lowest(start) for lowest, start, find_lowest in near if np.isfinite(lowest)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
 
 
 def _list_hops(
-    evaluator: Evaluator, theta: FloatArray, free: NDArray[np.bool_]
+    evaluator: Evaluator, theta: FloatArray, free: NDArray[np.bool_], errors: FloatArray | None
 ) -> Iterator[tuple[float, FloatArray, FindLowest]]:
-    """Yield the lowest J of the quadratic model about the middle of each sample interval near by, theta there, and a
-    function that returns both of the model about another point.
+    """Yield the lowest J of the quadratic model about the middle of each interval, theta there, and a function that
+    returns both of the model about another point.
     """
-    whole = evaluator(theta)
-    for e in range(len(evaluator.engines)):
-        yield from _list_hops_of_run(evaluator, e, whole, theta, free)
+    whole = None
+    for e, run in enumerate(evaluator.problem.experiments):
+        if errors is None:
+            intervals = _list_intervals(run, evaluator.problem.unknowns.times[e], list_sample_times(run), theta)
+        else:
+            intervals = _scan(evaluator, e, theta, errors)
+        if found := list(intervals):
+            whole = evaluator(theta) if whole is None else whole
+            yield from _list_hops_of_run(evaluator, e, whole, theta, free, found)
 
 
 def _list_hops_of_run(
-    evaluator: Evaluator, e: int, whole: Evaluation[FloatArray], theta: FloatArray, free: NDArray[np.bool_]
+    evaluator: Evaluator,
+    e: int,
+    whole: Evaluation[FloatArray],
+    theta: FloatArray,
+    free: NDArray[np.bool_],
+    intervals: list[tuple[int, float, float]],
 ) -> Iterator[tuple[float, FloatArray, FindLowest]]:
     """Yield what `_list_hops` does for one run.
 
     The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
     point.
     """
-    problem = evaluator.problem
-    run, here = problem.experiments[e], _evaluate_run(evaluator, e, theta)
+    problem, here = evaluator.problem, _evaluate_run(evaluator, e, theta)
     own, mine = problem.own_places[e]
 
     def find_lowest(place: int, low: float, high: float, point: FloatArray) -> tuple[float, FloatArray]:
@@ -134,7 +158,7 @@ def _list_hops_of_run(
         found = _minimize(gradient, hessian, free, place, low - theta[place], high - theta[place])
         return (np.inf, theta) if found is None else (float(cost + found[0]), theta + found[1])
 
-    for place, low, high in _list_intervals(run, problem.unknowns.times[e], list_sample_times(run), theta):
+    for place, low, high in intervals:
         middle = theta.copy()
         middle[place] = 0.5 * (low + high)
         yield *find_lowest(place, low, high, middle), partial(find_lowest, place, low, high)
@@ -177,6 +201,32 @@ def _list_intervals(
             low, high = nodes[j], nodes[j + 1]
             if place >= 0 and j != k and ends[i] < 0.5 * (low + high) < ends[i + 2]:
                 yield place, float(low), float(high)
+
+
+def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -> Iterator[tuple[int, float, float]]:
+    """Yield the place of a time in theta, and the ends of an interval in which J, with all else as it is, is lower than
+    nearer to theta: another minimum.
+    """
+    problem = evaluator.problem
+    where, run = problem.unknowns.times[e], problem.experiments[e]
+    ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
+    for i, place in enumerate(where.tolist()):
+        nearest = SCAN_FIRST * errors[place] if place >= 0 else 0.0
+        for end in (ends[i], ends[i + 2]):
+            room = abs(end - theta[place])
+            if not 0.0 < nearest < room:
+                continue
+            count = int(np.log(room / nearest) / np.log(SCAN_RATIO)) + 1
+            away = nearest * SCAN_RATIO ** np.arange(count)
+            costs, times = [], theta[place] + np.copysign(away, end - theta[place])
+            for t in times.tolist():
+                moved = theta.copy()
+                moved[place] = t
+                costs.append(evaluator.engines[e].cost(*problem.vectors(moved, e)))
+            for j in np.flatnonzero(np.diff(costs) < 0.0).tolist():
+                beyond = times[j + 2] if j + 2 < count else end
+                if j + 2 >= count or costs[j + 2] > costs[j + 1]:
+                    yield place, *sorted((float(times[j]), float(beyond)))
 
 
 PLACES = 60
