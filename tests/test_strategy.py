@@ -414,7 +414,7 @@ def test_starts_are_drawn_where_an_unknown_has_no_effect():
     truth = (0.1, 0.25, 1.2)
     exact = sf.simulate(build(np.zeros(60), 31.0, truth))
     values = np.interp(times, exact.times, exact.states[:, 0]) + 0.01 * np.random.default_rng(1).normal(size=60)
-    fit = sf.estimate(build(values, 31.7, (0.076, 0.622, 3.6)))
+    fit = sf.estimate(build(values, 31.7, (0.076, 0.622, 3.6)), time_budget=60.0)
     assert fit.steps[1].cost == fit.steps[0].cost, "the beam"
     assert fit.verdict.level == "good"
     np.testing.assert_allclose(fit.theta, (31.0, *truth), rtol=0.05)

@@ -217,16 +217,16 @@ def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -
             if not 0.0 < nearest < room:
                 continue
             count = int(np.log(room / nearest) / np.log(SCAN_RATIO)) + 1
-            away = nearest * SCAN_RATIO ** np.arange(count)
-            costs, times = [], theta[place] + np.copysign(away, end - theta[place])
-            for t in times.tolist():
+            times = theta[place] + np.copysign(nearest * SCAN_RATIO ** np.arange(count), end - theta[place])
+            costs = np.empty(count)
+            for j, t in enumerate(times.tolist()):
                 moved = theta.copy()
                 moved[place] = t
-                costs.append(evaluator.engines[e].cost(*problem.vectors(moved, e)))
-            for j in np.flatnonzero(np.diff(costs) < 0.0).tolist():
-                beyond = times[j + 2] if j + 2 < count else end
-                if j + 2 >= count or costs[j + 2] > costs[j + 1]:
-                    yield place, *sorted((float(times[j]), float(beyond)))
+                costs[j] = evaluator.engines[e].cost(*problem.vectors(moved, e))
+            falls = np.append(costs[1:] < costs[:-1], False)
+            for j in np.flatnonzero(falls[:-1] & ~falls[1:]).tolist():
+                low, high = sorted((times[j], times[j + 2] if j + 2 < count else end))
+                yield place, float(low), float(high)
 
 
 PLACES = 60
