@@ -189,7 +189,8 @@ def estimate(
     strategy : {"auto", "local", "thorough"}
         "local": one fit from the first guess. "auto": more where the verdict on it is not good, and for costs without
         data, whose verdict knows no quality of fit: a beam that follows hypotheses about the times through the log,
-        where it applies, then many starts, until the verdict is good. "thorough": all of them, whatever the verdict.
+        where it applies, then many starts, until the verdict is good. Where it is good, another minimum in a transition
+        time is tried if J may be lower there. "thorough": all of them, whatever the verdict.
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
         not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
