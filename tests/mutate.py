@@ -18,7 +18,7 @@ import drawn
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "switchfit"
 
-PAPER, ROWS, IMPLICIT_ROWS = "paper_adjoint.py", "discretization/rows.py", "discretization/implicit_rows.py"
+PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
 MODEL, PROPAGATION = "discretization/model.py", "discretization/propagation.py"
 STRUCTURE, CORNERS, EVALUATOR = "problem/structure.py", "problem/corners.py", "fit/evaluator.py"
 ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
@@ -98,18 +98,14 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
     },
     "rows": {
         "h' in the tangents of the stages": swap(
-            ROWS, "X_d = X_d if h_d is None else X_d + h_d * combine(tableau.a[j], slopes)", "X_d = X_d"
+            ROWS, "states.append(follow(x_d, row, K_d))", "states.append(x_d + h * combine(row, K_d))"
         ),
         "h' in the tangent behind a row": swap(
-            ROWS, "after if h_d is None else after + h_d * combine(tableau.b, slopes)", "after"
+            ROWS, "K_d, follow(x_d, tableau.b, K_d))", "K_d, x_d + h * combine(tableau.b, K_d))"
         ),
-        "D_1 f in the tangents": swap(
-            ROWS, "times_vector(f_x[j], X_d) + forcing[j]", "times_vector(f_x[j], x_d) + forcing[j]"
-        ),
+        "D_1 f in the tangents": swap(ROWS, "times_vector(J, states[-1]) + given", "times_vector(J, x_d) + given"),
         "later stages in the adjoint": swap(ROWS, "(b[j] * psi + later)", "(b[j] * psi)"),
-        "a transposed in the adjoint": swap(
-            ROWS, "[a[m][j] for m in range(j + 1, s)]", "[a[m][m - 1] for m in range(j + 1, s)]"
-        ),
+        "a transposed in the adjoint": swap(ROWS, "combine(a[j + 1 :, j], mu", "combine(a[j + 1 :].diagonal(j), mu"),
         "psi in the adjoint": swap(ROWS, "psi + sum(mu[1:], mu[0])", "sum(mu[1:], mu[0])"),
         "ell in what the length multiplies": swap(
             ROWS, "((psi * slopes[j]).sum() + densities[j])", "(psi * slopes[j]).sum()"
@@ -145,16 +141,12 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "W in the Gauss-Newton matrix": swap(PROGRAMS, "jax.vmap(partial(apply_weights, W))(at_stages)", "at_stages"),
     },
     "implicit": {
-        "D_1 f x' in the tangents": swap(
-            IMPLICIT_ROWS, "[forcing[j] + times_vector(f_x[j], at(j, ())) for", "[forcing[j] for"
-        ),
-        "h' in the tangents of the stages": swap(
-            IMPLICIT_ROWS, "x_d if h_d is None else x_d + h_d * combine(a[j], slopes[:s])", "x_d"
-        ),
-        "a transposed in the adjoint": swap(IMPLICIT_ROWS, "combine(a[:s, j], costs)", "combine(a[j, :s], costs)"),
-        "the transposed equations": swap(IMPLICIT_ROWS, ".solve(right, transposed=True)", ".solve(right)"),
+        "D_1 f x' in the tangents": swap(ROWS, "[given + times_vector(J, X_d) for", "[given for"),
+        "h' in the tangents of the stages": swap(ROWS, "known = [follow(x_d, row, ())", "known = [x_d"),
+        "a transposed in the adjoint": swap(ROWS, "combine(a[:, j], costs)", "combine(a[j], costs)"),
+        "the transposed equations": swap(ROWS, ".solve(right, transposed=True)", ".solve(right)"),
         "f in the error of a row": swap(
-            IMPLICIT_ROWS, "damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)"
+            ROWS, "damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)"
         ),
         "the factors of the last row": swap(SEGMENTS, 'at(found["kept"], row,', 'at(found["kept"], 0,'),
         "no second derivative of Newton's map": swap(

@@ -4,7 +4,7 @@ The programs that JAX compiles: cost and derivatives of one experiment.
 
 They differentiate the simulation as it is. A step is one row of `switchfit.discretization.propagation.propagate`, whose
 derivatives JAX finds; those of an implicit step follow from the implicit function theorem
-(`switchfit.discretization.implicit_rows.stages`). A Hessian is differentiated forward first, then backward: the other
+(`switchfit.discretization.propagation`). A Hessian is differentiated forward first, then backward: the other
 way round, JAX would lose the rules of users' `jax.custom_jvp` functions inside a scan at the second derivative.
 """
 

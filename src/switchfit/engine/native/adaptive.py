@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.discretization.implicit_rows import estimate_error
 from switchfit.discretization.rows import (
     ADAPTIVE,
     ADAPTIVE_ERROR,
@@ -17,6 +16,7 @@ from switchfit.discretization.rows import (
     Progress,
     Tolerances,
     combine,
+    estimate_error,
     judge_error,
 )
 from switchfit.engine.native.elimination import eliminate

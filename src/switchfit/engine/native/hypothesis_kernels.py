@@ -18,8 +18,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from switchfit.discretization import implicit_rows
-from switchfit.discretization.rows import EXPLICIT_ERROR, Stages, Tableau, Tangent, combine, times_vector
+from switchfit.discretization.rows import (
+    EXPLICIT_ERROR,
+    Stages,
+    Tableau,
+    Tangent,
+    combine,
+    estimate_error,
+    times_vector,
+)
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels, Store, as_vector, list_entries, store_all
 from switchfit.engine.native.scalars import Graph, Namespace, Node, Objects, Template
@@ -51,7 +58,7 @@ class HypothesisKernels(Kernels):
         at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
         if tableau.coupled:
             slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
-            error = implicit_rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
+            error = estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
         else:
             error = h * combine(EXPLICIT_ERROR, found.slopes)
         stores = [("error", 0, self._largest_error(graph, error, x))]

@@ -31,13 +31,12 @@ A straight-line function reads and writes through pointers. The name of a pointe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.discretization import implicit_rows
-from switchfit.discretization import rows as explicit_rows
+from switchfit.discretization import rows
 from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.discretization.rows import (
     EXPLICIT,
@@ -174,7 +173,7 @@ class Kernels:
         states = [x + combine(row, k) for row in STIFF.a]
         found = [field(j, X) for j, X in enumerate(states)]
         slopes, jacobians = zip(*found, strict=True)
-        corrected = implicit_rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
+        corrected = rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
         after = np.concatenate([x + combine(row, corrected) for row in STIFF.a])
         change = xp.abs(after - np.concatenate(states))
         size = xp.abs(after) + xp.abs(np.concatenate([x] * len(k)))
@@ -210,7 +209,7 @@ class Kernels:
 
         # The increments k_j = h K_j were found by the loop of `segments.write_newton` before; here they are inputs.
         k = self.load_increments(graph) if tableau.coupled else []
-        found = explicit_rows.stages(tableau, field, start, end, x, k)
+        found = rows.stages(tableau, field, start, end, x, k)
         after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         stores, factors = store_all("x_after", 0, after), None
         keep: Callable[..., list[Store]] = store_all if self.goes_back else lambda *_: []
@@ -220,7 +219,7 @@ class Kernels:
             # has from its stages, those of an implicit row are k / h and have to be stored.
             if k:
                 f_x = stage(graph, *at(start, x), only=(F_X,))[0]
-                found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
+                found = found._replace(slopes=rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
                 at_points = at_points + (found.slopes if moving else [])
             stores += keep("X", 0, np.concatenate(at_points))
             if kept:
@@ -244,12 +243,9 @@ class Kernels:
                 times_d = times_derivative(tableau, start_d, end_d)
                 # D_2 f t_j' + D_p f p', the part of K_j' that does not depend on X_j'.
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
-            tangent: Callable[..., explicit_rows.Tangent] = explicit_rows.tangent
-            if factors is not None:
-                tangent = partial(implicit_rows.tangent, factors=factors)
             # Without `moving` h_d is None: the graph then has none of the products with h', which all other rows would
             # pay for.
-            along = tangent(tableau, h, found.slopes, of_x, forcing, Z, h_d)
+            along = rows.tangent(tableau, h, found.slopes, of_x, forcing, Z, h_d, factors)
             vectors = along.states + (along.slopes if k and moving else [])
             stores += keep("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
@@ -279,7 +275,7 @@ class Kernels:
         if tableau.coupled:
             slope, f_x = stage(graph, *at(graph.load("row", 0), x), only=(F, F_X))
             k = [combine(row, [X - x for X in after]) for row in inverse]
-            errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
+            errors = rows.estimate_error(h, k, slope, f_x, eliminate)
         else:
             # sum_j e_j h K_j with h K = inverse (X - x): the weights of the states, and what they leave of x.
             weights = EXPLICIT_ERROR @ inverse
@@ -359,15 +355,13 @@ class Kernels:
                 slopes[j] = stage(graph, *given, only=SLOPES, known=known[j])
             return g_t.item(), g_x, g_p
 
+        ell_x: list[Objects] = []
         if factors is not None:
-            # The w_j of an implicit row depend on one another: its matrix is factorized from D_1 f at all stages before
-            # any `pull`.
+            # The w_j of an implicit row depend on one another: D_1 ell at all stages is needed before any `pull`.
             points = zip(times, states, known, strict=True)
-            of_x = [stage(graph, *at(t, X), only=(ELL_X,), known=kept_there) for t, X, kept_there in points]
-            ell_x = [each[0] for each in of_x]
-            found = implicit_rows.adjoint(tableau, h, psi, pull, ell_x, factors.load(graph))
-        else:
-            found = explicit_rows.adjoint(tableau, h, psi, pull)
+            ell_x = [stage(graph, *at(t, X), only=(ELL_X,), known=kept_there)[0] for t, X, kept_there in points]
+            factors = factors.load(graph)
+        found = rows.adjoint(tableau, h, psi, pull, ell_x, factors)
         # A late sample ends a row of its own, which starts where the row around it does: `late` is its costate there.
         before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
         stores = store_all("psi", 0, before)
