@@ -24,7 +24,7 @@ STRUCTURE, CORNERS, EVALUATOR = "problem/structure.py", "problem/corners.py", "f
 ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
 DIRECTION, POINT, QP, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "qp", "state"))
 PROGRAMS, COURSE, SPLIT = "engine/jax.py", "engine/branches.py", "engine/choice.py"
-HYPOTHESES, HYPOTHESIS_LOOPS = "engine/native/hypothesis_kernels.py", "engine/native/hypothesis_loops.py"
+HYPOTHESES = "engine/native/hypotheses.py"
 KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
     f"engine/native/{name}.py" for name in ("kernels", "segments", "templates", "elimination", "llvm")
 )
@@ -227,7 +227,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             "append(name, knots[k], knots[k + 1])",
         ),
         "reset maps of another sequence": swap(
-            "engine/native/experiment.py",
+            "engine/native/engine.py",
             "self._named[name][:] = which",
             "self._named[name][:] = which if name == 'modes' else -1",
         ),
@@ -238,14 +238,14 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             KERNELS, "forcing = [self._along_p(graph, f_p) for", "forcing = [self._along_p(graph, 0.0 * f_p) for"
         ),
         "no column for tau": swap(HYPOTHESES, "+ sign * graph.loads(", "+ 0.0 * sign * graph.loads("),
-        "column one slot off": swap(HYPOTHESIS_LOOPS, "Column.SLOT) + 1", "Column.SLOT) + 2"),
+        "column one slot off": swap(HYPOTHESES, "Column.SLOT) + 1", "Column.SLOT) + 2"),
         "a birth before the sample at its time": swap(
-            HYPOTHESIS_LOOPS,
+            HYPOTHESES,
             'self.invoke("at_node", table, record, here + 1)',
             'self.invoke("at_node", table, record, here)',
         ),
         "the highest scores of a place are kept": swap(
-            HYPOTHESIS_LOOPS, "leave(score >= self._load_score", "leave(score <= self._load_score"
+            HYPOTHESES, "leave(score >= self._load_score", "leave(score <= self._load_score"
         ),
         "dropped penalty": swap(BEAM, " + self.penalty * switches", ""),
         "dropped limit for each sequence": swap("strategy/library.py", "PER_SEQUENCE = 3", "PER_SEQUENCE = 3000"),

@@ -16,7 +16,7 @@ from switchfit.discretization.rows import STIFF, STIFF_BEND, measure_jump
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import derivatives_inside_program
 from switchfit.engine.native import elimination, kernels, llvm
-from switchfit.engine.native.experiment import native_experiment, places_in_library
+from switchfit.engine.native.engine import native_experiment, places_in_library
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.templates import Order

@@ -39,8 +39,8 @@ from switchfit.engine.branches import (
     TooManyCrossingsError,
 )
 from switchfit.engine.jax import call_model
-from switchfit.engine.native.adaptive import Adaptive
-from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.engine import NativeExperiment, native_experiment
+from switchfit.engine.native.program import Adaptive
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
 from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch

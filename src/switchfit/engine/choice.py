@@ -29,10 +29,8 @@ from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.adaptive import Settings, find_path
 from switchfit.engine.branches import Branches, Course, Path, find_dips
 from switchfit.engine.jax import JaxEngine, derivatives
-from switchfit.engine.native.engine import NativeEngine, foreign_derivatives
-from switchfit.engine.native.experiment import reason_for_jax
-from switchfit.engine.native.hypotheses import NativeHypotheses
-from switchfit.engine.native.hypothesis_loops import hypotheses_program
+from switchfit.engine.native.engine import NativeEngine, foreign_derivatives, reason_for_jax
+from switchfit.engine.native.hypotheses import NativeHypotheses, hypotheses_program
 from switchfit.engine.native.templates import Sizes
 from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Run, Simulation, Tangents
 from switchfit.problem.corners import Corners, Sides
