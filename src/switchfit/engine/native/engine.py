@@ -10,8 +10,9 @@ import ctypes
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import jax
@@ -39,9 +40,8 @@ def native_experiment(
     structure: Structure, arguments: Arguments, times: FloatArray, order: Order
 ) -> NativeExperiment | None:
     """Return one experiment in machine code on the mesh with the nodes `times`; None if it cannot be compiled."""
-    sizes = Sizes.of(structure, arguments)
-    program = program_of(structure.library, sizes, order)
-    return None if isinstance(program, str) else NativeExperiment(program, structure, sizes, arguments, times, order)
+    program = program_of(structure.library, Sizes.of(structure, arguments), order)
+    return None if isinstance(program, str) else NativeExperiment(program, structure, arguments, times, order)
 
 
 def reason_for_jax(structure: Structure, arguments: Arguments) -> str | None:
@@ -105,13 +105,9 @@ def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, An
 
 
 @lru_cache(maxsize=64)
-def _find_own_directions(
-    sizes: Sizes, N: int, jumps: tuple[int, ...]
-) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
+def _find_own_directions(sizes: Sizes, N: int, jumps: tuple[int, ...]) -> tuple[Any, Any, Any]:
     """Return what `find_directions` does for N transitions with these jumps, shared by all meshes."""
-    found: tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]
-    found = find_directions(sizes, np.isin(np.arange(N), jumps).astype(np.int64), np)
-    return found
+    return find_directions(sizes, np.isin(np.arange(N), jumps).astype(np.int64), np)
 
 
 class FailedCheckError(Exception):
@@ -127,7 +123,6 @@ class NativeExperiment:
     ----------
     program : Program
     structure : Structure
-    sizes : Sizes
     arguments : Arguments
         Padded or not.
     times : (G + 1,) array
@@ -136,15 +131,10 @@ class NativeExperiment:
     """
 
     def __init__(
-        self,
-        program: Program,
-        structure: Structure,
-        sizes: Sizes,
-        arguments: Arguments,
-        times: FloatArray,
-        order: Order,
+        self, program: Program, structure: Structure, arguments: Arguments, times: FloatArray, order: Order
     ) -> None:
-        self.sizes, self.order, self.times, self.row_work = sizes, order, times, program.row_work
+        self.sizes = sizes = Sizes.of(structure, arguments)
+        self.order, self.times, self.row_work = order, times, program.row_work
         self._program, self._prefix = program, PREFIX[order]
         N, cells = sizes.N, len(times) - 1
         self._inner_nodes, self._cells = times[1:-1], cells
@@ -544,67 +534,60 @@ class NativeEngine:
 
     def judge_rows(self) -> None:
         """Estimate the errors of rows in all evaluations from now on."""
-        if not self._judges_rows:
-            self._judges_rows = True
-            for each in filter(None, self._experiments.values()):
-                each.judge_rows(jumps=self._mesh.is_sharp)
+        self._judges_rows = True
+        for each in filter(None, self._experiments.values()):
+            each.judge_rows(jumps=self._mesh.is_sharp)
 
-    def _try(self, order: Order, use: Callable[[NativeExperiment], Found], fall_back: Callable[[], Found]) -> Found:
+    def _try(self, order: Order, use: Callable[..., Found], fall_back: Callable[..., Found], *given: Any) -> Found:
         """Return what one function finds in machine code of an order, or what another finds by JAX."""
         native = self.at(order)
-        try:
-            return fall_back() if native is None else use(native)
-        except FailedCheckError:
-            return fall_back()
+        with suppress(FailedCheckError):
+            if native is not None:
+                return use(native, *given)
+        return fall_back(*given)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
-        return self._try(Order.COST, lambda native: native.cost(tau, p), lambda: self._fallback.cost(tau, p))
+        return self._try(Order.COST, NativeExperiment.cost, self._fallback.cost, tau, p)
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
         """Return J and its derivatives."""
-        return self._try(
-            ORDERS[matrix],
-            lambda native: native(tau, p, side),
-            lambda: self._fallback.derivatives(tau, p, side, matrix),
-        )
+        by_jax = partial(self._fallback.derivatives, matrix=matrix)
+        return self._try(ORDERS[matrix], NativeExperiment.__call__, by_jax, tau, p, side)
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         given = tau, p, side, multipliers
-        return self._try(self._second, lambda native: native(*given), lambda: self._fallback.constrained(*given))
+        return self._try(self._second, NativeExperiment.__call__, self._fallback.constrained, *given)
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
 
-        def simulate(native: NativeExperiment) -> Costates:
-            found, costates, _ = native.simulate(tau, p, multipliers)
+        def find(native: NativeExperiment, *given: FloatArray) -> Costates:
+            found, costates, _ = native.simulate(*given)
             return Costates.of_rows(self._structure, found.first_row, found.start, found.before, costates)
 
-        return self._try(self._second, simulate, lambda: self._fallback.costates(tau, p, multipliers))
+        return self._try(self._second, find, self._fallback.costates, tau, p, multipliers)
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
         given = times, cells, states, p
-        return self._try(Order.COST, lambda native: native.slopes(*given), lambda: self._fallback.slopes(*given))
+        return self._try(Order.COST, NativeExperiment.slopes, self._fallback.slopes, *given)
 
     def trace(self, tau: FloatArray, p: FloatArray) -> Simulation:
         """Return all rows, without outputs."""
-        return self._try(
-            Order.COST,
-            lambda native: cut_at_tf(native.simulate(tau, p)[0], self._structure),
-            lambda: self._fallback.trace(tau, p),
-        )
+
+        def simulate(native: NativeExperiment, *given: FloatArray) -> Simulation:
+            return cut_at_tf(native.simulate(*given)[0], self._structure)
+
+        return self._try(Order.COST, simulate, self._fallback.trace, tau, p)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
-        return self._try(
-            self._second if tangents else Order.COST,
-            lambda native: self._simulate(native, tau, p),
-            lambda: self._fallback.simulate(tau, p, tangents=tangents),
-        )
+        by_jax = partial(self._fallback.simulate, tangents=tangents)
+        return self._try(self._second if tangents else Order.COST, self._simulate, by_jax, tau, p)
 
     def _simulate(self, native: NativeExperiment, tau: FloatArray, p: FloatArray) -> Simulation:
         """Return all rows by machine code.
