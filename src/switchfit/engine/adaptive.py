@@ -28,16 +28,8 @@ import numpy as np
 from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.rows import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
-from switchfit.engine.branches import (
-    MOST_FOUND,
-    BranchError,
-    Branches,
-    Course,
-    Crossing,
-    Path,
-    SteepError,
-    TooManyCrossingsError,
-)
+from switchfit.engine import branches
+from switchfit.engine.branches import MOST_FOUND, BranchError, Branches, Course, Crossing, Path, SteepError
 from switchfit.engine.jax import call_model
 from switchfit.engine.native.engine import NativeExperiment, native_experiment
 from switchfit.engine.native.program import Adaptive
@@ -101,7 +93,7 @@ def solve_adaptively(run: Run, theta: FloatArray, settings: Settings = Settings(
     if run.branches is not None:
         try:
             return find_path(run, run.branches, tau, p, run.coarse, settings)[0]
-        except TooManyCrossingsError as error:
+        except branches.TooManyCrossingsError as error:
             if run.path is not None:  # a trial far from the guess
                 raise
             # Too many crossings at the guess: once more without following them, with short steps at each corner.

@@ -25,17 +25,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.discretization import rows
 from switchfit.discretization.mesh import Arguments
-from switchfit.discretization.rows import (
-    EXPLICIT_ERROR,
-    STIFF,
-    Stages,
-    Tableau,
-    Tangent,
-    combine,
-    estimate_error,
-    times_vector,
-)
+from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine, times_vector
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.engine import count_samples, get_address
 from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, as_vector, list_entries, store_all
@@ -140,9 +132,9 @@ class HypothesisKernels(Kernels):
         at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
         if tableau.coupled:
             slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
-            error = estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
+            error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
         else:
-            error = h * combine(EXPLICIT_ERROR, found.slopes)
+            error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
         stores = [("error", 0, self._largest_error(graph, error, x))]
         if not costs:
             return stores

@@ -38,23 +38,7 @@ import numpy as np
 
 from switchfit.discretization import rows
 from switchfit.discretization.model import AT_TRANSITIONS
-from switchfit.discretization.rows import (
-    EXPLICIT,
-    EXPLICIT_BEND,
-    EXPLICIT_ERROR,
-    STIFF,
-    STIFF_BEND,
-    Stages,
-    Tableau,
-    Tangent,
-    combine,
-    cost_of_row,
-    invert_stages,
-    length_factor,
-    measure_jump,
-    times_derivative,
-    times_vector,
-)
+from switchfit.discretization.rows import EXPLICIT, STIFF, Stages, Tableau, Tangent, combine, times_vector
 from switchfit.engine.native.elimination import Elimination, Routine, count_factors, eliminate
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.scalars import CHECKED, MAY_FAIL, Graph, Namespace, Node, Objects, Template
@@ -240,7 +224,7 @@ class Kernels:
             if moving:
                 start_d, end_d = self._ends(graph)
                 h_d = end_d - start_d
-                times_d = times_derivative(tableau, start_d, end_d)
+                times_d = rows.times_derivative(tableau, start_d, end_d)
                 # D_2 f t_j' + D_p f p', the part of K_j' that does not depend on X_j'.
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
             # Without `moving` h_d is None: the graph then has none of the products with h', which all other rows would
@@ -252,7 +236,7 @@ class Kernels:
             stores += self._add_to_row(graph, stage, tableau, found, along, costs)
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
-            stores.append(("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)))
+            stores.append(("J", 0, graph.load("J", 0) + rows.cost_of_row(tableau, h, densities)))
         if checked:
             stores += graph.check()
         self.module.write_straight_line(name, stores)
@@ -271,14 +255,14 @@ class Kernels:
         graph = Graph()
         at, (x, h, _, after) = self._row(graph), self._load_row(graph, tableau)
         # The slopes are not in memory, but h K_j follow from the states: a linear map, whose weights are known numbers.
-        inverse = invert_stages(tableau)
+        inverse = rows.invert_stages(tableau)
         if tableau.coupled:
             slope, f_x = stage(graph, *at(graph.load("row", 0), x), only=(F, F_X))
             k = [combine(row, [X - x for X in after]) for row in inverse]
             errors = rows.estimate_error(h, k, slope, f_x, eliminate)
         else:
             # sum_j e_j h K_j with h K = inverse (X - x): the weights of the states, and what they leave of x.
-            weights = EXPLICIT_ERROR @ inverse
+            weights = rows.EXPLICIT_ERROR @ inverse
             errors = combine(weights, after) - weights.sum() * x
         self._add_to_errors(f"error_{mode}", graph, Namespace(graph).abs(errors))
 
@@ -287,13 +271,13 @@ class Kernels:
         # The middle stage and the bend see a jump that the first and the last one straddle; see `rows.measure_jump`.
         changes = [X - x for X in after]
         first, middle, last = (combine(inverse[j], changes) for j in (0, len(inverse) // 2, -1))
-        bend = combine((STIFF_BEND if tableau.coupled else EXPLICIT_BEND) @ inverse, changes)
+        bend = combine((rows.STIFF_BEND if tableau.coupled else rows.EXPLICIT_BEND) @ inverse, changes)
         times = [graph.load("row", 0) + c * h for c in tableau.c[[0, -1]].tolist()]
         ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
         # The mean of the derivatives at both ends times the change of (t, X) is how f would change if it were smooth.
         f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
         smooth = 0.5 * h * (times_vector(f_x, states[-1] - states[0]) + f_t * (times[1] - times[0]))
-        jump = measure_jump(first, middle, last, bend, smooth, Namespace(graph))
+        jump = rows.measure_jump(first, middle, last, bend, smooth, Namespace(graph))
         self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * jump)
 
     def _load_row(self, graph: Graph, tableau: Tableau) -> tuple[Objects, Node, list[Objects], list[Objects]]:
@@ -372,9 +356,9 @@ class Kernels:
             # D_tau J of a row that tau opens or closes: t_j' times D_2 (w_j . f + h b_j ell), and h' times V. Summed
             # over the two rows beside tau this is psi X^i, (6), of the discretized cost.
             start_d, end_d = self._ends(graph)
-            times_d = times_derivative(tableau, start_d, end_d)
+            times_d = rows.times_derivative(tableau, start_d, end_d)
             K = [graph.loads("X", n, (count + j) * n) if tableau.coupled else s[0] for j, s in enumerate(slopes)]
-            factor = length_factor(tableau, psi, found.states, K, [s[4].item() for s in slopes])
+            factor = rows.length_factor(tableau, psi, found.states, K, [s[4].item() for s in slopes])
             g = g + factor * (end_d - start_d) + sum(g_t * t_d for g_t, t_d in zip(found.times, times_d, strict=True))
             if self.order == Order.HESSIAN:
                 # V' along theta with psi and mu held: how these move is in Z' S Z already. V is linear in K_j and
@@ -388,7 +372,7 @@ class Kernels:
                     else:
                         K_d.append(times_vector(D_1f, X_d) + self._along_p(graph, f_p) + f_t * times_d[j])
                     ell_d.append((l_x * X_d).sum() + self._along_p(graph, l_p) + l_t.item() * times_d[j])
-                factor_d = length_factor(tableau, psi, found.states, K_d, ell_d)
+                factor_d = rows.length_factor(tableau, psi, found.states, K_d, ell_d)
                 stores.append(("length", 0, as_vector(graph, factor_d)))
         stores.append(("g", 0, as_vector(graph, g)))
         chosen, entries = self._store_entries(graph, tableau, second)

@@ -26,40 +26,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.discretization.rows import (
-    ADAPTIVE,
-    ADAPTIVE_ERROR,
-    EXPONENT,
-    STIFF,
-    STIFF_EXPONENT,
-    Progress,
-    Tolerances,
-    combine,
-    estimate_error,
-    judge_error,
-)
+from switchfit.discretization import rows
+from switchfit.discretization.rows import ADAPTIVE, STIFF, combine
+from switchfit.engine.native import segments
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variable, compile_modules
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
-from switchfit.engine.native.segments import (
-    GIVEN,
-    OF_SAMPLES,
-    ZEROED,
-    Pointers,
-    Writer,
-    constraint_pointers,
-    count_rows,
-    estimate_row,
-    layout_of,
-    solve_stages,
-    state_pointers,
-    write_backward,
-    write_forward,
-    write_late_samples,
-    write_newton,
-    write_samples,
-)
+from switchfit.engine.native.segments import GIVEN, OF_SAMPLES, Pointers, Writer
 from switchfit.engine.native.templates import ELL, ELL_X, F_X, F, Order, Sizes
 from switchfit.engine.native.trace import Unsupported
 from switchfit.problem.functions import use_float64
@@ -103,7 +77,7 @@ def write_handler(writer: Writer) -> str:
     for name, length in writer.layout.sums.items():
         found[name] = writer.at(totals, position)
         position += length
-    rows = count_rows(writer, found)
+    rows = segments.count_rows(writer, found)
     place: Operand = 0
     for name, extent in writer.layout.memory.items():
         found[name] = writer.at(between, place)
@@ -123,12 +97,12 @@ def write_evaluation(writer: Writer) -> str:
     of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
     table, *counts = writer.begin(f"void @evaluate(ptr %table{of_samples})")
     found, layout = writer.pointers(), writer.layout
-    rows = count_rows(writer, found)
+    rows = segments.count_rows(writer, found)
     # The sums are one block of memory, so that one call clears all of them.
     writer.zero(found[next(iter(layout.sums))], sum(layout.sums.values()))
-    for name in ZEROED:
+    for name in segments.ZEROED:
         writer.zero(found[name], rows * layout.memory[name].each_row + layout.memory[name].fixed)
-    first = state_pointers(writer, found, 0)
+    first = segments.state_pointers(writer, found, 0)
     writer.call("start", found | {f"{name}_after": pointer for name, pointer in first.items()})
     with writer.loop(0, N + 1) as segment:
         writer.invoke("forward", table, segment)
@@ -144,11 +118,10 @@ def write_evaluation(writer: Writer) -> str:
 
 def _call_end(writer: Writer, found: Pointers) -> None:
     """Call the terminal cost and constraints."""
-    library, last = writer.library, state_pointers(writer, found, count_rows(writer, found))
+    library, last = writer.library, segments.state_pointers(writer, found, segments.count_rows(writer, found))
     # No row follows the end: what the terminal terms add to the costate goes to psi itself.
-    given = (
-        found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
-    )
+    given = found | last | {"jump": found["psi"]}
+    given |= segments.constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
     for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
         writer.call(name, given)
 
@@ -202,10 +175,10 @@ def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
     state, y = graph.loads("state", len(at)), graph.loads("y", n + 1)
     # y is (x, running cost): the mesh has to resolve both.
     points = [_evaluate(kernels, graph, stage, str(j)) for j in range(count)]
-    progress = Progress(
+    progress = rows.Progress(
         state[at.t], state[at.step], *(graph.apply("ne", state[k], 0.0) for k in (at.refused, at.stuck))
     )
-    given = progress, state[at.end], Tolerances(state[at.rtol], state[at.atol]), y
+    given = progress, state[at.end], rows.Tolerances(state[at.rtol], state[at.atol]), y
     h, xp = progress.step, Namespace(graph)
     if is_implicit:
         k, (at_start, *at_stages) = kernels.load_increments(graph), points
@@ -215,14 +188,14 @@ def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
         k = [np.append(each, h * density.item()) for each, density in zip(k, densities, strict=True)]
         # d (x, cost) / dt = (f, ell) does not depend on the cost: its column is zero.
         jacobian = np.block([[f_x, np.zeros((n, 1))], [ell_x[None], 0.0]])
-        error = estimate_error(h, k, np.append(f, ell), jacobian, eliminate)
-        now, y_now = judge_error(*given, y + combine(STIFF.b, k), error, STIFF_EXPONENT, xp)
+        error = rows.estimate_error(h, k, np.append(f, ell), jacobian, eliminate)
+        now, y_now = rows.judge_error(*given, y + combine(STIFF.b, k), error, rows.STIFF_EXPONENT, xp)
     else:
         K: list[Objects] = []
         for row, evaluate in zip((*ADAPTIVE.a, ADAPTIVE.b), points, strict=True):
             after = y + h * combine(row, K)
             K.append(np.concatenate([np.ravel(value) for value in evaluate(after[:n], (F, ELL))]))
-        now, y_now = judge_error(*given, after, h * combine(ADAPTIVE_ERROR, K), EXPONENT, xp)
+        now, y_now = rows.judge_error(*given, after, h * combine(rows.ADAPTIVE_ERROR, K), rows.EXPONENT, xp)
     stores = [("state", at.t, now.t), ("state", at.step, now.step), *(("y", k, node) for k, node in enumerate(y_now))]
     for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
@@ -294,7 +267,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
             found[f"moment{j}"] = writer.allocate("double", 2)
             found[f"signal{j}"] = _store_moment(writer, found, cells, t + step * c, found[f"moment{j}"])
         if is_implicit:
-            solve_stages(writer, f"newton_step_{mode}", found)
+            segments.solve_stages(writer, f"newton_step_{mode}", found)
         writer.call(f"step_{mode}", found)
         with writer.when(writer.get("double", state, at.refused).equals(0.0)):
             accepted = writer.load("i64", count)
@@ -372,7 +345,7 @@ def drop_programs() -> None:
     """Drop cached programs that are not in use, and what is known of their memory."""
     with _one_at_a_time:
         _program_of.cache_clear()
-        layout_of.cache_clear()
+        segments.layout_of.cache_clear()
 
 
 def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> Iterator[str]:
@@ -384,25 +357,25 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
         if order > Order.COST:
-            module.row_work.append(estimate_row(writer, mode, curvatures[mode]["inner"]))
+            module.row_work.append(segments.estimate_row(writer, mode, curvatures[mode]["inner"]))
         yield module.take()
     kernels.nodes()
     for k in range(len(library.measurements)):
         if k in late:
             kernels.late_time(k)
-            module.add(write_late_samples(writer, k, curvatures))
+            module.add(segments.write_late_samples(writer, k, curvatures))
         else:
-            module.add(write_samples(writer, k))
+            module.add(segments.write_samples(writer, k))
     for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
         module.add(write_loop(writer, name))
     kernels.state()
     if order != Order.GRADIENT:
         kernels.outputs()
         module.add(write_loop(writer, "outputs"))
-    module.add(write_forward(writer))
+    module.add(segments.write_forward(writer))
     module.add(write_evaluation(writer))
     if order > Order.COST:
-        module.add(write_backward(writer, curvatures))
+        module.add(segments.write_backward(writer, curvatures))
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
     yield module.take()
@@ -419,7 +392,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))
     if library.implicit[mode]:
         kernels.newton(f"newton_{mode}", stage)
-        module.add(write_newton(writer, f"newton_{mode}"))
+        module.add(segments.write_newton(writer, f"newton_{mode}"))
     tableau, curvatures = kernels.tableau(mode), {}
     for kind, template, moving, costs, is_late in kinds:
         name = f"{kind}_{mode}"
@@ -439,6 +412,6 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         module.add(write_loop(writer, f"slope_{mode}"))
         write_step(kernels, mode, stage)
         if library.implicit[mode]:
-            module.add(write_newton(writer, f"newton_step_{mode}"))
+            module.add(segments.write_newton(writer, f"newton_step_{mode}"))
         module.add(write_adaptive_solve(writer, mode))
     return curvatures

@@ -17,27 +17,8 @@ import jax
 import numpy as np
 from jax.interpreters import partial_eval
 
-from switchfit.engine.native.arrays import (
-    OF_INTEGERS,
-    Integer,
-    Meaning,
-    Unsupported,
-    cholesky,
-    choose,
-    compare_in_order,
-    dynamic_slice,
-    dynamic_update_slice,
-    from_double,
-    gather,
-    known_number,
-    less,
-    lu,
-    scatter,
-    search,
-    sort,
-    triangular_solve,
-    within,
-)
+from switchfit.engine.native import arrays
+from switchfit.engine.native.arrays import Integer, Meaning, Unsupported, choose, known_number, less
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
 from switchfit.problem.jaxprs import MOVES as SELECTIONS
 from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
@@ -141,7 +122,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
-            places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
+            places = arrays.search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
             if places is not None:
                 return [np.asarray(places, dtype=object)]
         return _run(graph, inner, args)
@@ -180,7 +161,7 @@ def _evaluate_known(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries of arrays of a type."""
-    table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, OF_INTEGERS)
+    table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, arrays.OF_INTEGERS)
     if name in table:
         return table[name](graph, params, dtype)
     if dtype.kind in "iu" and name not in OTHER_NAMES:
@@ -325,10 +306,10 @@ def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any],
     if kind.kind == "b":
         return lambda a: graph.apply("ne", a if dtype.kind == "f" else Integer.of(graph, a).node, 0.0)
     if dtype.kind == "f":
-        return from_double(graph, kind)
+        return arrays.from_double(graph, kind)
     if kind.kind == "f":
         return lambda a: Integer.of(graph, a).node
-    return lambda a: within(graph, Integer.of(graph, a), kind)
+    return lambda a: arrays.within(graph, Integer.of(graph, a), kind)
 
 
 def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
@@ -405,8 +386,8 @@ OF_DOUBLES: dict[str, Meaning] = {
     "logistic": lambda graph, params, dtype: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
     "sign": _sign,
     "round": _round,
-    "lt_to": lambda graph, params, dtype: partial(compare_in_order, graph, "lt"),
-    "le_to": lambda graph, params, dtype: partial(compare_in_order, graph, "le"),
+    "lt_to": lambda graph, params, dtype: partial(arrays.compare_in_order, graph, "lt"),
+    "le_to": lambda graph, params, dtype: partial(arrays.compare_in_order, graph, "le"),
     "is_finite": lambda graph, params, dtype: lambda a: graph.apply("eq", a - a, 0.0),
 }
 """Operations on each entry of arrays of doubles."""
@@ -415,7 +396,7 @@ OF_DOUBLES: dict[str, Meaning] = {
 # Truth values
 
 
-OF_TRUTH: dict[str, Meaning] = OF_INTEGERS | {
+OF_TRUTH: dict[str, Meaning] = arrays.OF_INTEGERS | {
     name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth
 }
 """Operations on each entry of arrays of truth values, which are compared as integers are."""
@@ -498,7 +479,7 @@ def _scatter(name: str | None) -> Callable[..., Any]:
                 return OPERATIONS[name].value(old, update)
             return choose(graph, here, _get_meaning(graph, name, {}, dtype)(old, update), old)
 
-        return scatter(graph, equation, a, indices, updates, combine)
+        return arrays.scatter(graph, equation, a, indices, updates, combine)
 
     return scatter_entries
 
@@ -506,9 +487,9 @@ def _scatter(name: str | None) -> Callable[..., Any]:
 SUMS = {"sum": "add", "prod": "mul", "max": "max", "min": "min"}
 
 INDEXED: dict[str, Callable[..., Any]] = {
-    "gather": gather,
-    "dynamic_slice": dynamic_slice,
-    "dynamic_update_slice": dynamic_update_slice,
+    "gather": arrays.gather,
+    "dynamic_slice": arrays.dynamic_slice,
+    "dynamic_update_slice": arrays.dynamic_update_slice,
     "scatter": _scatter(None),
     "scatter-add": _scatter("add"),
     "scatter-mul": _scatter("mul"),
@@ -520,10 +501,10 @@ INDEXED: dict[str, Callable[..., Any]] = {
 RULES: dict[str, Callable[..., Any]] = {
     "argmax": _find_first("ge"),
     "argmin": _find_first("le"),
-    "lu": lu,
-    "cholesky": cholesky,
-    "triangular_solve": triangular_solve,
-    "sort": sort,
+    "lu": arrays.lu,
+    "cholesky": arrays.cholesky,
+    "triangular_solve": arrays.triangular_solve,
+    "sort": arrays.sort,
     "dot_general": _dot,
     **{f"reduce_{name}": _reduce(op) for name, op in SUMS.items()},
     **{f"reduce_{name}": _reduce(name) for name in ("and", "or", "xor")},
