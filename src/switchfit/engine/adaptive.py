@@ -240,10 +240,8 @@ class _Solve:
             known = run.solvers.__dict__ if coarse is run.coarse else {}
             key = f"{'' if course is None else course.branches.version} {chosen.implicit}"
             if key not in known:
-                made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
-                if made is None and chosen is not structure:
-                    made = native_experiment(structure, whole, coarse.times, order=Order.COST)
-                known[key] = made
+                made = (native_experiment(each, whole, coarse.times, Order.COST) for each in (chosen, structure))
+                known[key] = next(filter(None, made), None)
             self._native = known[key]
         self._p = np.zeros(0)
 
@@ -277,12 +275,13 @@ class _Solve:
         return np.concatenate(steps)
 
     def _find_initial_state(self) -> FloatArray:
-        if self._native is None:
-            x = self._call_model(Model.initial_state, self._structure.functions)
+        native, p = self._native, self._p
+        if native is None:
+            x = self._call_model(Model.initial_state, structure=self._structure.functions)
         else:
-            x = self._native.initial_state(self._p)
+            x = native.initial_state(p)
         if not np.isfinite(x).all():
-            named = read_parameters(self._structure, self._arguments, self._p)
+            named = read_parameters(self._structure, self._arguments, p)
             # of an array of which some entries are read, these alone
             shown = {name: named[name].ravel()[list(read)] for name, _, read in self._structure.parameters if read}
             whole = {name: value for name, value in named.items() if value.size == np.size(shown.get(name, value))}
@@ -292,11 +291,11 @@ class _Solve:
 
     def _apply_reset(self, i: int, t: float, x: FloatArray) -> FloatArray:
         """Return the state after the reset map of transition i (from 0)."""
-        structure = self._structure
-        if self._native is None:
-            after = self._call_model(_apply_reset, structure, t, x, which=(i,))
+        structure, native, p = self._structure, self._native, self._p
+        if native is None:
+            after = self._call_model(_apply_reset, t, x, structure=structure, which=(i,))
         else:
-            after = self._native.after_reset(i, t, x, self._p)
+            after = native.after_reset(i, t, x, p)
         if not np.isfinite(after).all():
             names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i : i + 2])
             what = "the map of a Jump" if i in structure.jumps else f"reset map {names}"
@@ -421,13 +420,10 @@ class _Solve:
 
         return slope
 
-    def _call_model(
-        self, function: Callable[..., jax.Array], structure: Structure, *given: Any, which: tuple[int, ...] = ()
-    ) -> FloatArray:
+    def _call_model(self, function: Callable[..., jax.Array], *given: Any, **settings: Any) -> FloatArray:
         """Return the value of a function of the model, at the parameters."""
         with use_float64(), use_compilation_cache():
-            value = call_model(self._arguments, *given, self._p, structure=structure, function=function, which=which)
-            return np.asarray(value)
+            return np.asarray(call_model(self._arguments, *given, self._p, function=function, **settings))
 
     def _report_stuck(self, stretch: _Stretch, t: float, x: FloatArray, reason: str | None) -> NotIntegrableError:
         """Return the error of a solve that cannot go on beyond t, where x is the state."""

@@ -35,7 +35,7 @@ from switchfit.engine.native.llvm import Module, Program, Value, Variable
 from switchfit.engine.native.program import PREFIX, compile_library, write_slope
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Node, Objects, Template
 from switchfit.engine.native.segments import Pointers, Writer, add_curvature, solve_stages, write_newton
-from switchfit.engine.native.templates import F_X, GRADIENT, SECOND, F, Order, Sizes, constants_of
+from switchfit.engine.native.templates import COST_TO_GO, F_X, F, Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -143,7 +143,7 @@ class HypothesisKernels(Kernels):
             # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
             # J.
             given = at(t, X, hb=h * weight)
-            g_x, g_p, S = stage(graph, *given, only=(*GRADIENT[1:], *SECOND), checked=True)
+            g_x, g_p, S = stage(graph, *given, only=COST_TO_GO[1:], checked=True)
             # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
             # future.
             g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)

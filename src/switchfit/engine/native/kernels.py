@@ -42,20 +42,7 @@ from switchfit.discretization.rows import EXPLICIT, STIFF, Stages, Tableau, Tang
 from switchfit.engine.native.elimination import Elimination, Routine, count_factors, eliminate
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.scalars import CHECKED, MAY_FAIL, Graph, Namespace, Node, Objects, Template
-from switchfit.engine.native.templates import (
-    ELL,
-    ELL_X,
-    F_P,
-    F_T,
-    F_X,
-    GRADIENT,
-    SECOND,
-    SLOPES,
-    F,
-    Order,
-    Sizes,
-    Templates,
-)
+from switchfit.engine.native.templates import COST_TO_GO, ELL, ELL_X, F_P, F_T, F_X, SLOPES, F, Order, Sizes, Templates
 from switchfit.problem.structure import Structure
 
 STAGES = len(EXPLICIT.b)
@@ -333,7 +320,7 @@ class Kernels:
 
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
             given = at(times[j], states[j], w, hb)
-            g_t, g_x, g_p, S = stage(graph, *given, only=GRADIENT + SECOND, checked=True, known=known[j])
+            g_t, g_x, g_p, S = stage(graph, *given, only=COST_TO_GO, checked=True, known=known[j])
             second[j] = list_entries(S, with_time=moving)
             if moving:
                 slopes[j] = stage(graph, *given, only=SLOPES, known=known[j])

@@ -24,8 +24,7 @@ F, F_T, F_X, F_P, ELL, _, ELL_X = range(7)
 SLOPES = tuple(range(8))
 """Positions in the outputs of `Templates.stage`: f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p."""
 
-GRADIENT = (8, 9, 10)
-SECOND = (11,)
+COST_TO_GO = (8, 9, 10, 11)
 """Positions of the derivatives of ``w . f + hb ell``: first in t, x and p; second along (t, x, p), as one matrix."""
 
 
@@ -107,7 +106,7 @@ class Templates:
         return Model(self.library, arguments)
 
     def stage(self, mode: int, running: bool = True) -> Template:
-        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `SECOND` are their positions.
+        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `COST_TO_GO` are their positions.
 
         Without `running`, ell is zero. At order COST there are f and ell alone, with D_1 f and D_1 ell in a mode that
         takes implicit steps.
