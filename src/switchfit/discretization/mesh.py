@@ -322,7 +322,9 @@ def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Argume
         padded._replace(cell=_pad_with_last(mesh.cell_ending_at(item.seen_times), len(padded.time), 0))  # type: ignore[arg-type]
         for item, padded in zip(measurements, common.samples, strict=True)
     )
-    signals = _split_signals_by_cell(experiment, mesh)
+    # Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S).
+    split = [split_by_cell(signal, mesh) for signal in experiment.signals]
+    signals = split[0] if len(split) == 1 else np.concatenate([np.zeros((len(mesh.nodes) - 1, 4, 0)), *split], axis=2)
     return common._replace(nodes=mesh.nodes, signals=signals, samples=samples)  # type: ignore[arg-type]  # made jax arrays
 
 
@@ -367,13 +369,6 @@ def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[An
     padded = np.full(length, array[-1] if len(array) else first, array.dtype)
     padded[: len(array)] = array
     return padded
-
-
-def _split_signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
-    """Return every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
-    signals = [split_by_cell(signal, mesh) for signal in experiment.signals]
-    none = np.zeros((len(mesh.nodes) - 1, 4, 0))
-    return signals[0] if len(signals) == 1 else np.concatenate([none, *signals], axis=2)
 
 
 def split_by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:

@@ -322,10 +322,10 @@ class _Solve:
                 return steps, x
             # The middle of what is left of the stretch says which cell of the signals is meant at its ends.
             rest = stretch._replace(start=crossing.time, x=x)
-            if crossing.time >= stretch.end:
-                self._course.cross(crossing, stretch.middle)
+            is_end = crossing.time >= stretch.end
+            self._course.cross(crossing, (stretch if is_end else rest).middle)
+            if is_end:
                 return steps, x
-            self._course.cross(crossing, rest.middle)
             stretch = rest
 
     def _solve(self, stretch: _Stretch) -> tuple[FloatArray, FloatArray, Crossing | None]:
@@ -362,7 +362,7 @@ class _Solve:
     ) -> tuple[FloatArray, FloatArray, Crossing | None]:
         """Do what `_solve` does by steps of one kind."""
         course, natively = self._course, isinstance(steps, _NativeSteps)
-        accepted, x = [stretch.start], stretch.x
+        accepted, x, reason = [stretch.start], stretch.x, None
         # Between two calls Python looks: for corners that the steps have passed, and for stiffness.
         at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
         while steps.is_running:
@@ -374,10 +374,8 @@ class _Solve:
                     raise _NativeError
                 if watch is not None:
                     watch.give_up(_project_steps(accepted, stretch.end))
-                if course is not None:
-                    course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
                 reason = f"it needs more than {self._settings.most} steps"
-                raise self._report_stuck(stretch, accepted[-1], steps.y[:-1], reason)
+                break
             times, states = steps.advance(at_once)
             if course is not None:
                 # Steps behind a crossing were taken by the field of the wrong branch, and are dropped.
@@ -399,7 +397,9 @@ class _Solve:
         if course is not None:
             course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
         if steps.t < stretch.end or not np.isfinite(steps.y).all():
-            raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
+            if natively and reason is None:
+                raise _NativeError
+            raise self._report_stuck(stretch, steps.t, steps.y[:-1], reason or steps.message)
         return np.array(accepted[1:]), steps.y[:-1], None
 
     def _build_slope(self, stretch: _Stretch, mode: int) -> Slope:

@@ -176,26 +176,24 @@ def _differentiate_twice(
     return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
 
 
-def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
     """Return the derivative (D,) of the first result, and the second."""
-    derivative, other = jax.jacfwd(function, has_aux=True)(theta)
-    return derivative, other
+    return jax.jacfwd(function, has_aux=True)(theta)
 
 
-def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
     """Do what `_differentiate_forward` does, backward; forward through a loop of unknown length, as JAX cannot else."""
     return _try_backward(function, theta) or _differentiate_forward(function, theta)
 
 
-def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> tuple[Array, Any] | None:
+def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> Any:
     """Return the derivative of the first result, and the second; None if there is a loop of unknown length."""
     try:
-        derivative, other = jax.grad(function, has_aux=True)(at)
+        return jax.grad(function, has_aux=True)(at)
     except ValueError as error:
         if NOT_BACKWARD not in str(error):
             raise
         return None
-    return derivative, other
 
 
 @partial(jax.jit, static_argnames=("structure",))
@@ -260,8 +258,8 @@ def simulate_rows(
     if not tangents:
         return J, seen, rows, ()
 
+    # At the rows that begin or end at a transition, dx/dt times the derivative of the time is subtracted.
     def fix_times(values: Array, moving: Array, side: int) -> Array:
-        """Subtract dx/dt times the derivative of the time at the rows that begin or end at a transition."""
         for i in range(N):
             row = opening[i] - 1 + side
             piece = jax.tree.map(lambda a, row=row: a[row], path.pieces)

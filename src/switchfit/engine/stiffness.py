@@ -48,8 +48,6 @@ LOOKS_TO_STOP = 20
 """Looks in a row at which stability limits the step after which the explicit solve is given up: the steps that it would
 take are known well enough from its pace. It took 25 ms to the end, where friction is regularised at 1e-6 m/s."""
 
-_LOOKS_THAT_MAY_STOP = range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
-
 LIMITED = 2.0
 """``|lambda| h`` from which stability limits the step: the region of stability reaches to 3.3 for eigenvalues whose
 damping ratio is above 0.3, to 2.1 for one of 0.02. Accuracy limits it to less: at rtol = 1e-8 to 0.1 in an
@@ -206,7 +204,8 @@ class Watch:
         """Return whether the current mode is stiff, however its solve goes on, and may take implicit steps."""
         looks = self.modes[self.current].looks
         # 20 of at most 60 looks are more than a quarter of them.
-        if self.refused is None or self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
+        may_stop = len(looks) in range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
+        if self.refused is None or self.current in self.refused or not may_stop:
             return False
         last = looks[-LOOKS_TO_STOP:]
         rates = _measure_rates(last)
