@@ -47,7 +47,6 @@ Functions of one step take `xp`, the module for their arrays: NumPy, or the name
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, NamedTuple, Protocol
@@ -539,16 +538,10 @@ def first_step(
 
     NaN if a slope is not finite.
     """
-
-    def size(error: FloatArray) -> float:
-        relative = error / weight
-        return math.sqrt(relative.dot(relative) / len(y))  # `error_norm`, in half the time
-
     with np.errstate(all="ignore"):
-        weight = tolerances.atol + tolerances.rtol * np.abs(y)
         if not np.isfinite(K).all():
             return np.nan
-        of_state, of_slope = size(y), size(K)
+        of_state, of_slope = (float(error_norm(each, y, y, tolerances)) for each in (y, K))
         if not np.isfinite(of_slope):  # its square overflows: the first step will fail, with a message
             return min(1e-6, end - t)
         # An Euler step h_0 that moves y by 1 % of its size, then h_1 from (h_1)^q max(|f|, |df| / h_0) = 0.01: the
@@ -557,7 +550,7 @@ def first_step(
         step = 0.0
         if guess > 0.0:
             ahead = min(t + guess, float(np.nextafter(end, t)))
-            bend = size(slope(ahead, y + guess * K) - K) / guess
+            bend = float(error_norm(slope(ahead, y + guess * K) - K, y, y, tolerances)) / guess
             flat = of_slope <= 1e-15 and bend <= 1e-15
             step = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** -exponent
         step = min(100.0 * guess, step)

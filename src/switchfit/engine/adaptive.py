@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -68,8 +68,7 @@ ROWS_BY_JAX = {True: 20_000, False: 200_000}
 """Work of an explicit and of an implicit row in JAX, in additions of machine code: 5 and 50 us, for 2 to 4 states."""
 
 
-@dataclass(frozen=True)
-class Settings:
+class Settings(NamedTuple):
     """How an experiment is solved adaptively.
 
     Attributes

@@ -15,7 +15,7 @@ slides.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -70,8 +70,7 @@ def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
     return evaluate
 
 
-@dataclass(frozen=True)
-class Path:
+class Path(NamedTuple):
     """Branches of a trajectory.
 
     Attributes

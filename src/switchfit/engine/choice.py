@@ -330,7 +330,7 @@ class SplitEngine:
 
     def _holds(self, split: _Split, times: FloatArray, p: FloatArray) -> bool:
         """Return whether the trajectory is inside its branches at the ends of all rows, and in dips between them."""
-        found = split.engine.trace(times, p)
+        found = split.engine.simulate(times, p, tangents=False)
         course = Course(self._branches, self._structure, self._arguments, p)
         # All rows of one branch together: one call evaluates the functions of its ends for all of them.
         pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)

@@ -369,10 +369,6 @@ class JaxEngine:
             found = call_model(*given, structure=self._structure.functions, function=_compute_fields)
         return np.asarray(found)[:count]
 
-    def trace(self, tau: FloatArray, p: FloatArray) -> Simulation:
-        """Return all rows."""
-        return self.simulate(tau, p, tangents=False)
-
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         key = np.concatenate([tau, p]).tobytes()

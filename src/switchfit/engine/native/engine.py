@@ -576,14 +576,6 @@ class NativeEngine:
         given = times, cells, states, p
         return self._try(Order.COST, NativeExperiment.slopes, self._fallback.slopes, *given)
 
-    def trace(self, tau: FloatArray, p: FloatArray) -> Simulation:
-        """Return all rows, without outputs."""
-
-        def simulate(native: NativeExperiment, *given: FloatArray) -> Simulation:
-            return cut_at_tf(native.simulate(*given)[0], self._structure)
-
-        return self._try(Order.COST, simulate, self._fallback.trace, tau, p)
-
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         by_jax = partial(self._fallback.simulate, tangents=tangents)

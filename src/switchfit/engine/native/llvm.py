@@ -37,7 +37,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.scalars import FROM_LIBM, LONG, OPERATIONS, Node, Operation, list_needed
+from switchfit.engine.native.scalars import FROM_LIBM, OPERATIONS, Node, Operation, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 Found = TypeVar("Found")
@@ -393,10 +393,6 @@ LOOKUP = 3
 """Cost of a table lookup, in additions."""
 
 
-EFFORT = dict.fromkeys(LONG, 20) | {"div": 4, "sqrt": 4, "lookup": 3}
-"""Cost of operations, in additions, where it is not 1."""
-
-
 class Module:
     """Text of LLVM functions, collected one by one and taken in parts.
 
@@ -596,8 +592,6 @@ class Program:
     ----------
     key : str
         Hash of the module, the same in every process.
-    row_work : list of int
-        Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
     lock : held during a call, since ctypes releases the GIL
     memory : array of doubles
         Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.

@@ -243,17 +243,15 @@ class Node:
 def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
     """Return whether an operation yields a truth value; raise TypeError if its arguments have the wrong type for it."""
     operation = OPERATIONS.get(op)
+    if operation is None:
+        return op == "const" and isinstance(args[0], bool)
     if op == "select":
-        condition, yes, no = args
-        if not condition.truth or yes.truth is not no.truth:
-            raise TypeError("select takes a truth value, then two cases of one type")
-        return bool(yes.truth)
-    if operation is not None:
-        for a in args:
-            if a.truth is not operation.takes_truth:
-                raise TypeError(f"{op} does not take {'a truth value' if a.truth else 'a double'}")
-        return operation.gives_truth
-    return op == "const" and isinstance(args[0], bool)
+        takes, gives = (True, args[1].truth, args[1].truth), args[1].truth
+    else:
+        takes, gives = (operation.takes_truth,) * len(args), operation.gives_truth
+    if any(a.truth is not each for a, each in zip(args, takes, strict=True)):
+        raise TypeError(f"{op} takes other types: truth values for doubles, or the other way round")
+    return bool(gives)
 
 
 class Graph:
