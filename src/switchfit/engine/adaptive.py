@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -68,7 +68,8 @@ ROWS_BY_JAX = {True: 20_000, False: 200_000}
 """Work of an explicit and of an implicit row in JAX, in additions of machine code: 5 and 50 us, for 2 to 4 states."""
 
 
-class Settings(NamedTuple):
+@dataclass(frozen=True)
+class Settings:
     """How an experiment is solved adaptively.
 
     Attributes
