@@ -192,12 +192,7 @@ class Stages(NamedTuple):
 
 
 def stages(
-    tableau: Tableau,
-    f: Callable[[Array, Array], Array],
-    start: Array,
-    end: Array,
-    x: Array,
-    increments: Sequence[Array] = (),
+    tableau: Tableau, f: Callable[..., Array], start: Array, end: Array, x: Array, increments: Sequence[Array] = ()
 ) -> Stages:
     """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field.
 

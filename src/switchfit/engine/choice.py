@@ -52,6 +52,7 @@ LOST = "the trajectory cannot be followed through the corners of its modes at th
 REQUIRED = "engine='native' requires machine code, but {}. Leave engine out to evaluate with JAX."
 
 Build = Callable[[Structure], NativeEngine | JaxEngine]
+Evaluate = Callable[[Structure, FloatArray], Evaluation[FloatArray]]
 
 
 OWN = -2
@@ -136,12 +137,7 @@ class SplitEngine:
         return self._solve(tau, p, 1.0)[1].cost
 
     def derivatives(
-        self,
-        tau: FloatArray,
-        p: FloatArray,
-        side: float,
-        matrix: Matrix,
-        method: Callable[[Structure, FloatArray], Evaluation[FloatArray]] | None = None,
+        self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Evaluate | None = None
     ) -> Evaluation[FloatArray]:
         """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
         split, found = self._solve(tau, p, side)

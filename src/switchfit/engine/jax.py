@@ -34,7 +34,7 @@ from switchfit.discretization.propagation import (
     switch_mode,
     weigh_stages,
 )
-from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, add_samples, cut_at_tf
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, finish_simulation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure, pad_length
@@ -155,10 +155,7 @@ def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False
 
 
 def _differentiate_twice(
-    evaluate: Callable[[Array], tuple[Array, Array]],
-    theta: Array,
-    multipliers: Array,
-    differentiate: Callable[..., Any],
+    evaluate: Callable[..., tuple[Array, Array]], theta: Array, multipliers: Array, differentiate: Callable[..., Any]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return what `derivatives` does with multipliers, of a function that returns J and c."""
 
@@ -392,8 +389,8 @@ class JaxEngine:
             y_after,
             tangents=Tangents(*(each[rows] for each in derivatives)) if tangents else None,
         )
-        all_seen = add_samples(simulation, self._structure, self._arguments, dict(zip(which, late, strict=True)))
-        simulation = cut_at_tf(all_seen, self._structure)
+        seen = dict(zip(which, late, strict=True))
+        simulation = finish_simulation(simulation, self._structure, self._arguments, seen)
         if not tangents:
             self._last = key, simulation
         return simulation

@@ -177,8 +177,10 @@ def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     return node
 
 
-Meaning = Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]
-"""Takes a graph, the parameters of a JAX operation and the type of its result; returns the operation on entries."""
+Meaning = Callable[..., Any]
+"""What a JAX operation does to entries: takes a graph, the parameters of the operation, the type of the last operand,
+then an entry of each operand.
+"""
 
 LARGEST = 2**51
 """Bound below which sums, products and quotients of doubles are exact for integers."""
@@ -203,17 +205,14 @@ def within(graph: Graph, found: Integer, dtype: np.dtype[Any]) -> Any:
 def _exactly(op: str, value: Callable[..., int]) -> Meaning:
     """Return an operation on doubles; its result is between the extremes at the bounds of the operands and at zero."""
 
-    def get_meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-        def apply(*given: Any) -> Any:
-            args = [Integer.of(graph, a) for a in given]
-            corners = [value(*c) for c in product(*((a.low, a.high, min(max(0, a.low), a.high)) for a in args))]
-            low, high = min(corners), max(corners)
-            node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
-            return within(graph, Integer(node, low, high), dtype)
+    def apply(graph: Graph, params: Any, dtype: np.dtype[Any], *given: Any) -> Any:
+        args = [Integer.of(graph, a) for a in given]
+        corners = [value(*c) for c in product(*((a.low, a.high, min(max(0, a.low), a.high)) for a in args))]
+        low, high = min(corners), max(corners)
+        node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
+        return within(graph, Integer(node, low, high), dtype)
 
-        return apply
-
-    return get_meaning
+    return apply
 
 
 def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
@@ -222,35 +221,23 @@ def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -
     return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
 
 
-def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """Return division rounded towards zero; division by zero yields -1."""
-
-    def divide(one: Any, other: Any) -> Any:
-        a, b = Integer.of(graph, one), Integer.of(graph, other)
-        largest = max(abs(a.low), abs(a.high), 1)
-        low = 0 if a.low >= 0 and b.low >= 0 else -largest
-        node = _drop_sign_of_zero(graph, graph.apply("trunc", a.node / b.node), -largest, largest, "trunc")
-        return choose(graph, equal(graph, b, 0), -1, within(graph, Integer(node, low, largest), dtype))
-
-    return divide
+def _divide(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, other: Any) -> Any:
+    """Divide, rounded towards zero; division by zero yields -1."""
+    a, b = Integer.of(graph, one), Integer.of(graph, other)
+    largest = max(abs(a.low), abs(a.high), 1)
+    low = 0 if a.low >= 0 and b.low >= 0 else -largest
+    node = _drop_sign_of_zero(graph, graph.apply("trunc", a.node / b.node), -largest, largest, "trunc")
+    return choose(graph, equal(graph, b, 0), -1, within(graph, Integer(node, low, largest), dtype))
 
 
-def _remainder(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def _find_remainder(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, other: Any) -> Any:
     """Return the remainder with the sign of the dividend; for a division by zero, it is the dividend itself."""
-
-    def remainder(one: Any, other: Any) -> Any:
-        a, b = Integer.of(graph, one), Integer.of(graph, other)
-        nonzero = Integer.of(graph, choose(graph, equal(graph, b, 0), 1, b))
-        largest = max(abs(b.low), abs(b.high)) - 1
-        node = a.node - nonzero.node * graph.apply("trunc", a.node / nonzero.node)
-        low, high = (0 if a.low >= 0 else -max(largest, 0)), (0 if a.high <= 0 else max(largest, 0))
-        return choose(graph, equal(graph, b, 0), a, Integer(node, low, high))
-
-    return remainder
-
-
-def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
-    return lambda a: choose(graph, less(graph, a, 0), -1, choose(graph, less(graph, 0, a), 1, 0))
+    a, b = Integer.of(graph, one), Integer.of(graph, other)
+    nonzero = Integer.of(graph, choose(graph, equal(graph, b, 0), 1, b))
+    largest = max(abs(b.low), abs(b.high)) - 1
+    node = a.node - nonzero.node * graph.apply("trunc", a.node / nonzero.node)
+    low, high = (0 if a.low >= 0 else -max(largest, 0)), (0 if a.high <= 0 else max(largest, 0))
+    return choose(graph, equal(graph, b, 0), a, Integer(node, low, high))
 
 
 def _choose_extreme(graph: Graph, extreme: Callable[..., int], a: Any, b: Any) -> Integer:
@@ -261,18 +248,13 @@ def _choose_extreme(graph: Graph, extreme: Callable[..., int], a: Any, b: Any) -
     return Integer(node, extreme(one.low, other.low), extreme(one.high, other.high))
 
 
-def from_double(graph: Graph, kind: np.dtype[Any]) -> Callable[[Any], Any]:
-    """Return the conversion of doubles to integers of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
-    least, most = _bounds(kind)
-
-    def convert(a: Any) -> Any:
-        rounded = graph.apply("trunc", a)
-        number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)
-        if kind.itemsize == 8:
-            graph.require(graph.apply("le", graph.apply("abs", number), float(most)))
-        return clamp(graph, Integer(number, least - 1, most + 1), least, most)
-
-    return convert
+def from_double(graph: Graph, kind: np.dtype[Any], a: Any) -> Any:
+    """Return a double as an integer of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
+    (least, most), rounded = _bounds(kind), graph.apply("trunc", a)
+    number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)
+    if kind.itemsize == 8:
+        graph.require(graph.apply("le", graph.apply("abs", number), float(most)))
+    return clamp(graph, Integer(number, least - 1, most + 1), least, most)
 
 
 OF_INTEGERS: dict[str, Meaning] = {
@@ -281,17 +263,17 @@ OF_INTEGERS: dict[str, Meaning] = {
     "mul": _exactly("mul", operator.mul),
     "neg": _exactly("neg", operator.neg),
     "abs": _exactly("abs", abs),
-    "div": _quotient,
-    "rem": _remainder,
-    "sign": _sign,
-    "max": lambda graph, params, dtype: partial(_choose_extreme, graph, max),
-    "min": lambda graph, params, dtype: partial(_choose_extreme, graph, min),
-    "lt": lambda graph, params, dtype: partial(less, graph),
-    "gt": lambda graph, params, dtype: lambda a, b: less(graph, b, a),
-    "le": lambda graph, params, dtype: lambda a, b: graph.apply("not", less(graph, b, a)),
-    "ge": lambda graph, params, dtype: lambda a, b: graph.apply("not", less(graph, a, b)),
-    "eq": lambda graph, params, dtype: partial(equal, graph),
-    "ne": lambda graph, params, dtype: lambda a, b: graph.apply("not", equal(graph, a, b)),
+    "div": _divide,
+    "rem": _find_remainder,
+    "sign": lambda graph, _, __, a: choose(graph, less(graph, a, 0), -1, choose(graph, less(graph, 0, a), 1, 0)),
+    "max": lambda graph, _, __, a, b: _choose_extreme(graph, max, a, b),
+    "min": lambda graph, _, __, a, b: _choose_extreme(graph, min, a, b),
+    "lt": lambda graph, _, __, a, b: less(graph, a, b),
+    "gt": lambda graph, _, __, a, b: less(graph, b, a),
+    "le": lambda graph, _, __, a, b: graph.apply("not", less(graph, b, a)),
+    "ge": lambda graph, _, __, a, b: graph.apply("not", less(graph, a, b)),
+    "eq": lambda graph, _, __, a, b: equal(graph, a, b),
+    "ne": lambda graph, _, __, a, b: graph.apply("not", equal(graph, a, b)),
 }
 """Operations on each entry of arrays of integers; comparisons too."""
 
@@ -326,7 +308,7 @@ def _get_reach(start: Any, size: int) -> slice:
 
 def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:
     """Take a window of a known array that moves along several axes: each entry by one index into a table."""
-    multiply, add, subtract = (OF_INTEGERS[op](graph, {}, np.dtype(np.int64)) for op in ("mul", "add", "sub"))
+    multiply, add, subtract = (partial(OF_INTEGERS[op], graph, {}, np.dtype(int)) for op in ("mul", "add", "sub"))
     spans = [start.high - start.low + 1 for start in starts]
     index: Any = 0
     for start, span in zip(starts, spans, strict=True):

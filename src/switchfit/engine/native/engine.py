@@ -29,7 +29,7 @@ from switchfit.engine.native.program import PREFIX, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, layout_of
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, add_samples, cut_at_tf
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, finish_simulation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -602,7 +602,7 @@ class NativeEngine:
         tangents = None if found.tangents is None else Tangents(before_d, after_d, y_before_d, y_after_d)
         simulation = replace(found, y_before=y_before, y_after=y_after, tangents=tangents)
         seen = {k: native.outputs(each[:, 0], each[:, 1:], p, np.zeros(0))[0] for k, each in late.items()}
-        return cut_at_tf(add_samples(simulation, structure, self._arguments, seen), structure)
+        return finish_simulation(simulation, structure, self._arguments, seen)
 
 
 _registered: dict[str, Program] = {}

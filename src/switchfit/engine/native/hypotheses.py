@@ -542,7 +542,9 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
 SLOT = int(Column.SLOT)
 
 
-SampleArrays = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+Integers = NDArray[np.int64]
+
+SampleArrays = tuple[Integers, FloatArray, FloatArray, FloatArray]
 """Of one Measurements: the place of the first sample at each node (G + 2,), times (K,), values and weights (K, q)."""
 
 
@@ -559,10 +561,10 @@ class OrderTables(NamedTuple):
     stops : (L,), nodes between which births are
     """
 
-    children: NDArray[np.int64]
-    counts: NDArray[np.int64]
+    children: Integers
+    counts: Integers
     windows: FloatArray
-    stops: NDArray[np.int64]
+    stops: Integers
 
 
 class NativeHypotheses:
@@ -666,7 +668,7 @@ class NativeHypotheses:
         counts, children = np.zeros((1, 2), dtype=np.int64), np.zeros((1, 0, COLUMNS), dtype=np.int64)
         return self.replay(start, p[None], counts, children, np.zeros((1, 0)), 0, recentres=False)
 
-    def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
+    def advance(self, parents: Hypotheses, children: Integers, first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
 
         The samples at the first node are those of the parents; the births come after them.
@@ -678,14 +680,8 @@ class NativeHypotheses:
         return self._go_on(parents.records, counts, children, times, (first, last, False))
 
     def follow_order(
-        self,
-        parents: FloatArray,
-        places: NDArray[np.int64],
-        births: FloatArray,
-        order: OrderTables,
-        first: int,
-        last: int,
-    ) -> tuple[NDArray[np.int64], FloatArray, Hypotheses]:
+        self, parents: FloatArray, places: Integers, births: FloatArray, order: OrderTables, first: int, last: int
+    ) -> tuple[Integers, FloatArray, Hypotheses]:
         """Take hypotheses from one stop to another in a given order of modes; the lowest scores of each place are kept.
 
         Parameters
@@ -720,8 +716,8 @@ class NativeHypotheses:
         self,
         start: Hypotheses,
         p: FloatArray,
-        counts: NDArray[np.int64],
-        children: NDArray[np.int64],
+        counts: Integers,
+        children: Integers,
         times: FloatArray,
         last: int,
         first: int | None = None,
@@ -755,8 +751,8 @@ class NativeHypotheses:
     def _go_on(
         self,
         parents: FloatArray,
-        counts: NDArray[np.int64],
-        children: NDArray[np.int64],
+        counts: Integers,
+        children: Integers,
         times: FloatArray,
         places: tuple[int, int, bool],
         recentres: bool = True,

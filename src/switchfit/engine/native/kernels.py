@@ -49,6 +49,7 @@ STAGES = len(EXPLICIT.b)
 """Stages of a row, or stages and slopes of an implicit one, that have memory."""
 
 Store = tuple[str, int, Node]
+Factors = Elimination | Routine | None
 Along = list[tuple[Node, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
@@ -161,9 +162,7 @@ class Kernels:
         n = self.sizes.n
         return [graph.loads("increments", n, j * n) for j in range(STIFF.coupled)]
 
-    def forward_row(
-        self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau
-    ) -> Elimination | Routine | None:
+    def forward_row(self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau) -> Factors:
         """Write the forward step of a row: its stages, the state after it, their derivatives and its running cost.
 
         Return the factors that it keeps.
@@ -285,14 +284,7 @@ class Kernels:
         self.module.write_straight_line(name, store_all("errors", 0, largest))
 
     def backward_row(
-        self,
-        name: str,
-        stage: Template,
-        moving: bool,
-        costs: bool,
-        tableau: Tableau,
-        factors: Elimination | Routine | None,
-        late: bool = False,
+        self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, factors: Factors, late: bool
     ) -> list[tuple[int, int]]:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
@@ -440,21 +432,21 @@ class Kernels:
             if self.goes_back:
                 self._map_back(name, template, of_start=name == "start")
         for kind in AT_TRANSITIONS:
-            inputs: tuple[str, ...] = ("time", "x", "p", "multiplier", "origin", "signal")
+            inputs = "time", "x", "p", "multiplier", "origin", "signal"
             add = self._constraint if kind == "guards" else self._cost
             for which in range(len(getattr(library, kind))):
                 template = self.templates.transition(kind, which)
-                self._write_node(f"{kind}_{which}", add, template, inputs, moving=True, multiplier=1)
+                self._write_node(f"{kind}_{which}", add, template, True, *inputs, multiplier=1)
         for k, sensor in enumerate(library.measurements):
-            template, inputs = self.templates.sample(k), ("time", "value", "weight", "x", "p")
-            lengths = dict.fromkeys(("value", "weight"), sensor.channels)
+            template, lengths = self.templates.sample(k), dict.fromkeys(("value", "weight"), sensor.channels)
             is_late = sensor.delay is not None  # its time depends on theta then
-            self._write_node(f"sample_{k}", self._cost, template, inputs, is_late, **lengths)
+            self._write_node(f"sample_{k}", self._cost, template, is_late, "time", *lengths, "x", "p", **lengths)
         if library.terminal:
-            self._write_node("end", self._cost, self.templates.end(), ("x", "p"), moving=False)
+            self._write_node("end", self._cost, self.templates.end(), False, "x", "p")
         if library.terminal_constraints:
-            template, inputs, m = self.templates.end_constraint(), ("x", "p", "multiplier"), self.sizes.m
-            self._write_node("end_constraint", self._constraint, template, inputs, moving=False, multiplier=m)
+            given = False, "x", "p", "multiplier"
+            template = self.templates.end_constraint()
+            self._write_node("end_constraint", self._constraint, template, *given, multiplier=self.sizes.m)
 
     def _map_forward(self, name: str, template: Template) -> None:
         graph, n, checked = Graph(), self.sizes.n, not self.goes_back
@@ -502,15 +494,11 @@ class Kernels:
         self.module.write_straight_line("end_of_late", stores)
 
     def _write_node(
-        self,
-        name: str,
-        add: Callable[[Graph, Sequence[Objects], bool], list[Store]],
-        template: Template,
-        inputs: tuple[str, ...],
-        moving: bool,
-        **lengths: int,
+        self, name: str, add: Callable[..., Any], template: Template, moving: bool, *inputs: str, **lengths: int
     ) -> None:
-        """Write a cost, or constraints, at a node; `moving` if its time depends on theta."""
+        """Write the stores that `add` returns for a cost, or constraints, at a node; `moving` if its time depends on
+        theta.
+        """
         graph = Graph()
         found = template(graph, *self._load_inputs(graph, *inputs, **lengths), checked=True)
         self.module.write_straight_line(name, add(graph, found, moving) + graph.check())

@@ -160,10 +160,10 @@ def _evaluate_known(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """Return what an operation does to entries of arrays of a type."""
+    """Return what an operation does to entries, of arrays of which the last has a type."""
     table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, arrays.OF_INTEGERS)
     if name in table:
-        return table[name](graph, params, dtype)
+        return partial(table[name], graph, params, dtype)
     if dtype.kind in "iu" and name not in OTHER_NAMES:
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
@@ -217,7 +217,7 @@ def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     if known is not None:
         return _run(graph, branches[int(np.clip(known, 0, len(branches) - 1))], operands)
     results = [_run(graph, branch, operands) for branch in branches]
-    select = np.frompyfunc(partial(_select(graph), choice), len(branches), 1)
+    select = np.frompyfunc(partial(_select, graph, None, None, choice), len(branches), 1)
     return [np.asarray(select(*cases), dtype=object) for cases in zip(*results, strict=True)]
 
 
@@ -297,62 +297,53 @@ NUMPY: dict[str, Callable[..., Any]] = {
 # Entries of any type
 
 
-def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+def _convert(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
     kind = np.dtype(params["new_dtype"])
     if kind.kind not in "biu" and kind != np.float64:
         raise Unsupported(f"converts what depends on the state to {kind}")
     if kind.kind == dtype.kind and kind.kind in "bf":
-        return lambda a: a
-    if kind.kind == "b":
-        return lambda a: graph.apply("ne", a if dtype.kind == "f" else Integer.of(graph, a).node, 0.0)
+        return a
     if dtype.kind == "f":
-        return arrays.from_double(graph, kind)
-    if kind.kind == "f":
-        return lambda a: Integer.of(graph, a).node
-    return lambda a: arrays.within(graph, Integer.of(graph, a), kind)
+        return graph.apply("ne", a, 0.0) if kind.kind == "b" else arrays.from_double(graph, kind, a)
+    number = Integer.of(graph, a)
+    if kind.kind in "iu":
+        return arrays.within(graph, number, kind)
+    return number.node if kind.kind == "f" else graph.apply("ne", number.node, 0.0)
 
 
-def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+def _raise_to_integer(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
     exponent, multiply = int(params["y"]), _get_meaning(graph, "mul", {}, dtype)
-
-    def power(a: Any) -> Any:
-        # By squares: x^k takes about 2 log2 k products.
-        result, square, left = 1, a, abs(exponent)
-        while left:
-            if left & 1:
-                result = multiply(result, square)
-            left >>= 1
-            square = multiply(square, square) if left else square
-        return graph.apply("div", 1.0, result) if exponent < 0 else result
-
-    return power
+    # By squares: x^k takes about 2 log2 k products.
+    result, square, left = 1, a, abs(exponent)
+    while left:
+        if left & 1:
+            result = multiply(result, square)
+        left >>= 1
+        square = multiply(square, square) if left else square
+    return graph.apply("div", 1.0, result) if exponent < 0 else result
 
 
-def _select(graph: Graph, *_: Any) -> Callable[..., Any]:
+def _select(graph: Graph, params: Any, dtype: Any, which: Any, *cases: Any) -> Any:
     """Select one of several cases by a truth value or an integer."""
-
-    def select(which: Any, *cases: Any) -> Any:
-        if not isinstance(which, Node | Integer):
-            return cases[int(which)]
-        if isinstance(which, Node):
-            return choose(graph, which, cases[1], cases[0])
-        result = cases[0]
-        for k, case in enumerate(cases[1:], start=1):
-            result = choose(graph, less(graph, which, k), result, case)
-        return result
-
-    return select
+    if not isinstance(which, Node | Integer):
+        return cases[int(which)]
+    if isinstance(which, Node):
+        return choose(graph, which, cases[1], cases[0])
+    result = cases[0]
+    for k, case in enumerate(cases[1:], start=1):
+        result = choose(graph, less(graph, which, k), result, case)
+    return result
 
 
-def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any], low: Any, a: Any, high: Any) -> Any:
     smaller, larger = (_get_meaning(graph, name, {}, dtype) for name in ("min", "max"))
-    return lambda low, a, high: smaller(larger(a, low), high)
+    return smaller(larger(a, low), high)
 
 
 OF_ALL: dict[str, Meaning] = {
     "clamp": _clamp,
     "convert_element_type": _convert,
-    "integer_pow": _integer_power,
+    "integer_pow": _raise_to_integer,
     "select_n": _select,
 }
 """Operations on each entry of arrays of any type."""
@@ -362,33 +353,30 @@ OF_ALL: dict[str, Meaning] = {
 
 
 def _apply_operation(op: str) -> Meaning:
-    return lambda graph, params, dtype: partial(graph.apply, op)
+    return lambda graph, params, dtype, *entries: graph.apply(op, *entries)
 
 
-def _round(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+def _round(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
     """Round to the nearest integer; a half to the even one, or away from zero."""
     to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
-    return partial(graph.apply, "rint" if to_even else "round")
+    return graph.apply("rint" if to_even else "round", a)
 
 
-def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
-    def sign(a: Any) -> Any:
-        negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
-        return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
-
-    return sign
+def _sign(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
+    negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
+    return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
 
 
 OF_DOUBLES: dict[str, Meaning] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
-    "square": lambda graph, params, dtype: lambda a: a * a,
-    "rsqrt": lambda graph, params, dtype: lambda a: 1.0 / graph.apply("sqrt", a),
-    "logistic": lambda graph, params, dtype: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
+    "square": lambda graph, _, __, a: a * a,
+    "rsqrt": lambda graph, _, __, a: 1.0 / graph.apply("sqrt", a),
+    "logistic": lambda graph, _, __, a: 1.0 / (1.0 + graph.apply("exp", -a)),
     "sign": _sign,
     "round": _round,
-    "lt_to": lambda graph, params, dtype: partial(arrays.compare_in_order, graph, "lt"),
-    "le_to": lambda graph, params, dtype: partial(arrays.compare_in_order, graph, "le"),
-    "is_finite": lambda graph, params, dtype: lambda a: graph.apply("eq", a - a, 0.0),
+    "lt_to": lambda graph, _, __, a, b: arrays.compare_in_order(graph, "lt", a, b),
+    "le_to": lambda graph, _, __, a, b: arrays.compare_in_order(graph, "le", a, b),
+    "is_finite": lambda graph, _, __, a: graph.apply("eq", a - a, 0.0),
 }
 """Operations on each entry of arrays of doubles."""
 
