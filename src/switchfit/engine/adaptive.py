@@ -32,7 +32,7 @@ from switchfit.engine import branches
 from switchfit.engine.branches import MOST_FOUND, BranchError, Branches, Course, Crossing, Path, SteepError
 from switchfit.engine.jax import call_model
 from switchfit.engine.native.engine import NativeExperiment, native_experiment
-from switchfit.engine.native.program import Adaptive
+from switchfit.engine.native.program import AT
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
 from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
@@ -158,13 +158,13 @@ class _NativeSteps:
 
     def __init__(self, native: NativeExperiment, mode: int, stretch: _Stretch, p: FloatArray, given: Tolerances):
         self._native, self._mode, self._p, self._end = native, mode, p, stretch.end
-        self.y, at, (start, end) = np.append(stretch.x, 0.0), Adaptive(), stretch[1:3]
+        self.y, (start, end) = np.append(stretch.x, 0.0), stretch[1:3]
         exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
         step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
-        self._state = np.zeros(len(at))
-        self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
+        self._state = np.zeros(len(AT))
+        self._state[[AT.t, AT.step, AT.end, AT.rtol, AT.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
-        self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)
+        self._state[[AT.low, AT.high]] = np.nextafter(start, end), np.nextafter(end, start)
         self.t, self.is_running = start, True
 
     def slope(self, t: float, y: FloatArray) -> FloatArray:
@@ -177,9 +177,9 @@ class _NativeSteps:
 
     def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
         """Take up to `most` steps; return the accepted times (L,) and the states there (L, n)."""
-        found, at = self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most), Adaptive()
-        self.t = float(self._state[at.t])
-        self.is_running = self.t < self._end and not self._state[at.stuck]
+        found = self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most)
+        self.t = float(self._state[AT.t])
+        self.is_running = self.t < self._end and not self._state[AT.stuck]
         return found
 
 

@@ -273,22 +273,14 @@ class Hypotheses(NamedTuple):
         return Hypotheses(*(values[chosen] for values in self[:-1]))
 
 
-class Column(IntEnum):
-    """Columns of the table that makes children of hypotheses: (C, 7) of int64.
+Column = IntEnum("Column", "PARENT BEFORE AFTER SLOT RESET_MAP TRANSITION_COST GUARD", start=0)
+"""Columns of the table that makes children of hypotheses: (C, 7) of int64.
 
-    PARENT : position of the parent
-    BEFORE, AFTER : mode of the parent and of the child
-    SLOT : which transition happens at the first node, from 0, a birth; -1 if none does
-    RESET_MAP, TRANSITION_COST, GUARD : place of its functions in the library, -1 for none
-    """
-
-    PARENT = 0
-    BEFORE = 1
-    AFTER = 2
-    SLOT = 3
-    RESET_MAP = 4
-    TRANSITION_COST = 5
-    GUARD = 6
+PARENT : position of the parent
+BEFORE, AFTER : mode of the parent and of the child
+SLOT : which transition happens at the first node, from 0, a birth; -1 if none does
+RESET_MAP, TRANSITION_COST, GUARD : place of its functions in the library, -1 for none
+"""
 
 
 class Tolerances(NamedTuple):

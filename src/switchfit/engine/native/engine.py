@@ -143,7 +143,7 @@ class NativeExperiment:
         self._function = self._find("evaluate", 1 + len(self._counts))
         layout = layout_of(structure.library, sizes, order)
         self._rows = layout.constraint_rows
-        self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
+        self._lengths = {name: fixed + each * (cells + N) for name, (fixed, each) in layout.memory.items()}
         self._size = sum(self._lengths.values())
         # All transition times at tf, and all segments but the first in the last cell, until `_run` writes those of a
         # call.
@@ -384,7 +384,7 @@ class NativeExperiment:
         Parameters
         ----------
         state : array
-            See `Adaptive`.
+            See `switchfit.engine.native.program.AT`.
         y : (n + 1,) array
             State and running cost so far.
         """
@@ -670,7 +670,7 @@ def foreign_derivatives(
     for samples in arguments.samples:
         buffers += [*samples, np.zeros(1, dtype=np.int64), np.zeros(1)]  # none is late
     lengths = layout.sums
-    of_memory = sum(length.at(cells + N) for length in layout.memory.values())
+    of_memory = sum(fixed + each * (cells + N) for fixed, each in layout.memory.values())
     results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
     # A batch is a loop: all of its entries use one scratch space, which stays in the CPU caches.
     totals = sequential_vmap(lambda *given: jax.ffi.ffi_call(name, results)(*given)[0])(*buffers)

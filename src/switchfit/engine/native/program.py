@@ -19,10 +19,10 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import namedtuple
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
 
@@ -79,9 +79,9 @@ def write_handler(writer: Writer) -> str:
         position += length
     rows = segments.count_rows(writer, found)
     place: Operand = 0
-    for name, extent in writer.layout.memory.items():
+    for name, (fixed, each_row) in writer.layout.memory.items():
         found[name] = writer.at(between, place)
-        place = rows * extent.each_row + extent.fixed + place
+        place = rows * each_row + fixed + place
     for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
         writer.put(found[name], table, k)
     of_cells = (names.index(f"{OF_SAMPLES[0]} {k}") for k in range(measurements))
@@ -101,7 +101,8 @@ def write_evaluation(writer: Writer) -> str:
     # The sums are one block of memory, so that one call clears all of them.
     writer.zero(found[next(iter(layout.sums))], sum(layout.sums.values()))
     for name in segments.ZEROED:
-        writer.zero(found[name], rows * layout.memory[name].each_row + layout.memory[name].fixed)
+        fixed, each_row = layout.memory[name]
+        writer.zero(found[name], rows * each_row + fixed)
     first = segments.state_pointers(writer, found, 0)
     writer.call("start", found | {f"{name}_after": pointer for name, pointer in first.items()})
     with writer.loop(0, N + 1) as segment:
@@ -130,24 +131,13 @@ TIMES = {False: [*ADAPTIVE.c.tolist(), 1.0], True: [0.0, *STIFF.c.tolist()]}
 """Times at which an explicit (False) or implicit step evaluates the mode, as fractions of it."""
 
 
-class Adaptive(NamedTuple):
-    """Offsets in the state of the adaptive solver, in doubles.
+Adaptive = namedtuple("Adaptive", "t step refused stuck end rtol atol low high")
 
-    t, step, refused, stuck : of `Progress`; truth values are 0 or 1
-    end : of the solve
-    rtol, atol : of `Tolerances`
-    low, high : the times between which a signal may be looked up
-    """
-
-    t: int = 0
-    step: int = 1
-    refused: int = 2
-    stuck: int = 3
-    end: int = 4
-    rtol: int = 5
-    atol: int = 6
-    low: int = 7
-    high: int = 8
+AT = Adaptive(*range(9))
+"""Offsets in the state of the adaptive solver, in doubles: t, step, refused and stuck are those of `Progress`, truth
+values being 0 or 1; the end of the solve; rtol and atol of `Tolerances`; low and high, the times between which a signal
+may be looked up.
+"""
 
 
 def write_slope(kernels: Kernels, mode: int, stage: Template) -> None:
@@ -170,15 +160,15 @@ def _evaluate(
 @np.errstate(divide="ignore")  # the error of a mode at rest is the number zero
 def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
     """Write a step in a mode, with the error control behind it; an implicit one follows the iterations of Newton."""
-    n, at, is_implicit = kernels.sizes.n, Adaptive(), kernels.library.implicit[mode]
+    n, is_implicit = kernels.sizes.n, kernels.library.implicit[mode]
     graph, count = Graph(), len(TIMES[is_implicit])
-    state, y = graph.loads("state", len(at)), graph.loads("y", n + 1)
+    state, y = graph.loads("state", len(AT)), graph.loads("y", n + 1)
     # y is (x, running cost): the mesh has to resolve both.
     points = [_evaluate(kernels, graph, stage, str(j)) for j in range(count)]
     progress = rows.Progress(
-        state[at.t], state[at.step], *(graph.apply("ne", state[k], 0.0) for k in (at.refused, at.stuck))
+        state[AT.t], state[AT.step], *(graph.apply("ne", state[k], 0.0) for k in (AT.refused, AT.stuck))
     )
-    given = progress, state[at.end], rows.Tolerances(state[at.rtol], state[at.atol]), y
+    given = progress, state[AT.end], rows.Tolerances(state[AT.rtol], state[AT.atol]), y
     h, xp = progress.step, Namespace(graph)
     if is_implicit:
         k, (at_start, *at_stages) = kernels.load_increments(graph), points
@@ -196,8 +186,8 @@ def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
             after = y + h * combine(row, K)
             K.append(np.concatenate([np.ravel(value) for value in evaluate(after[:n], (F, ELL))]))
         now, y_now = rows.judge_error(*given, after, h * combine(rows.ADAPTIVE_ERROR, K), rows.EXPONENT, xp)
-    stores = [("state", at.t, now.t), ("state", at.step, now.step), *(("y", k, node) for k, node in enumerate(y_now))]
-    for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
+    stores = [("state", AT.t, now.t), ("state", AT.step, now.step), *(("y", k, node) for k, node in enumerate(y_now))]
+    for place, flag in ((AT.refused, now.refused), (AT.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
     # The stages of a step that is rejected may be anywhere.
     for pointer, offset, node in graph.check():
@@ -207,7 +197,7 @@ def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
         graph = Graph()
         stages = [_evaluate(kernels, graph, stage, str(j), checked=False) for j in range(1, count)]
         field = lambda j, X: stages[j](X, (F, F_X))  # noqa: E731
-        found = kernels.correct(graph, graph.load("state", at.step), graph.loads("y", n), field)
+        found = kernels.correct(graph, graph.load("state", AT.step), graph.loads("y", n), field)
         kernels.module.write_straight_line(f"newton_step_{mode}", found)
 
 
@@ -226,11 +216,11 @@ def write_loop(writer: Writer, name: str) -> str:
 
 def _store_moment(writer: Writer, found: Pointers, cells: Value, time: Value, moment: Value) -> Value:
     """Store a time, and the first node of the cell that holds it, clipped to [low, high]; return the signals there."""
-    S, at = writer.sizes.signals, Adaptive()
+    S = writer.sizes.signals
     writer.store(time, moment)
     if not S:
         return found["signals"]
-    low, high = (writer.get("double", found["state"], k) for k in (at.low, at.high))
+    low, high = (writer.get("double", found["state"], k) for k in (AT.low, AT.high))
     # At the ends of a stretch an input may jump: the time is kept inside [low, high], so that the cell is one of the
     # stretch.
     later = (time < low).choose(low, time)
@@ -251,7 +241,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
 
     It ends at the end time, after `most` accepted steps, or when the solver is stuck.
     """
-    n, at, is_implicit = writer.sizes.n, Adaptive(), writer.library.implicit[mode]
+    n, is_implicit = writer.sizes.n, writer.library.implicit[mode]
     given = "i64 %cells, ptr %state, ptr %y, ptr %rows, i64 %most, ptr %count"
     _, cells, state, y, rows, most, count = writer.begin(f"void @adaptive_{mode}_steps(ptr %table, {given})")
     found = writer.pointers() | {"state": state, "y": y}
@@ -260,7 +250,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     found["J"] = found["newton"]  # NaN if the iterations do not converge, as the increments are
     writer.store(0, count, "i64")
     with writer.repeat() as leave:
-        t, end, stuck, step = (writer.get("double", state, k) for k in (at.t, at.end, at.stuck, at.step))
+        t, end, stuck, step = (writer.get("double", state, k) for k in (AT.t, AT.end, AT.stuck, AT.step))
         # Go on while t < end, not stuck, and with room for accepted times.
         leave(((t < end) & stuck.equals(0.0) & (writer.load("i64", count) < most)).equals(False))
         for j, c in enumerate(TIMES[is_implicit]):
@@ -269,10 +259,10 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
         if is_implicit:
             segments.solve_stages(writer, f"newton_step_{mode}", found)
         writer.call(f"step_{mode}", found)
-        with writer.when(writer.get("double", state, at.refused).equals(0.0)):
+        with writer.when(writer.get("double", state, AT.refused).equals(0.0)):
             accepted = writer.load("i64", count)
             row = writer.at(rows, accepted, 2 + n)
-            writer.store(writer.get("double", state, at.t), row)
+            writer.store(writer.get("double", state, AT.t), row)
             writer.copy(writer.at(row, 1), y, 1 + n)
             writer.store(accepted + 1, count)
     return writer.end()

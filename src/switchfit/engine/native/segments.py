@@ -38,17 +38,6 @@ values (K, q), weights (K, q); the segment that holds a late sample, (K,); resul
 the state, and this state, (K, 1 + n)."""
 
 
-class Length(NamedTuple):
-    """A size, in doubles, that grows with the number of rows."""
-
-    fixed: int
-    each_row: int = 0
-
-    def at(self, rows: int) -> int:
-        """Return the size for a number of rows."""
-        return self.fixed + self.each_row * rows
-
-
 ZEROED = ("jumps", "late")
 """Parts of the scratch space that start at zero, as the accumulators do; others are written before they are read."""
 
@@ -61,12 +50,13 @@ class Layout(NamedTuple):
     constraint_rows : the rows of constraints: those of guards, one per transition, come first, "end" is the first
         terminal one, and "count" the number of all
     sums : sizes of the accumulators, which start at zero: they are the results
-    memory : sizes of the parts of the scratch space; late samples have a row of their own behind all others
+    memory : sizes of the parts of the scratch space, each a fixed one and what every row adds; late samples have a row
+        of their own behind all others
     """
 
     constraint_rows: dict[str, int]
     sums: dict[str, int]
-    memory: dict[str, Length]
+    memory: dict[str, tuple[int, int]]
 
     @property
     def pointers(self) -> tuple[str, ...]:
@@ -88,18 +78,18 @@ def layout_of(library: Structure, sizes: Sizes, order: Order) -> Layout:
     sums = {"psi": n, "J": 1, "g": width, "H": sizes.D * width}
     sums |= {"constraints": count, "jacobian": count * width, "errors": n, CHECKED: 1}
     memory = {
-        "states": Length(n + n * late, n),
-        "reset_states": Length(N * n * resets),
-        "tangents": Length(n * width * (1 + late), n * width * derivatives),
-        "reset_tangents": Length(N * n * width * resets),
-        **{name: Length(size * late, size * derivatives) for name, size in of_row.items()},
-        "jumps": Length(n, n * derivatives * jumps),
-        "late": Length(0, n * derivatives * late),
-        "costates": Length(0, n * derivatives),
-        "increments": Length(len(STIFF.b) * n * implicit),
-        "newton": Length(2 * implicit),
-        "entries": Length(STAGES * (1 + n + sizes.M) ** 2),
-        "length": Length(width),
+        "states": (n + n * late, n),
+        "reset_states": (N * n * resets, 0),
+        "tangents": (n * width * (1 + late), n * width * derivatives),
+        "reset_tangents": (N * n * width * resets, 0),
+        **{name: (size * late, size * derivatives) for name, size in of_row.items()},
+        "jumps": (n, n * derivatives * jumps),
+        "late": (0, n * derivatives * late),
+        "costates": (0, n * derivatives),
+        "increments": (len(STIFF.b) * n * implicit, 0),
+        "newton": (2 * implicit, 0),
+        "entries": (STAGES * (1 + n + sizes.M) ** 2, 0),
+        "length": (width, 0),
     }
     return Layout({"end": end, "count": count}, sums, memory)
 
