@@ -356,12 +356,8 @@ def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
 def _pad_samples(item: Measurements, length: int, t0: float) -> Samples:
     """Return samples of one Measurements, padded with missing ones to a length, without their cells."""
     rows = ((0, length - len(item.times)), (0, 0))
-    return Samples(
-        np.zeros(0, dtype=np.intp),  # type: ignore[arg-type]  # made jax arrays
-        _pad_with_last(item.seen_times, length, t0),  # type: ignore[arg-type]
-        np.pad(np.nan_to_num(item.values), rows),  # type: ignore[arg-type]
-        np.pad(item.weights, rows),  # type: ignore[arg-type]
-    )
+    times, values = _pad_with_last(item.seen_times, length, t0), np.pad(np.nan_to_num(item.values), rows)
+    return Samples(np.zeros(0, int), times, values, np.pad(item.weights, rows))  # type: ignore[arg-type]  # made jax arrays
 
 
 def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[Any]:

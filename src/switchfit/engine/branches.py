@@ -303,11 +303,6 @@ class Course:
         self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
         self._ends.append([])
 
-    def _find_rates(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> FloatArray:
-        """Return dg/dt of all corners along a branch, at its steep corner k, which x is near."""
-        margins = tuple((at, NEAR_STEEP * margin) for at, margin in self.corners.margins)
-        return self.evaluate(find_corners(self.corners.function, margins).rates_at(sides, k), t, x, inside)
-
     def _is_steep(self, corner: int) -> bool:
         return any(k == corner for (k, _), _ in self.corners.margins)
 
@@ -488,7 +483,9 @@ class Course:
         if self._is_steep(k):
             # At the corner itself, both rates may vanish as those of other corners do not: no side is better. Else the
             # rates on the margin decide as for any corner, since they are those that move the trajectory.
-            exact = np.abs([self._find_rates(each, k, t, x, inside) for each in both])
+            margins = tuple((at, NEAR_STEEP * margin) for at, margin in self.corners.margins)
+            near = find_corners(self.corners.function, margins)
+            exact = np.abs([self.evaluate(near.rates_at(each, k), t, x, inside) for each in both])
             if exact[:, k].max() <= STILL_STEEP * exact.max():
                 return sides[k] or 1
         up, down = (self.evaluate(self.corners.rates(each), t, x, inside)[k] for each in both)

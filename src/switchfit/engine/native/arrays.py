@@ -288,7 +288,9 @@ Combine = Callable[[Any, Any, Any], Any]
 def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
-    a = a[tuple(_get_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
+    # What the window may reach along each axis.
+    ends = [(s.low, s.high) if isinstance(s, Integer) else (s, s) for s in starts]
+    a = a[tuple(slice(low, high + size) for (low, high), size in zip(ends, sizes, strict=True))]
     if len(moving) > 1 and all(known_number(e) is not None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
     for axis in moving:
@@ -299,11 +301,6 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
             window[place] = pick(graph, candidates.tolist(), starts[axis])
         a = np.moveaxis(window, 0, axis)
     return a
-
-
-def _get_reach(start: Any, size: int) -> slice:
-    """Return the range of indices that a window may reach."""
-    return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
 
 
 def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:

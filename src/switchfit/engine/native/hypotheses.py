@@ -33,7 +33,7 @@ from switchfit.engine.native.engine import count_samples, get_address
 from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, as_vector, list_entries, store_all
 from switchfit.engine.native.llvm import Module, Program, Value, Variable
 from switchfit.engine.native.program import PREFIX, compile_library, write_slope
-from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Node, Objects, Template
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
 from switchfit.engine.native.segments import Pointers, Writer, add_curvature, solve_stages, write_newton
 from switchfit.engine.native.templates import COST_TO_GO, F_X, F, Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
@@ -135,7 +135,11 @@ class HypothesisKernels(Kernels):
             error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
         else:
             error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
-        stores = [("error", 0, self._largest_error(graph, error, x))]
+        # The larger of the error so far and that of this step, relative to rtol (smallest + |x|).
+        (rtol, smallest), xp, largest = graph.loads("tolerances", 2), Namespace(graph), graph.load("error", 0)
+        for relative in xp.abs(error) / (rtol * (smallest + xp.abs(x))):
+            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
+        stores = [("error", 0, largest)]
         if not costs:
             return stores
         g, second = graph.load("g", 0, vector=True), []
@@ -151,15 +155,6 @@ class HypothesisKernels(Kernels):
             stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
         self._chosen, entries = self._store_entries(graph, tableau, second)
         return [*stores, ("g", 0, as_vector(graph, g)), *entries]
-
-    def _largest_error(self, graph: Graph, errors: Objects, x: Objects) -> Node:
-        """Return the larger of the error so far and that of a step, relative to ``rtol (smallest + |x|)``."""
-        rtol, smallest = graph.loads("tolerances", 2)
-        largest = graph.load("error", 0)
-        xp = Namespace(graph)
-        for relative in xp.abs(errors) / (rtol * (smallest + xp.abs(x))):
-            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
-        return largest
 
     def move(self, name: str, sign: float, costs: bool) -> None:
         """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.

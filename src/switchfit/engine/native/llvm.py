@@ -37,7 +37,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.scalars import FROM_LIBM, OPERATIONS, Node, Operation, list_needed
+from switchfit.engine.native.scalars import FROM_LIBM, OPERATIONS, Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 Found = TypeVar("Found")
@@ -479,13 +479,6 @@ _CALLED = re.compile(r"call \w+ @([\w.]+)\(")
 _HEADER = re.compile(r"^define (\w+ @([\w.]+)\(.*\))", re.MULTILINE)
 
 
-def _write_declaration(operation: Operation) -> str:
-    """Return the declaration of the function that an operation calls; C functions are declared without side effects."""
-    operands = ", ".join(["double"] * operation.operands)
-    memory = " memory(none) nounwind willreturn" if operation.function in FROM_LIBM else ""
-    return f"declare double @{operation.function}({operands}){memory}"
-
-
 class _Writer(Lines):
     """Emits the instructions of one function, one for each operation; `used` are the names of its pointers."""
 
@@ -534,7 +527,10 @@ class _Writer(Lines):
             return self._solve(node)
         operation = OPERATIONS[op]
         if operation.function is not None:
-            self.module.declare(operation.function, _write_declaration(operation))
+            operands = ", ".join(["double"] * operation.operands)
+            # C functions have no side effects that matter.
+            memory = " memory(none) nounwind willreturn" if operation.function in FROM_LIBM else ""
+            self.module.declare(operation.function, f"declare double @{operation.function}({operands}){memory}")
         return self.let(kind, operation.code.format(*(self._as(a, node.vector) for a in args), type=kind))
 
     def _factorize(self, node: Node) -> Value:

@@ -109,22 +109,16 @@ def write_evaluation(writer: Writer) -> str:
         writer.invoke("forward", table, segment)
     for k, count in enumerate(counts):
         writer.invoke(f"samples_{k}", table, count)
-    _call_end(writer, found)
+    # No row follows the end: what the terminal terms add to the costate goes to psi itself.
+    library, given = writer.library, found | segments.state_pointers(writer, found, rows) | {"jump": found["psi"]}
+    given |= segments.constraint_pointers(writer, found, layout.constraint_rows["end"])
+    for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
+        writer.call(name, given)
     if writer.order > Order.COST:
         with writer.loop(0, N + 1) as turn:
             writer.invoke("backward", table, N - turn)
         writer.call("start_back", found | {"jump": found["jumps"]})
     return writer.end()
-
-
-def _call_end(writer: Writer, found: Pointers) -> None:
-    """Call the terminal cost and constraints."""
-    library, last = writer.library, segments.state_pointers(writer, found, segments.count_rows(writer, found))
-    # No row follows the end: what the terminal terms add to the costate goes to psi itself.
-    given = found | last | {"jump": found["psi"]}
-    given |= segments.constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
-    for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
-        writer.call(name, given)
 
 
 TIMES = {False: [*ADAPTIVE.c.tolist(), 1.0], True: [0.0, *STIFF.c.tolist()]}

@@ -463,10 +463,6 @@ def list_needed(outputs: Sequence[Node]) -> list[Node]:
     return [graph.nodes[k] for k in np.flatnonzero(wanted)]
 
 
-def _look_up(table: NDArray[np.float64], index: Any) -> Any:
-    return table[np.asarray(index, int)]
-
-
 class Template:
     """A traced function of scalars that can be copied into graphs; inputs and outputs are lists of arrays.
 
@@ -498,10 +494,22 @@ class Template:
         node, they are not computed again.
         """
         chosen = tuple(range(len(self._flat)) if only is None else only)
-        presumed = self.presumed if checked else []
-        made = self._copy(graph, inputs, self._list_needed(chosen, checked), known or {})
+        given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
+        made: dict[int, Node] = dict(known or {})  # the copies by the index of the node here
+        for node in self._list_needed(chosen, checked):
+            if node.index in made:
+                continue
+            if node.op == "load":
+                value = given[int(node.args[0])][node.args[1]]
+                made[node.index] = value if isinstance(value, Node) else graph.constant(value)
+            elif node.op == "const":
+                made[node.index] = graph.constant(node.args[0])
+            elif node.op == "lookup":
+                made[node.index] = graph.lookup(node.args[0].values, made[node.args[1].index])
+            elif node.op != "table":
+                made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
         # What the template left out as a product with zero is presumed in the graph that uses it, with these inputs.
-        for node in presumed:
+        for node in self.presumed if checked else ():
             graph.presume(made[node.index])
         results = []
         for k in chosen:
@@ -516,7 +524,8 @@ class Template:
         loads = [(node.index, int(node.args[0]), node.args[1]) for node in nodes if node.op == "load"]
         known = {node.index: node.number for node in nodes if node.op == "const"}
         known |= {node.index: node.values for node in nodes if node.op == "table"}
-        values = {name: operation.value for name, operation in OPERATIONS.items()} | {"lookup": _look_up}
+        values = {name: operation.value for name, operation in OPERATIONS.items()}
+        values["lookup"] = lambda table, index: table[np.asarray(index, int)]
         return loads, known, [(n.index, values[n.op], [a.index for a in n.args]) for n in nodes if n.op in values]
 
     def evaluate(self, *inputs: Any) -> list[NDArray[np.float64]]:
@@ -548,23 +557,3 @@ class Template:
             wanted = [v for k in chosen for v in self._flat[k] if isinstance(v, Node)]
             self._needed[key] = list_needed([*wanted, *(self.presumed if checked else [])])
         return self._needed[key]
-
-    def _copy(
-        self, graph: Graph, inputs: Sequence[Any], nodes: Sequence[Node], known: Mapping[int, Node]
-    ) -> dict[int, Node]:
-        """Copy nodes into a graph, but those that are known; return the copies by the index of the node here."""
-        given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
-        made: dict[int, Node] = dict(known)
-        for node in nodes:
-            if node.index in known:
-                continue
-            if node.op == "load":
-                value = given[int(node.args[0])][node.args[1]]
-                made[node.index] = value if isinstance(value, Node) else graph.constant(value)
-            elif node.op == "const":
-                made[node.index] = graph.constant(node.args[0])
-            elif node.op == "lookup":
-                made[node.index] = graph.lookup(node.args[0].values, made[node.args[1].index])
-            elif node.op != "table":
-                made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
-        return made

@@ -258,10 +258,6 @@ def _pad(params: Any, a: Any, value: Any) -> Any:
     return result
 
 
-def _split(params: Any, a: Any) -> Any:
-    return np.split(a, np.cumsum(params["sizes"])[:-1], axis=params["axis"])
-
-
 MOVES: dict[str, Callable[..., Any]] = {
     **{name: lambda params, a, *_, move=move: move(a, params) for name, move in SELECTIONS.items()},
     "broadcast_in_dim": _broadcast,
@@ -269,7 +265,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "pad": _pad,
     "rev": lambda params, a: np.flip(a, params["dimensions"]),
     "tile": lambda params, a: np.tile(a, params["reps"]),
-    "split": _split,
+    "split": lambda params, a: np.split(a, np.cumsum(params["sizes"])[:-1], axis=params["axis"]),
     "stack": lambda params, *a: np.stack(a, axis=params["axis"]),
     "unstack": lambda params, a: list(np.moveaxis(a, params["axis"], 0)),
     "copy": lambda params, a: a,
