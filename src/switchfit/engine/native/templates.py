@@ -112,27 +112,23 @@ class Templates:
         n, M = self.sizes.n, self.sizes.M
 
         def stage(model: Model, t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any) -> Any:
-            piece = Piece(origin, coefficients)
-            f, ell = model.field(mode, piece), model.density(mode, piece)
-            costs = running and model.has_running_cost
-            zero = jnp.zeros(())
+            piece, zero = Piece(origin, coefficients), jnp.zeros(())
+            costs, f = running and model.has_running_cost, model.field(mode, piece)
+            ell = model.density(mode, piece) if costs else lambda t, x, p: zero
             # A simulation has no derivatives, but Newton's method for implicit steps needs D_1 f, and their error D_1
             # ell too.
             if self.order == Order.COST:
                 if not self.library.implicit[mode]:
-                    return [f(t, x, p), zero, zero, zero, ell(t, x, p) if running else zero]
-                value, ell_x = jax.value_and_grad(ell, argnums=1)(t, x, p) if costs else (zero, jnp.zeros(n))
+                    return [f(t, x, p), zero, zero, zero, ell(t, x, p)]
+                value, ell_x = jax.value_and_grad(ell, argnums=1)(t, x, p)
                 return [f(t, x, p), zero, jax.jacfwd(f, argnums=1)(t, x, p), zero, value, zero, ell_x]
             slope = (f(t, x, p), *jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p))
-            cost = (zero, zero, jnp.zeros(n), jnp.zeros(M))
-            if costs:
-                value, gradient = jax.value_and_grad(ell, argnums=(0, 1, 2))(t, x, p)
-                cost = (value, *gradient)
+            value, gradient = jax.value_and_grad(ell, argnums=(0, 1, 2))(t, x, p)
 
             # With the w_j and h b_j of a row its derivatives are mu_j, and those in t_j and p, of
             # `discretization.rows.adjoint`.
             def cost_to_go(t: Any, x: Any, p: Any) -> Any:
-                return w @ f(t, x, p) + (hb * ell(t, x, p) if costs else 0.0)
+                return w @ f(t, x, p) + hb * ell(t, x, p)
 
             def gauss_newton() -> Any:
                 second = self._no_second()
@@ -150,7 +146,7 @@ class Templates:
 
                 return second + _differentiate_twice(cost_of_state, t, x, p)
 
-            return [*slope, *cost, *self._differentiate(cost_to_go, t, x, p, gauss_newton)]
+            return [*slope, value, *gradient, *self._differentiate(cost_to_go, t, x, p, gauss_newton)]
 
         also = " or a running cost" if running and (self.library.running or self.library.references) else ""
         shapes = (), (n,), (M,), (n,), (), (), (4, self.sizes.signals)
