@@ -39,7 +39,7 @@ TESTS = {
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
     "jax": [PROTOCOL, ["tests/test_insertion.py", "-k", "engines_agree"], FISHER],
-    "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge or routine or order or factors"]],
+    "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge or routine or order or pivots"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "beam": [["tests/test_known_order.py", "-k", "say"], ["tests/test_beam.py", "-k", "not jax"]],
