@@ -375,20 +375,10 @@ class JaxEngine:
             found = simulate_rows(self._on_device, tau, p, structure=self._any_sequence, tangents=tangents)
         layout, rows = self._cut_rows(tau)
         J, late, values, derivatives = jax.tree.map(np.asarray, found)
-        before, after, y_before, y_after = (each[rows] for each in values)
         which = [k for k, sensor in enumerate(self._structure.measurements) if sensor.delay is not None]
-        simulation = Simulation(
-            float(J),
-            self._mesh.times,
-            layout.first_cell,
-            layout.start[rows],
-            layout.end[rows],
-            before,
-            after,
-            y_before,
-            y_after,
-            tangents=Tangents(*(each[rows] for each in derivatives)) if tangents else None,
-        )
+        of_rows = (each[rows] for each in (layout.start, layout.end, *values))
+        along = Tangents(*(each[rows] for each in derivatives)) if tangents else None
+        simulation = Simulation(float(J), self._mesh.times, layout.first_cell, *of_rows, tangents=along)
         seen = dict(zip(which, late, strict=True))
         simulation = finish_simulation(simulation, self._structure, self._arguments, seen)
         if not tangents:

@@ -368,13 +368,8 @@ def _list_windows(
     """
     gathers = hasattr(numbers, "start_index_map")
     axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
-    batched = dict(
-        zip(
-            numbers.operand_batching_dims,
-            numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims,
-            strict=True,
-        )
-    )
+    own = numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims
+    batched = dict(zip(numbers.operand_batching_dims, own, strict=True))
     outside = [k for k in range(many) if k not in inside]
     for place in np.ndindex(*indices.shape[:-1]):
         starts: list[Any] = [place[batched[axis]] if axis in batched else 0 for axis in range(len(shape))]

@@ -309,19 +309,10 @@ class NativeExperiment:
                     starts[(first_cell[1:] + np.arange(1, N + 1))[resets]] = after[resets]
                 return starts, ends[1:]
 
-            none = np.zeros((cells + N, 0))
-            derives = self.order > Order.COST
-            simulation = Simulation(
-                self._J.item(0),
-                self.times,
-                first_cell,
-                times[:-1],
-                times[1:],
-                *beside_rows("states", n),
-                none,
-                none,
-                tangents=Tangents(*beside_rows("tangents", n, width), none, none) if derives else None,
-            )
+            none, derives = np.zeros((cells + N, 0)), self.order > Order.COST
+            rows = times[:-1], times[1:], *beside_rows("states", n), none, none
+            tangents = Tangents(*beside_rows("tangents", n, width), none, none) if derives else None
+            simulation = Simulation(self._J.item(0), self.times, first_cell, *rows, tangents=tangents)
             late = {k: self._named[f"seen {k}"].reshape(-1, 1 + n).copy() for k, *_ in self._late}
             return simulation, of_rows("costates", cells + N if derives else 0, n), late
 

@@ -95,19 +95,10 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
     """Return the sizes of the scratch space, in doubles: the eliminated [H; g'], the entries of g as they were
     eliminated, and what the straight-line functions exchange.
     """
-    return {
-        "rows": (sizes.D + 1) * sizes.width,
-        "reduced": sizes.D,
-        "shift": sizes.D,
-        "g_after": sizes.width,
-        "K": sizes.n + 1,
-        "along": sizes.width,
-        "information": 1,
-        "XZ": STAGES * sizes.n * sizes.width,
-        "entries": STAGES * (1 + sizes.n + sizes.M) ** 2,
-        "increments": STIFF.coupled * sizes.n,
-        "newton": 2,
-    }
+    n, D, width = sizes.n, sizes.D, sizes.width
+    lengths = {"rows": (D + 1) * width, "reduced": D, "shift": D, "g_after": width, "K": n + 1, "along": width}
+    lengths |= {"information": 1, "XZ": STAGES * n * width, "entries": STAGES * (1 + n + sizes.M) ** 2}
+    return lengths | {"increments": STIFF.coupled * n, "newton": 2}
 
 
 class HypothesisKernels(Kernels):
@@ -610,12 +601,9 @@ class NativeHypotheses:
             self._set_samples(k, first, *values)
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
-        self._propagate = program.function(
-            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 7
-        )
-        self._follow_order = program.function(
-            f"{PREFIX[Order.GAUSS_NEWTON]}follow_order", *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 5
-        )
+        prefix, kind = PREFIX[Order.GAUSS_NEWTON], ctypes.c_int64  # of numbers, and of addresses
+        self._propagate = program.function(f"{prefix}propagate", *[kind] * 13)
+        self._follow_order = program.function(f"{prefix}follow_order", *[kind] * 14)
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
         self._arrays |= {f"{name}_{k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}

@@ -93,15 +93,9 @@ class Templates:
     def model(self, constants: tuple[Any, ...]) -> Model:
         """Return the model with traced constants."""
         fixed = sum(not read for _, _, read in self.library.parameters)
-        arguments = Arguments(
-            nodes=jnp.zeros(2),
-            signals=jnp.zeros((1, 4, self.sizes.signals)),
-            fixed=tuple(constants[:fixed]),
-            initial_state=constants[-1],
-            samples=(),
-            weights=tuple(constants[fixed:-1]),
-        )
-        return Model(self.library, arguments)
+        parameters, weights, initial_state = constants[:fixed], constants[fixed:-1], constants[-1]
+        nodes, signals = jnp.zeros(2), jnp.zeros((1, 4, self.sizes.signals))
+        return Model(self.library, Arguments(nodes, signals, parameters, initial_state, (), weights))
 
     def stage(self, mode: int, running: bool = True) -> Template:
         """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `COST_TO_GO` are their positions.
