@@ -332,10 +332,8 @@ def build_common_arguments(problem: Problem, e: int) -> Arguments:
     """Return the arguments of experiment e that suit any mesh, without nodes, signals and the cells of samples."""
     structure, experiment = problem.structures[e], problem.experiments[e]
     initial = initial_state_of(problem.system, experiment)
-    mapped = experiment.parameter_map
-    fixed = tuple(
-        problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read
-    )
+    unread = (experiment.parameter_map.get(name, name) for name, _, read in structure.parameters if not read)
+    fixed = tuple(problem.parameters[name].value for name in unread)
     measurements = select_kind(experiment.data, Measurements)
     lengths = problem.sample_lengths[e]
     samples = tuple(_pad_samples(*each, experiment.t0) for each in zip(measurements, lengths, strict=True))

@@ -354,9 +354,8 @@ class Course:
             values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
             pairs = zip(values, ends, strict=True)
             near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
-            self._make_steep(
-                [(k, self.sides[k]) for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)]
-            )
+            undefined = [k for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)]
+            self._make_steep([(k, self.sides[k]) for k in undefined])
 
     def _make_steep(self, corners: list[tuple[int, int]]) -> None:
         """Make corners steep on a side, if there are any that are not: the path has to be found anew."""

@@ -80,6 +80,12 @@ class Integer:
         return cls(graph.constant(float(value)), int(value), int(value))
 
 
+def _check_size(count: int, most: int, what: str) -> None:
+    """Refuse what would take too many operations, or too much memory."""
+    if count > most:
+        raise Unsupported(f"{what} (limit: {most})")
+
+
 def _is_known_integer(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
@@ -135,10 +141,8 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
         return entries[0]
     if len(starts) > MOST_SELECTIONS and all(known_number(e) is not None for e in entries):
         return _look_up(graph, list(map(known_number, entries)), index)
-    if len(starts) > MOST_CHOICES:
-        raise Unsupported(
-            f"takes one of {len(starts)} numbers by an index that depends on the state (limit: {MOST_CHOICES})"
-        )
+    count = len(starts)
+    _check_size(count, MOST_CHOICES, f"takes one of {count} numbers by an index that depends on the state")
 
     def select_run(runs: list[int]) -> Any:
         if len(runs) == 1:
@@ -167,8 +171,7 @@ def _is_same(one: Any, other: Any) -> bool:
 
 
 def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
-    if len(entries) > MOST_ROWS_OF_TABLE:
-        raise Unsupported(f"looks up numbers in a table of {len(entries)} entries (limit: {MOST_ROWS_OF_TABLE})")
+    _check_size(len(entries), MOST_ROWS_OF_TABLE, f"looks up numbers in a table of {len(entries)} entries")
     node = graph.lookup(np.array(entries, dtype=float), index.node - float(index.low))
     if all(isinstance(e, bool | np.bool_) for e in entries):
         return graph.apply("ne", node, 0.0)
@@ -324,10 +327,7 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
     """Change a window of an array of objects in place, at starts that are in range where the condition holds."""
     ranges = [range(s.low, s.high + 1) if isinstance(s, Integer) else (s,) for s in starts]
     count = int(np.prod([len(r) for r in ranges]))
-    if count > MOST_CHOICES:
-        raise Unsupported(
-            f"changes one of {count} numbers at an index that depends on the state (limit: {MOST_CHOICES})"
-        )
+    _check_size(count, MOST_CHOICES, f"changes one of {count} numbers at an index that depends on the state")
     for first in product(*ranges):
         here = condition
         for start, value in zip(starts, first, strict=True):
@@ -453,8 +453,7 @@ def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
 def _sort_entries(graph: Graph, entries: list[Entries], kinds: list[str]) -> list[Entries]:
     """Sort entries by exchanging neighbors."""
     n = len(entries)
-    if n > MOST_SORTED:
-        raise Unsupported(f"sorts {n} numbers that depend on the state (limit: {MOST_SORTED})")
+    _check_size(n, MOST_SORTED, f"sorts {n} numbers that depend on the state")
     for front in range(n - 1):
         for k in reversed(range(front, n - 1)):
             one, other = entries[k], entries[k + 1]
@@ -502,8 +501,7 @@ def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
     if np.isnan(numbers).any() or (np.diff(numbers) < 0.0).any():
         return None
     K = len(numbers)
-    if K > MOST_ROWS_OF_TABLE:
-        raise Unsupported(f"searches a table of {K} entries (limit: {MOST_ROWS_OF_TABLE})")
+    _check_size(K, MOST_ROWS_OF_TABLE, f"searches a table of {K} entries")
     turns = K.bit_length()
     padded = np.concatenate([numbers, np.full(2**turns - 1 - K, np.inf)])
 
@@ -537,8 +535,7 @@ def _map_matrices(graph: Graph, function: Callable[..., tuple[Any, ...]], *array
 
 
 def _check_rows(rows: int, most: int) -> None:
-    if rows > most:
-        raise Unsupported(f"works with a matrix of {rows} rows (limit: {most})")
+    _check_size(rows, most, f"works with a matrix of {rows} rows")
 
 
 def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:

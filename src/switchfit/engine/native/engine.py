@@ -613,9 +613,8 @@ def _register(library: Structure, sizes: Sizes) -> str:
     name = f"switchfit_{program.key[:32]}"
     with _one_at_a_time:
         if name not in _registered:
-            jax.ffi.register_ffi_target(
-                name, jax.ffi.pycapsule(program.function("xla_handler", ctypes.c_void_p)), platform="cpu"
-            )
+            handler = jax.ffi.pycapsule(program.function("xla_handler", ctypes.c_void_p))
+            jax.ffi.register_ffi_target(name, handler, platform="cpu")
             _registered[name] = program
     return name
 

@@ -159,9 +159,8 @@ def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
     state, y = graph.loads("state", len(AT)), graph.loads("y", n + 1)
     # y is (x, running cost): the mesh has to resolve both.
     points = [_evaluate(kernels, graph, stage, str(j)) for j in range(count)]
-    progress = rows.Progress(
-        state[AT.t], state[AT.step], *(graph.apply("ne", state[k], 0.0) for k in (AT.refused, AT.stuck))
-    )
+    flags = (graph.apply("ne", state[k], 0.0) for k in (AT.refused, AT.stuck))
+    progress = rows.Progress(state[AT.t], state[AT.step], *flags)
     given = progress, state[AT.end], rows.Tolerances(state[AT.rtol], state[AT.atol]), y
     h, xp = progress.step, Namespace(graph)
     if is_implicit:

@@ -247,9 +247,8 @@ USUAL_ITERATIONS = 5
 def write_newton(writer: Writer, name: str) -> str:
     """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
     count, names = len(STIFF.b) * writer.sizes.n, (*writer.module.pointers[name], "J")
-    given = dict(
-        zip(names, writer.begin(f"void @solve_{name}({', '.join(f'ptr %{key}' for key in names)})"), strict=True)
-    )
+    parameters = writer.begin(f"void @solve_{name}({', '.join(f'ptr %{key}' for key in names)})")
+    given = dict(zip(names, parameters, strict=True))
     # k = 0 is X_j = x, so that the first iteration is a linearly implicit step.
     writer.zero(given["increments"], count)
     writer.store(1.0, given["newton"])
