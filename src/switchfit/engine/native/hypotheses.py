@@ -525,9 +525,6 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     yield module.take()
 
 
-SLOT = int(Column.SLOT)
-
-
 Integers = NDArray[np.int64]
 
 SampleArrays = tuple[Integers, FloatArray, FloatArray, FloatArray]
@@ -657,7 +654,7 @@ class NativeHypotheses:
         The samples at the first node are those of the parents; the births come after them.
         """
         times, counts = np.empty((len(children), 1)), np.empty((len(children), 3), dtype=np.int64)
-        parent, before, after, slot = children.T[: SLOT + 1]
+        parent, before, after, slot = children.T[: Column.SLOT + 1]
         times[:] = self._arrays["nodes"][first]
         counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
         return self._go_on(parents.records, counts, children, times, (first, last, False))
