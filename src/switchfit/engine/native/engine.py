@@ -21,7 +21,7 @@ import numpy as np
 from jax.custom_batching import sequential_vmap
 from numpy.typing import NDArray
 
-from switchfit.discretization.mesh import Arguments, Mesh, Samples, count_passed
+from switchfit.discretization.mesh import Arguments, Mesh, Samples, build_rows
 from switchfit.discretization.model import AT_TRANSITIONS, read_parameters
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.llvm import Program
@@ -634,15 +634,11 @@ def foreign_derivatives(
     sizes, library = Sizes.of(structure, arguments), structure.library
     name = _register(library, sizes)
     N, D, width = sizes.N, sizes.D, sizes.width
-    idle = N - tau.shape[0]  # number of segments that the sequence does not need: they begin and end at tf
-    nodes = arguments.nodes
-    cells = nodes.shape[0] - 1
-    real_cells = jnp.sum(nodes[1:] > nodes[:-1])
-    count_own = tau.shape[0]
+    nodes, count_own = jnp.asarray(arguments.nodes), tau.shape[0]
+    cells, idle = nodes.shape[0] - 1, N - count_own  # idle: segments that the sequence does not need, from tf to tf
     jumps = places.get("jumps", np.zeros(count_own, dtype=np.int64))[:count_own]
     side = jnp.where(jumps > 0, 1.0, side)  # as in `Structure.fix_sides`
-    passed = count_passed(nodes, tau, side)
-    begins = jnp.clip(passed - 1, 0, real_cells - 1)
+    first_cell = build_rows(nodes, tau, side).first_cell
     units, own, there = find_directions(sizes, jumps, jnp)
     layout = layout_of(library, sizes, Order.HESSIAN)
     given: dict[str, Any] = {
@@ -651,7 +647,7 @@ def foreign_derivatives(
         "c": jnp.concatenate([*(jnp.ravel(a) for a in constants_of(arguments)), jnp.zeros(1)]),
         "p": jnp.append(p, 0.0),
         "bounds": jnp.concatenate([nodes[:1], tau, jnp.repeat(nodes[-1:], idle + 1)]),
-        "first_cell": jnp.concatenate([jnp.zeros(1, int), begins, jnp.full(idle + 1, cells - 1)]),
+        "first_cell": jnp.concatenate([first_cell, jnp.full(idle + 1, cells - 1)]),
         "multipliers": np.zeros(max(layout.constraint_rows["count"], 1)),
         "units": units,
     }
