@@ -657,7 +657,7 @@ class NativeHypotheses:
         parent, before, after, slot = children.T[: Column.SLOT + 1]
         times[:] = self._arrays["nodes"][first]
         counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
-        return self._go_on(parents.records, counts, children, times, (first, last, False))
+        return self._go_on(parents.records, (children, times, counts), (first, last, False))
 
     def follow_order(
         self, parents: FloatArray, places: Integers, births: FloatArray, order: OrderTables, first: int, last: int
@@ -726,23 +726,17 @@ class NativeHypotheses:
         if first is not None:
             own.states[:], own.tangents[:] = start.states, start.tangents
         counts = np.column_stack([counts, np.arange(len(counts))])
-        return self._go_on(own.records, counts, children, times, (first or 0, last, first is None), recentres)
+        return self._go_on(own.records, (children, times, counts), (first or 0, last, first is None), recentres)
 
     def _go_on(
-        self,
-        parents: FloatArray,
-        counts: Integers,
-        children: Integers,
-        times: FloatArray,
-        places: tuple[int, int, bool],
-        recentres: bool = True,
+        self, parents: FloatArray, births: tuple[Any, ...], places: tuple[int, int, bool], recentres: bool = True
     ) -> Hypotheses:
-        """Propagate copies of records."""
-        records = np.empty((len(counts), self.record_size))
-        arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
-        addresses = map(get_address, (records, parents, *arrays))
+        """Propagate copies of records; `births` are their children, times and counts."""
+        children, times, counts = map(np.ascontiguousarray, births)
+        records, last = np.empty((len(counts), self.record_size)), places[1]
+        addresses = map(get_address, (records, parents, children, times, counts))
         ends = last == self._cells, recentres and self._recentres
-        self._propagate(self._table_at, *addresses, times.shape[1], first, last, restarts, len(records), *ends)
+        self._propagate(self._table_at, *addresses, times.shape[1], *places, len(records), *ends)
         return self.view(records)
 
     def view(self, records: FloatArray) -> Hypotheses:
