@@ -21,7 +21,7 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
@@ -119,11 +119,11 @@ class Watch:
 
     Parameters
     ----------
-    most : mapping of str to float, optional
+    most : dict of str to float, optional
         Work in a mode after which `add` raises `TooManyStepsError`.
     between : int
         Steps in a mode between two looks.
-    refused : container of str, optional
+    refused : set of str, optional
         Modes that take explicit steps although they are stiff; by default all do.
 
     Attributes
@@ -134,10 +134,7 @@ class Watch:
     """
 
     def __init__(
-        self,
-        most: Mapping[str, float] | None = None,
-        between: int = STEPS_BETWEEN,
-        refused: Container[str] | None = None,
+        self, most: dict[str, float] | None = None, between: int = STEPS_BETWEEN, refused: set[str] | None = None
     ) -> None:
         self.modes: dict[str, _ModeSteps] = {}
         self.most, self.between, self.refused = most or {}, between, refused

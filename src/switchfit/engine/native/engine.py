@@ -413,13 +413,10 @@ class NativeExperiment:
         self._find_first_cells(tau, side)
         if self._late:
             self._find_late_cells(p)
+        self._multipliers[:] = 0.0
         if multipliers is not None:
             self._multipliers[self._constraint_rows] = multipliers
-        try:
-            self._function(self._address, *self._counts)
-        finally:
-            if multipliers is not None:
-                self._multipliers[:] = 0.0
+        self._function(self._address, *self._counts)
         check = self._check.item(0)
         # If the cost is not finite, it is returned without fallback: the caller rejects the point anyway.
         if check != check and math.isfinite(self._J.item(0)):
