@@ -50,6 +50,7 @@ STAGES = len(EXPLICIT.b)
 
 Store = tuple[str, int, Node]
 Factors = Elimination | Routine | None
+"""Those of the coupled equations of an implicit row; None for an explicit one."""
 Along = list[tuple[Node, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
