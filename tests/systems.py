@@ -1,7 +1,7 @@
 """Test systems: nonlinear, time-dependent, with parameters in several modes and every kind of cost at once.
 
-The weight of each kind of cost, the time at which everything happens and whether two modes are equal are fixed
-parameters, that is arguments: one compiled program serves all of these variations.
+The weight of each kind of cost and whether two modes are equal are fixed parameters, that is arguments: one compiled
+program serves all of these variations.
 """
 
 from __future__ import annotations
@@ -34,13 +34,11 @@ CELLS = 176
 
 
 def mode_a(t, x, p):
-    s = t - p["shift"]
-    return jnp.array([x[1] * jnp.cos(s) + 0.2 * x[0] * x[1], -p["a"] * x[0] + 0.3 * x[1] ** 2 * jnp.sin(s)])
+    return jnp.array([x[1] * jnp.cos(t) + 0.2 * x[0] * x[1], -p["a"] * x[0] + 0.3 * x[1] ** 2 * jnp.sin(t)])
 
 
 def mode_b_alone(t, x, p):
-    s = t - p["shift"]
-    return jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * s) * x[1], -x[0] * jnp.exp(-p["a"] * s)])
+    return jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * t) * x[1], -x[0] * jnp.exp(-p["a"] * t)])
 
 
 def mode_b(t, x, p):
@@ -48,8 +46,7 @@ def mode_b(t, x, p):
 
 
 def mode_c(t, x, p):
-    s = t - p["shift"]
-    return jnp.array([p["a"] * s - x[0] * x[1], p["b"] * jnp.sin(x[0] * s)])
+    return jnp.array([p["a"] * t - x[0] * x[1], p["b"] * jnp.sin(x[0] * t)])
 
 
 def driven_a(t, x, p, u):
@@ -62,13 +59,11 @@ def driven_b(t, x, p, u):
 
 def stiff_b(t, x, p):
     """The second state follows the first one within a thousandth of the horizon."""
-    s = t - p["shift"]
-    return jnp.array([p["b"] * jnp.cos(s) - x[0] * x[1], -1000.0 * p["a"] * (x[1] - jnp.cos(p["b"] * x[0] + s))])
+    return jnp.array([p["b"] * jnp.cos(t) - x[0] * x[1], -1000.0 * p["a"] * (x[1] - jnp.cos(p["b"] * x[0] + t))])
 
 
 def reset(t, x, p):
-    s = t - p["shift"]
-    return jnp.array([1.1 * x[0] + p["a"] * s * x[1] ** 2, 0.2 * p["b"] ** 2 * jnp.sin(x[0]) - 0.7 * x[1]])
+    return jnp.array([1.1 * x[0] + p["a"] * t * x[1] ** 2, 0.2 * p["b"] ** 2 * jnp.sin(x[0]) - 0.7 * x[1]])
 
 
 def initial_state(p):
@@ -76,8 +71,7 @@ def initial_state(p):
 
 
 def running(t, x, p):
-    s = t - p["shift"]
-    return p["w_running"] * (jnp.sin(x[0]) * x[1] ** 2 * p["a"] * jnp.cos(s) + jnp.exp(0.3 * x[0]) * p["b"] * x[1] * s)
+    return p["w_running"] * (jnp.sin(x[0]) * x[1] ** 2 * p["a"] * jnp.cos(t) + jnp.exp(0.3 * x[0]) * p["b"] * x[1] * t)
 
 
 def terminal(x, p):
@@ -85,11 +79,11 @@ def terminal(x, p):
 
 
 def observed_continuously(t, x, p):
-    return jnp.array([x[0] * x[1] + p["b"] * (t - p["shift"])])
+    return jnp.array([x[0] * x[1] + p["b"] * t])
 
 
 def observed_at_samples(t, x, p):
-    return jnp.array([p["a"] * x[1] ** 2 + (t - p["shift"]) * x[0], x[0] + p["b"] * x[1]])
+    return jnp.array([p["a"] * x[1] ** 2 + t * x[0], x[0] + p["b"] * x[1]])
 
 
 NODES = np.linspace(0.0, 2.0, 21)
@@ -117,25 +111,22 @@ IMPLICIT = {"mixed": (False, True)}
 """Which modes take implicit steps, for problems in which some but not all do; ``solver="auto"`` chooses so."""
 
 
-def problem_of(name: str, shift: float = 0.0, parts: tuple[str, ...] = KINDS[:4]) -> Problem:
-    """One of `SYSTEMS` with the given kinds of cost."""
+def problem_of(name: str) -> Problem:
+    """One of `SYSTEMS`."""
     system, sequence, tau = SYSTEMS[name]
     values = np.stack([np.cos(3 * SAMPLE_TIMES), 1.0 + SAMPLE_TIMES], axis=1)
     values[3, 0] = np.nan
-    data = {
-        "running": RunningCost(running),
-        "reference": ReferenceSignal.from_samples(
-            KNOTS + shift, np.sin(2 * KNOTS), observe=observed_continuously, weights=[1.3]
-        ),
-        "samples": Measurements(SAMPLE_TIMES + shift, values, observe=observed_at_samples, sigma=[0.9, 1.2]),
-        "terminal": TerminalCost(terminal),
-    }
-    inputs = Input(KNOTS + shift, np.cos(KNOTS), kind="linear") if name == "resets" else None
-    experiment = Experiment([data[part] for part in parts], sequence, tau + shift, shift, shift + 2.0, inputs=inputs)
+    data = [
+        RunningCost(running),
+        ReferenceSignal.from_samples(KNOTS, np.sin(2 * KNOTS), observe=observed_continuously, weights=[1.3]),
+        Measurements(SAMPLE_TIMES, values, observe=observed_at_samples, sigma=[0.9, 1.2]),
+        TerminalCost(terminal),
+    ]
+    inputs = Input(KNOTS, np.cos(KNOTS), kind="linear") if name == "resets" else None
+    experiment = Experiment(data, sequence, tau, 0.0, 2.0, inputs=inputs)
     weights = {q: Parameter(1.0, fixed=True) for q in ("w_running", "w_terminal")}
-    parameters = {"a": P0[0], "b": P0[1], "shift": Parameter(shift, fixed=True), "equal": Parameter(0.0, fixed=True)}
-    solver = "stiff" if name == "stiff" else "explicit"
-    return Problem(system, experiment, parameters | weights, solver=solver)
+    parameters = {"a": P0[0], "b": P0[1], "equal": Parameter(0.0, fixed=True)}
+    return Problem(system, experiment, parameters | weights, solver="stiff" if name == "stiff" else "explicit")
 
 
 def padded_mesh(times: np.ndarray, cells: int = CELLS) -> Mesh:

@@ -15,8 +15,6 @@ from systems import (
     closed_form,
     closed_form_case,
     padded_mesh,
-    problem_of,
-    weighted,
 )
 
 from switchfit.discretization.mesh import build_arguments
@@ -105,11 +103,3 @@ def test_splitting_a_mode_changes_nothing(split: float) -> None:
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
     np.testing.assert_allclose(found.gradient[1:], expected.gradient[1:], atol=1e-6)
     np.testing.assert_allclose(found.hessian[1:, 1:], expected.hessian[1:, 1:], atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["plain", "resets"])
-def test_shift_of_time_changes_nothing(name: str) -> None:
-    this, shift = case(name), 4.0
-    moved = build_arguments(problem_of(name, shift), 0, padded_mesh(NODES + shift))
-    found = this.discrete(weighted(this.structure, moved, "all"), np.array(INSIDE[name]) + shift, P0)
-    assert_same(found, this.discrete(this.arguments(), INSIDE[name], P0), 1e-11)

@@ -8,7 +8,7 @@ import pytest
 
 import switchfit as sf
 from benchmarks.sharp.problems import spring
-from switchfit.discretization import implicit_rows, rows
+from switchfit.discretization import propagation, rows
 from switchfit.discretization.rows import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND
 from switchfit.engine.adaptive import refine_mesh, refine_mesh_of_run
 from switchfit.engine.native.kernels import JUMP_WEIGHT
@@ -94,8 +94,7 @@ def judge(h, slopes, states, f_x, weights):
 
 def measure(f, f_x, tableau, weights, h):
     """The jump of a row of x' = f(t, x) from 1 at 0, whose slope in t is 0 beside jumps."""
-    stages = implicit_rows.stages if tableau is STIFF else rows.stages
-    found = stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
+    found = propagation.compute_stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
     found = rows.Stages(*([np.asarray(value) for value in part] for part in found))
     slopes = [np.array([[f_x(found.times[j], found.states[j][0])]]) for j in (0, -1)]
     return float(rows.measure_jump(*judge(h, found.slopes, found.states, slopes, weights), np)[0])

@@ -10,8 +10,7 @@ from models import decay as eliminate
 from scipy.optimize import least_squares
 
 import switchfit as sf
-from switchfit.engine.native.engine import foreign_derivatives
-from switchfit.engine.native.experiment import places_in_library
+from switchfit.engine.native.engine import foreign_derivatives, places_in_library
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import idle_unknowns
 from switchfit.io.command_line import describe_experiments, summarize_estimate

@@ -19,7 +19,7 @@ from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, fin
 from switchfit.discretization.rows import ADAPTIVE, ADAPTIVE_ERROR, Tolerances
 from switchfit.engine import adaptive
 from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.engine import native_experiment
 from switchfit.engine.protocol import runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import LATE_RAMP, decay, rest
+from models import decay, rest
 
 import switchfit as sf
 from switchfit.engine.native import program
@@ -128,15 +128,6 @@ def test_two_costs_at_one_transition_are_refused():
     costs = [sf.TransitionCost(lambda t, x, p: x[0]), sf.TransitionCost(lambda t, x, p: t, before="swing")]
     with pytest.raises(ValueError, match="2 TransitionCosts count at a transition from 'swing' to"):
         problem([samples(), *costs])
-
-
-def test_a_fit_with_the_cost_of_a_switch():
-    """Minimum of J in closed form: the time that a transition would have alone is drawn to where it is cheap."""
-    data = sf.Measurements([3.0], [[1.8]], sigma=0.5)  # x(3) = 3 - tau
-    wish = sf.TransitionCost(lambda t, x, p: 0.5 * ((t - 1.0) / 0.25) ** 2, before="wait", after="ramp")
-    run = sf.Experiment([data, wish], ("wait", "ramp"), (1.5,), 0.0, 3.0)
-    found = sf.estimate(sf.Problem(LATE_RAMP, run))
-    assert found.theta[0] == pytest.approx((1.2 / 0.25 + 1.0 / 0.0625) / (1 / 0.25 + 1 / 0.0625), rel=1e-9)
 
 
 def programs():

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.branches import has_corners
 from switchfit.engine.choice import derivatives_inside_program, runs_natively
-from switchfit.engine.native.experiment import places_in_library
+from switchfit.engine.native.engine import places_in_library
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of

@@ -322,7 +322,9 @@ def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Argume
         padded._replace(cell=_pad_with_last(mesh.cell_ending_at(item.seen_times), len(padded.time), 0))  # type: ignore[arg-type]
         for item, padded in zip(measurements, common.samples, strict=True)
     )
-    signals = _split_signals_by_cell(experiment, mesh)
+    # Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S).
+    split = [split_by_cell(signal, mesh) for signal in experiment.signals]
+    signals = split[0] if len(split) == 1 else np.concatenate([np.zeros((len(mesh.nodes) - 1, 4, 0)), *split], axis=2)
     return common._replace(nodes=mesh.nodes, signals=signals, samples=samples)  # type: ignore[arg-type]  # made jax arrays
 
 
@@ -330,10 +332,8 @@ def build_common_arguments(problem: Problem, e: int) -> Arguments:
     """Return the arguments of experiment e that suit any mesh, without nodes, signals and the cells of samples."""
     structure, experiment = problem.structures[e], problem.experiments[e]
     initial = initial_state_of(problem.system, experiment)
-    mapped = experiment.parameter_map
-    fixed = tuple(
-        problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read
-    )
+    unread = (experiment.parameter_map.get(name, name) for name, _, read in structure.parameters if not read)
+    fixed = tuple(problem.parameters[name].value for name in unread)
     measurements = select_kind(experiment.data, Measurements)
     lengths = problem.sample_lengths[e]
     samples = tuple(_pad_samples(*each, experiment.t0) for each in zip(measurements, lengths, strict=True))
@@ -354,12 +354,8 @@ def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
 def _pad_samples(item: Measurements, length: int, t0: float) -> Samples:
     """Return samples of one Measurements, padded with missing ones to a length, without their cells."""
     rows = ((0, length - len(item.times)), (0, 0))
-    return Samples(
-        np.zeros(0, dtype=np.intp),  # type: ignore[arg-type]  # made jax arrays
-        _pad_with_last(item.seen_times, length, t0),  # type: ignore[arg-type]
-        np.pad(np.nan_to_num(item.values), rows),  # type: ignore[arg-type]
-        np.pad(item.weights, rows),  # type: ignore[arg-type]
-    )
+    times, values = _pad_with_last(item.seen_times, length, t0), np.pad(np.nan_to_num(item.values), rows)
+    return Samples(np.zeros(0, int), times, values, np.pad(item.weights, rows))  # type: ignore[arg-type]  # made jax arrays
 
 
 def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[Any]:
@@ -367,13 +363,6 @@ def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[An
     padded = np.full(length, array[-1] if len(array) else first, array.dtype)
     padded[: len(array)] = array
     return padded
-
-
-def _split_signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
-    """Return every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
-    signals = [split_by_cell(signal, mesh) for signal in experiment.signals]
-    none = np.zeros((len(mesh.nodes) - 1, 4, 0))
-    return signals[0] if len(signals) == 1 else np.concatenate([none, *signals], axis=2)
 
 
 def split_by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:

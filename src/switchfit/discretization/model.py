@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from itertools import pairwise
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import jax
@@ -152,14 +152,13 @@ class Model:
 
     def reference_residuals(self, piece: Piece) -> list[Callable[[Array, Array, Array], Array]]:
         """Return ``y(t, x, p) - y_m(t)`` of each reference signal, (q,)."""
-        ends = np.cumsum([0, *(channels for _, channels in self.structure.references)]).tolist()
-        return [
-            partial(self._reference_residual, k, slice(first, last), piece)
-            for k, (first, last) in enumerate(pairwise(ends))
-        ]
 
-    def _reference_residual(self, k: int, channels: slice, piece: Piece, t: Array, x: Array, p: Array) -> Array:
-        return self.observe(self.structure.references[k][0], t, x, p) - piece(t)[channels]
+        def residual(observe: Function | None, channels: slice, t: Array, x: Array, p: Array) -> Array:
+            return self.observe(observe, t, x, p) - piece(t)[channels]
+
+        ends = accumulate(channels for _, channels in self.structure.references)
+        each = zip(self.structure.references, ends, strict=True)
+        return [partial(residual, observe, slice(end - channels, end)) for (observe, channels), end in each]
 
     def observe(self, observe: Function | None, t: Array, x: Array, p: Array) -> Array:
         """Return the output of a sensor: (q,)."""

@@ -23,6 +23,15 @@ second     with Z_j the derivative of (t_j, X_j, p) along theta, and V that of t
 Only rows that open or close a mode have times that depend on theta. Arrays are NumPy arrays of the nodes of a graph,
 whose vectors hold one entry per unknown, so that all directions are treated at once.
 
+The slopes of an implicit method depend on each other. Newton's method finds the *increments* ``k_j = h K_j``, from
+which ``X_j = x + sum_l a_jl k_l`` follows,
+
+    ``(I - h a_jl D_1 f_j) dk = h f(t_j, X_j) - k_j``,
+
+and with the matrix of these coupled equations also the tangents, ``(I - h a_jl D_1 f_j) K' = ...``, and, transposed,
+the adjoint. A function that factorizes this matrix, or its factors, are passed: machine code eliminates entry by entry,
+or calls a routine.
+
 Step size control of the adaptive solve that chooses the mesh, in machine code.
 
 A step of the Dormand-Prince pair (`ADAPTIVE`) from y at t, with the stages of `rows`, has the error
@@ -30,7 +39,7 @@ A step of the Dormand-Prince pair (`ADAPTIVE`) from y at t, with the stages of `
 ``h min(10, max(0.2, 0.9 norm^(-1/5)))``, not larger than h after a rejected step. A step after an accepted one is never
 shorter than a few units in the last place of t, and the last step ends at the end time exactly. This is the step size
 control of SciPy's RK45 (Hairer, Norsett and Wanner I, section II.4). Steps of the implicit method have the error of
-`implicit_rows.estimate_error`, whose order is 4: the exponent is -1/4. A step whose stages are not found has an error
+`estimate_error`, whose order is 4: the exponent is -1/4. A step whose stages are not found has an error
 that is NaN, and is rejected.
 
 Functions of one step take `xp`, the module for their arrays: NumPy, or the namespace of a graph of scalars.
@@ -38,9 +47,9 @@ Functions of one step take `xp`, the module for their arrays: NumPy, or the name
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from functools import reduce
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -183,12 +192,7 @@ class Stages(NamedTuple):
 
 
 def stages(
-    tableau: Tableau,
-    f: Callable[[Array, Array], Array],
-    start: Array,
-    end: Array,
-    x: Array,
-    increments: Sequence[Array] = (),
+    tableau: Tableau, f: Callable[..., Array], start: Array, end: Array, x: Array, increments: Sequence[Array] = ()
 ) -> Stages:
     """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field.
 
@@ -209,6 +213,74 @@ def cost_of_row(tableau: Tableau, h: Array, densities: Sequence[Array]) -> Array
     return h * combine(tableau.b, densities)
 
 
+SHORT = 1e-3
+"""Length of a row, in times of the fastest component of f, below which its slopes are f at the stages."""
+
+
+class Factors(Protocol):
+    """A factorized matrix of s by s blocks (n, n)."""
+
+    def solve(self, right: Sequence[Array], *, transposed: bool = False) -> list[Array]:
+        """Return the solution for a right-hand side of s vectors (n,): s vectors (n,)."""
+        ...
+
+
+Factorize = Callable[[Array, Array, Sequence[Array]], Factors]
+"""Factorizes the matrix of the coupled equations: a (s, s), h and f_x (s arrays (n, n)), as in `couple`."""
+
+
+def couple(a: Array, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
+    """Return the matrix of the coupled equations, ``I - h a_jl D_1 f_j``, in s by s blocks (n, n)."""
+    unit = np.eye(f_x[0].shape[0])
+    return [
+        [(unit if j == m else 0.0 * unit) - (h * a_jm) * f_x[j] for m, a_jm in enumerate(row)]
+        for j, row in enumerate(a.tolist())
+    ]
+
+
+def correct_increments(
+    tableau: Tableau, h: Array, k: Sequence[Array], slopes: Sequence[Array], f_x: Sequence[Array], factorize: Factorize
+) -> list[Array]:
+    """Return the increments k (s arrays (n,)) after one iteration of Newton's method.
+
+    Parameters
+    ----------
+    slopes, f_x : s arrays (n,) and (n, n), f and D_1 f at the stages ``x + sum_l a_jl k_l``
+    """
+    right = [h * slope - own for slope, own in zip(slopes, k, strict=True)]
+    return [own + change for own, change in zip(k, factorize(tableau.a, h, f_x).solve(right), strict=True)]
+
+
+def choose_slopes(h: Array, k: Sequence[Array], f_X: Sequence[Array], f_x: Array, xp: Any) -> list[Array]:
+    """Return the slopes K of the stages, from the increments k, or f at the stages where the row is short.
+
+    The stiff components of f amplify the rounding errors of X, those of k / h do not. But the second derivative of
+    k / h in h loses all digits where h is a rounding error of a transition time, and 1 / h fails where it is zero.
+
+    Parameters
+    ----------
+    k, f_X : s arrays (n,)
+    f_x : (n, n), D_1 f at the start of the row
+    xp : module
+        jax.numpy, or the namespace of a graph.
+    """
+    fastest = reduce(xp.maximum, list(xp.abs(f_x).sum(axis=1)))
+    is_long = xp.abs(h) * fastest > SHORT
+    length = xp.where(xp.equal(h, 0.0), 1.0, h)
+    return [xp.where(is_long, own / length, slope) for own, slope in zip(k, f_X, strict=True)]
+
+
+def estimate_error(h: Array, k: Sequence[Array], slope: Array, f_x: Array, factorize: Factorize) -> Array:
+    """Return an estimate of the error of an implicit row, (n,): Hairer and Wanner II, equation (IV.8.19).
+
+    ``(I - h g D_1 f)^-1 g (h f + sum_j e_j k_j)``, of order 4, with f (n,) and D_1 f (n, n) at the start of the row.
+    """
+    damping, *weights = STIFF_ERROR
+    right = damping * (h * slope + combine(weights, k))
+    (error,) = factorize(np.array([[damping]]), h, [f_x]).solve([right])
+    return error
+
+
 class Tangent(NamedTuple):
     """Derivatives along one direction: of the states and slopes of the stages, (n,) each, and of x+ (n,)."""
 
@@ -225,6 +297,7 @@ def tangent(
     forcing: Sequence[Array],
     x_d: Array,
     h_d: Array,
+    factors: Factors | None = None,
 ) -> Tangent:
     """Differentiate a row along one direction.
 
@@ -236,17 +309,28 @@ def tangent(
     forcing : s arrays (n,), ``D_2 f t_j' + D_p f p'``
     x_d : (n,), derivative of the state before the row
     h_d : (), derivative of the step length; None where it does not depend on theta
+    factors : of the matrix of the coupled equations of an implicit row, with f_x; `adjoint` takes the same ones
     """
-    found = Tangent([], [], None)
-    for j in range(len(tableau.b)):
-        # X_j' = x' + h sum_l a_jl K_l' + h' sum_l a_jl K_l: along p this discretizes the linear equation whose solution
-        # is (10) of the paper.
-        X_d = x_d + h * combine(tableau.a[j], found.slopes)
-        X_d = X_d if h_d is None else X_d + h_d * combine(tableau.a[j], slopes)
-        found.states.append(X_d)
-        found.slopes.append(times_vector(f_x[j], X_d) + forcing[j])
-    after = x_d + h * combine(tableau.b, found.slopes)
-    return found._replace(after=after if h_d is None else after + h_d * combine(tableau.b, slopes))
+
+    def follow(start: Array, weights: FloatArray, K_d: Sequence[Array]) -> Array:
+        """Return ``start + h sum_l weights_l K_l' + h' sum_l weights_l K_l``."""
+        moved = start + h * combine(weights, K_d) if K_d else start
+        return moved if h_d is None else moved + h_d * combine(weights, slopes)
+
+    # X_j' = x' + h sum_l a_jl K_l' + h' sum_l a_jl K_l: along p this discretizes the linear equation whose solution is
+    # (10) of the paper.
+    states: list[Array] = []
+    K_d: list[Array] = []
+    if factors is None:
+        for J, given, row in zip(f_x, forcing, tableau.a, strict=True):
+            states.append(follow(x_d, row, K_d))
+            K_d.append(times_vector(J, states[-1]) + given)
+    else:
+        # (I - h a_jl D_1 f_j) K' = D_1 f_j (x' + h' sum_l a_jl K_l) + D_2 f t_j' + D_p f p'.
+        known = [follow(x_d, row, ()) for row in tableau.a]
+        K_d = factors.solve([given + times_vector(J, X_d) for J, given, X_d in zip(f_x, forcing, known, strict=True)])
+        states = [follow(x_d, row, K_d) for row in tableau.a]
+    return Tangent(states, K_d, follow(x_d, tableau.b, K_d))
 
 
 class Adjoint(NamedTuple):
@@ -272,18 +356,28 @@ Pull = Callable[[int, Array, Array], tuple[Array, Array, Array]]
 """``pull(j, w, hb)``: derivatives of ``w . f + hb ell`` at stage j in t (), x (n,) and p (M,)."""
 
 
-def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
-    """Pull the costate psi (n,) after a row back to its start."""
-    a, b = tableau.a.tolist(), tableau.b.tolist()
-    s = len(b)
-    w: list[Array] = [None] * s
-    mu: list[Array] = [None] * s
-    times: list[Array] = [None] * s
+def adjoint(
+    tableau: Tableau, h: Array, psi: Array, pull: Pull, ell_x: Sequence[Array] = (), factors: Factors | None = None
+) -> Adjoint:
+    """Pull the costate psi (n,) after a row back to its start; of an implicit row by its factors, and with D_1 ell at
+    each stage, s arrays (n,).
+    """
+    a, b, s = tableau.a, tableau.b.tolist(), len(tableau.b)
+    w, mu, times = ([None] * s for _ in range(3))
     parameters: Array = 0.0
-    # Last stage first: w_j needs mu_l of the stages that use K_j, those behind it. This discretizes (7) of the paper.
-    for j in reversed(range(s)):
-        later = combine([a[m][j] for m in range(j + 1, s)], mu[j + 1 :])
-        w[j] = h * (b[j] * psi + later)
+    if factors is not None:
+        # mu_l = D_1 f_l' w_l + h b_l D_1 ell_l put into w_j = h b_j psi + h sum_l a_lj mu_l leaves a system in w alone,
+        # with the transposed matrix of the tangent:
+        #     w_j - h sum_l a_lj D_1 f_l' w_l = h b_j psi + h sum_l a_lj h b_l D_1 ell_l
+        costs = [(h * b[j]) * ell_x[j] for j in range(s)]
+        right = [h * (b[j] * psi + combine(a[:, j], costs)) for j in range(s)]
+        w = factors.solve(right, transposed=True)
+    # Explicit: last stage first, since w_j needs mu_l of the stages that use K_j, those behind it. This discretizes (7)
+    # of the paper.
+    for j in reversed(range(s)) if factors is None else range(s):
+        if factors is None:
+            later = combine(a[j + 1 :, j], mu[j + 1 :])
+            w[j] = h * (b[j] * psi + later)
         times[j], mu[j], in_p = pull(j, w[j], h * b[j])
         parameters = parameters + in_p
     return Adjoint(w, mu, psi + sum(mu[1:], mu[0]), times, parameters)
@@ -439,16 +533,10 @@ def first_step(
 
     NaN if a slope is not finite.
     """
-
-    def size(error: FloatArray) -> float:
-        relative = error / weight
-        return math.sqrt(relative.dot(relative) / len(y))  # `error_norm`, in half the time
-
     with np.errstate(all="ignore"):
-        weight = tolerances.atol + tolerances.rtol * np.abs(y)
         if not np.isfinite(K).all():
             return np.nan
-        of_state, of_slope = size(y), size(K)
+        of_state, of_slope = (float(error_norm(each, y, y, tolerances)) for each in (y, K))
         if not np.isfinite(of_slope):  # its square overflows: the first step will fail, with a message
             return min(1e-6, end - t)
         # An Euler step h_0 that moves y by 1 % of its size, then h_1 from (h_1)^q max(|f|, |df| / h_0) = 0.01: the
@@ -457,7 +545,7 @@ def first_step(
         step = 0.0
         if guess > 0.0:
             ahead = min(t + guess, float(np.nextafter(end, t)))
-            bend = size(slope(ahead, y + guess * K) - K) / guess
+            bend = float(error_norm(slope(ahead, y + guess * K) - K, y, y, tolerances)) / guess
             flat = of_slope <= 1e-15 and bend <= 1e-15
             step = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** -exponent
         step = min(100.0 * guess, step)

@@ -28,19 +28,11 @@ import numpy as np
 from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.rows import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
-from switchfit.engine.branches import (
-    MOST_FOUND,
-    BranchError,
-    Branches,
-    Course,
-    Crossing,
-    Path,
-    SteepError,
-    TooManyCrossingsError,
-)
+from switchfit.engine import branches
+from switchfit.engine.branches import MOST_FOUND, BranchError, Branches, Course, Crossing, Path, SteepError
 from switchfit.engine.jax import call_model
-from switchfit.engine.native.adaptive import Adaptive
-from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.engine import NativeExperiment, native_experiment
+from switchfit.engine.native.program import AT
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
 from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
@@ -101,7 +93,7 @@ def solve_adaptively(run: Run, theta: FloatArray, settings: Settings = Settings(
     if run.branches is not None:
         try:
             return find_path(run, run.branches, tau, p, run.coarse, settings)[0]
-        except TooManyCrossingsError as error:
+        except branches.TooManyCrossingsError as error:
             if run.path is not None:  # a trial far from the guess
                 raise
             # Too many crossings at the guess: once more without following them, with short steps at each corner.
@@ -166,13 +158,13 @@ class _NativeSteps:
 
     def __init__(self, native: NativeExperiment, mode: int, stretch: _Stretch, p: FloatArray, given: Tolerances):
         self._native, self._mode, self._p, self._end = native, mode, p, stretch.end
-        self.y, at, (start, end) = np.append(stretch.x, 0.0), Adaptive(), stretch[1:3]
+        self.y, (start, end) = np.append(stretch.x, 0.0), stretch[1:3]
         exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
         step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
-        self._state = np.zeros(len(at))
-        self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
+        self._state = np.zeros(len(AT))
+        self._state[[AT.t, AT.step, AT.end, AT.rtol, AT.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
-        self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)
+        self._state[[AT.low, AT.high]] = np.nextafter(start, end), np.nextafter(end, start)
         self.t, self.is_running = start, True
 
     def slope(self, t: float, y: FloatArray) -> FloatArray:
@@ -185,9 +177,9 @@ class _NativeSteps:
 
     def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
         """Take up to `most` steps; return the accepted times (L,) and the states there (L, n)."""
-        found, at = self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most), Adaptive()
-        self.t = float(self._state[at.t])
-        self.is_running = self.t < self._end and not self._state[at.stuck]
+        found = self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most)
+        self.t = float(self._state[AT.t])
+        self.is_running = self.t < self._end and not self._state[AT.stuck]
         return found
 
 
@@ -248,10 +240,8 @@ class _Solve:
             known = run.solvers.__dict__ if coarse is run.coarse else {}
             key = f"{'' if course is None else course.branches.version} {chosen.implicit}"
             if key not in known:
-                made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
-                if made is None and chosen is not structure:
-                    made = native_experiment(structure, whole, coarse.times, order=Order.COST)
-                known[key] = made
+                made = (native_experiment(each, whole, coarse.times, Order.COST) for each in (chosen, structure))
+                known[key] = next(filter(None, made), None)
             self._native = known[key]
         self._p = np.zeros(0)
 
@@ -285,12 +275,13 @@ class _Solve:
         return np.concatenate(steps)
 
     def _find_initial_state(self) -> FloatArray:
-        if self._native is None:
-            x = self._call_model(Model.initial_state, self._structure.functions)
+        native, p = self._native, self._p
+        if native is None:
+            x = self._call_model(Model.initial_state, structure=self._structure.functions)
         else:
-            x = self._native.initial_state(self._p)
+            x = native.initial_state(p)
         if not np.isfinite(x).all():
-            named = read_parameters(self._structure, self._arguments, self._p)
+            named = read_parameters(self._structure, self._arguments, p)
             # of an array of which some entries are read, these alone
             shown = {name: named[name].ravel()[list(read)] for name, _, read in self._structure.parameters if read}
             whole = {name: value for name, value in named.items() if value.size == np.size(shown.get(name, value))}
@@ -300,11 +291,11 @@ class _Solve:
 
     def _apply_reset(self, i: int, t: float, x: FloatArray) -> FloatArray:
         """Return the state after the reset map of transition i (from 0)."""
-        structure = self._structure
-        if self._native is None:
-            after = self._call_model(_apply_reset, structure, t, x, which=(i,))
+        structure, native, p = self._structure, self._native, self._p
+        if native is None:
+            after = self._call_model(_apply_reset, t, x, structure=structure, which=(i,))
         else:
-            after = self._native.after_reset(i, t, x, self._p)
+            after = native.after_reset(i, t, x, p)
         if not np.isfinite(after).all():
             names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i : i + 2])
             what = "the map of a Jump" if i in structure.jumps else f"reset map {names}"
@@ -331,10 +322,10 @@ class _Solve:
                 return steps, x
             # The middle of what is left of the stretch says which cell of the signals is meant at its ends.
             rest = stretch._replace(start=crossing.time, x=x)
-            if crossing.time >= stretch.end:
-                self._course.cross(crossing, stretch.middle)
+            is_end = crossing.time >= stretch.end
+            self._course.cross(crossing, (stretch if is_end else rest).middle)
+            if is_end:
                 return steps, x
-            self._course.cross(crossing, rest.middle)
             stretch = rest
 
     def _solve(self, stretch: _Stretch) -> tuple[FloatArray, FloatArray, Crossing | None]:
@@ -371,7 +362,7 @@ class _Solve:
     ) -> tuple[FloatArray, FloatArray, Crossing | None]:
         """Do what `_solve` does by steps of one kind."""
         course, natively = self._course, isinstance(steps, _NativeSteps)
-        accepted, x = [stretch.start], stretch.x
+        accepted, x, reason = [stretch.start], stretch.x, None
         # Between two calls Python looks: for corners that the steps have passed, and for stiffness.
         at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
         while steps.is_running:
@@ -383,10 +374,8 @@ class _Solve:
                     raise _NativeError
                 if watch is not None:
                     watch.give_up(_project_steps(accepted, stretch.end))
-                if course is not None:
-                    course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
                 reason = f"it needs more than {self._settings.most} steps"
-                raise self._report_stuck(stretch, accepted[-1], steps.y[:-1], reason)
+                break
             times, states = steps.advance(at_once)
             if course is not None:
                 # Steps behind a crossing were taken by the field of the wrong branch, and are dropped.
@@ -408,7 +397,9 @@ class _Solve:
         if course is not None:
             course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
         if steps.t < stretch.end or not np.isfinite(steps.y).all():
-            raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
+            if natively and reason is None:
+                raise _NativeError
+            raise self._report_stuck(stretch, steps.t, steps.y[:-1], reason or steps.message)
         return np.array(accepted[1:]), steps.y[:-1], None
 
     def _build_slope(self, stretch: _Stretch, mode: int) -> Slope:
@@ -429,13 +420,10 @@ class _Solve:
 
         return slope
 
-    def _call_model(
-        self, function: Callable[..., jax.Array], structure: Structure, *given: Any, which: tuple[int, ...] = ()
-    ) -> FloatArray:
+    def _call_model(self, function: Callable[..., jax.Array], *given: Any, **settings: Any) -> FloatArray:
         """Return the value of a function of the model, at the parameters."""
         with use_float64(), use_compilation_cache():
-            value = call_model(self._arguments, *given, self._p, structure=structure, function=function, which=which)
-            return np.asarray(value)
+            return np.asarray(call_model(self._arguments, *given, self._p, function=function, **settings))
 
     def _report_stuck(self, stretch: _Stretch, t: float, x: FloatArray, reason: str | None) -> NotIntegrableError:
         """Return the error of a solve that cannot go on beyond t, where x is the state."""

@@ -15,7 +15,7 @@ slides.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -70,8 +70,7 @@ def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
     return evaluate
 
 
-@dataclass(frozen=True)
-class Path:
+class Path(NamedTuple):
     """Branches of a trajectory.
 
     Attributes
@@ -304,11 +303,6 @@ class Course:
         self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
         self._ends.append([])
 
-    def _find_rates(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> FloatArray:
-        """Return dg/dt of all corners along a branch, at its steep corner k, which x is near."""
-        margins = tuple((at, NEAR_STEEP * margin) for at, margin in self.corners.margins)
-        return self.evaluate(find_corners(self.corners.function, margins).rates_at(sides, k), t, x, inside)
-
     def _is_steep(self, corner: int) -> bool:
         return any(k == corner for (k, _), _ in self.corners.margins)
 
@@ -360,9 +354,8 @@ class Course:
             values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
             pairs = zip(values, ends, strict=True)
             near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
-            self._make_steep(
-                [(k, self.sides[k]) for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)]
-            )
+            undefined = [k for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)]
+            self._make_steep([(k, self.sides[k]) for k in undefined])
 
     def _make_steep(self, corners: list[tuple[int, int]]) -> None:
         """Make corners steep on a side, if there are any that are not: the path has to be found anew."""
@@ -489,7 +482,9 @@ class Course:
         if self._is_steep(k):
             # At the corner itself, both rates may vanish as those of other corners do not: no side is better. Else the
             # rates on the margin decide as for any corner, since they are those that move the trajectory.
-            exact = np.abs([self._find_rates(each, k, t, x, inside) for each in both])
+            margins = tuple((at, NEAR_STEEP * margin) for at, margin in self.corners.margins)
+            near = find_corners(self.corners.function, margins)
+            exact = np.abs([self.evaluate(near.rates_at(each, k), t, x, inside) for each in both])
             if exact[:, k].max() <= STILL_STEEP * exact.max():
                 return sides[k] or 1
         up, down = (self.evaluate(self.corners.rates(each), t, x, inside)[k] for each in both)

@@ -29,10 +29,8 @@ from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.adaptive import Settings, find_path
 from switchfit.engine.branches import Branches, Course, Path, find_dips
 from switchfit.engine.jax import JaxEngine, derivatives
-from switchfit.engine.native.engine import NativeEngine, foreign_derivatives
-from switchfit.engine.native.experiment import reason_for_jax
-from switchfit.engine.native.hypotheses import NativeHypotheses
-from switchfit.engine.native.hypothesis_loops import hypotheses_program
+from switchfit.engine.native.engine import NativeEngine, foreign_derivatives, reason_for_jax
+from switchfit.engine.native.hypotheses import NativeHypotheses, hypotheses_program
 from switchfit.engine.native.templates import Sizes
 from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Run, Simulation, Tangents
 from switchfit.problem.corners import Corners, Sides
@@ -54,6 +52,7 @@ LOST = "the trajectory cannot be followed through the corners of its modes at th
 REQUIRED = "engine='native' requires machine code, but {}. Leave engine out to evaluate with JAX."
 
 Build = Callable[[Structure], NativeEngine | JaxEngine]
+Evaluate = Callable[[Structure, FloatArray], Evaluation[FloatArray]]
 
 
 OWN = -2
@@ -138,12 +137,7 @@ class SplitEngine:
         return self._solve(tau, p, 1.0)[1].cost
 
     def derivatives(
-        self,
-        tau: FloatArray,
-        p: FloatArray,
-        side: float,
-        matrix: Matrix,
-        method: Callable[[Structure, FloatArray], Evaluation[FloatArray]] | None = None,
+        self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Evaluate | None = None
     ) -> Evaluation[FloatArray]:
         """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
         split, found = self._solve(tau, p, side)
@@ -332,7 +326,7 @@ class SplitEngine:
 
     def _holds(self, split: _Split, times: FloatArray, p: FloatArray) -> bool:
         """Return whether the trajectory is inside its branches at the ends of all rows, and in dips between them."""
-        found = split.engine.trace(times, p)
+        found = split.engine.simulate(times, p, tangents=False)
         course = Course(self._branches, self._structure, self._arguments, p)
         # All rows of one branch together: one call evaluates the functions of its ends for all of them.
         pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)

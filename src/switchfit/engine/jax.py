@@ -4,7 +4,7 @@ The programs that JAX compiles: cost and derivatives of one experiment.
 
 They differentiate the simulation as it is. A step is one row of `switchfit.discretization.propagation.propagate`, whose
 derivatives JAX finds; those of an implicit step follow from the implicit function theorem
-(`switchfit.discretization.implicit_rows.stages`). A Hessian is differentiated forward first, then backward: the other
+(`switchfit.discretization.propagation`). A Hessian is differentiated forward first, then backward: the other
 way round, JAX would lose the rules of users' `jax.custom_jvp` functions inside a scan at the second derivative.
 """
 
@@ -34,7 +34,7 @@ from switchfit.discretization.propagation import (
     switch_mode,
     weigh_stages,
 )
-from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, add_samples, cut_at_tf
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, finish_simulation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure, pad_length
@@ -155,10 +155,7 @@ def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False
 
 
 def _differentiate_twice(
-    evaluate: Callable[[Array], tuple[Array, Array]],
-    theta: Array,
-    multipliers: Array,
-    differentiate: Callable[..., Any],
+    evaluate: Callable[..., tuple[Array, Array]], theta: Array, multipliers: Array, differentiate: Callable[..., Any]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return what `derivatives` does with multipliers, of a function that returns J and c."""
 
@@ -176,26 +173,24 @@ def _differentiate_twice(
     return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
 
 
-def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
     """Return the derivative (D,) of the first result, and the second."""
-    derivative, other = jax.jacfwd(function, has_aux=True)(theta)
-    return derivative, other
+    return jax.jacfwd(function, has_aux=True)(theta)
 
 
-def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
     """Do what `_differentiate_forward` does, backward; forward through a loop of unknown length, as JAX cannot else."""
     return _try_backward(function, theta) or _differentiate_forward(function, theta)
 
 
-def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> tuple[Array, Any] | None:
+def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> Any:
     """Return the derivative of the first result, and the second; None if there is a loop of unknown length."""
     try:
-        derivative, other = jax.grad(function, has_aux=True)(at)
+        return jax.grad(function, has_aux=True)(at)
     except ValueError as error:
         if NOT_BACKWARD not in str(error):
             raise
         return None
-    return derivative, other
 
 
 @partial(jax.jit, static_argnames=("structure",))
@@ -260,8 +255,8 @@ def simulate_rows(
     if not tangents:
         return J, seen, rows, ()
 
+    # At the rows that begin or end at a transition, dx/dt times the derivative of the time is subtracted.
     def fix_times(values: Array, moving: Array, side: int) -> Array:
-        """Subtract dx/dt times the derivative of the time at the rows that begin or end at a transition."""
         for i in range(N):
             row = opening[i] - 1 + side
             piece = jax.tree.map(lambda a, row=row: a[row], path.pieces)
@@ -371,10 +366,6 @@ class JaxEngine:
             found = call_model(*given, structure=self._structure.functions, function=_compute_fields)
         return np.asarray(found)[:count]
 
-    def trace(self, tau: FloatArray, p: FloatArray) -> Simulation:
-        """Return all rows."""
-        return self.simulate(tau, p, tangents=False)
-
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         key = np.concatenate([tau, p]).tobytes()
@@ -384,22 +375,12 @@ class JaxEngine:
             found = simulate_rows(self._on_device, tau, p, structure=self._any_sequence, tangents=tangents)
         layout, rows = self._cut_rows(tau)
         J, late, values, derivatives = jax.tree.map(np.asarray, found)
-        before, after, y_before, y_after = (each[rows] for each in values)
         which = [k for k, sensor in enumerate(self._structure.measurements) if sensor.delay is not None]
-        simulation = Simulation(
-            float(J),
-            self._mesh.times,
-            layout.first_cell,
-            layout.start[rows],
-            layout.end[rows],
-            before,
-            after,
-            y_before,
-            y_after,
-            tangents=Tangents(*(each[rows] for each in derivatives)) if tangents else None,
-        )
-        all_seen = add_samples(simulation, self._structure, self._arguments, dict(zip(which, late, strict=True)))
-        simulation = cut_at_tf(all_seen, self._structure)
+        of_rows = (each[rows] for each in (layout.start, layout.end, *values))
+        along = Tangents(*(each[rows] for each in derivatives)) if tangents else None
+        simulation = Simulation(float(J), self._mesh.times, layout.first_cell, *of_rows, tangents=along)
+        seen = dict(zip(which, late, strict=True))
+        simulation = finish_simulation(simulation, self._structure, self._arguments, seen)
         if not tangents:
             self._last = key, simulation
         return simulation

@@ -197,25 +197,22 @@ class Costates(NamedTuple):
     costates: FloatArray
 
     @classmethod
-    def of_rows(
-        cls,
-        structure: Structure,
-        first_row: NDArray[np.intp],
-        times: FloatArray,
-        states: FloatArray,
-        costates: FloatArray,
-    ) -> Costates:
-        """Return the costates of rows (R,) without those after a free tf; `first_row` is that of each segment."""
+    def of_rows(cls, structure: Structure, first_row: NDArray[np.intp], *rows: FloatArray) -> Costates:
+        """Return the costates of rows, given the times (R,), states and costates at their starts (R, n), without those
+        after a free tf; `first_row` is that of each segment.
+        """
+        times, *states = rows
         segment = np.searchsorted(first_row, np.arange(len(times)), "right") - 1
         cells, modes = np.arange(len(times)) - segment, np.array(structure.mode_of_segment)[segment]
-        rows = slice(0, int(first_row[-1]) if structure.has_free_tf else len(times))
-        return cls(times[rows], cells[rows], modes[rows], states[rows], costates[rows])
+        last = int(first_row[-1]) if structure.has_free_tf else len(times)
+        return cls(*(values[:last] for values in (times, cells, modes, *states)))
 
 
-def add_samples(
+def finish_simulation(
     simulation: Simulation, structure: Structure, arguments: Arguments, late: Mapping[int, FloatArray]
 ) -> Simulation:
-    """Return the simulation with the outputs of each of the Measurements at its samples.
+    """Return the simulation with the outputs of each of the Measurements at its samples, and without the rows after a
+    free tf.
 
     Parameters
     ----------
@@ -234,11 +231,7 @@ def add_samples(
             y = np.concatenate([late[k], np.repeat(late[k][-1:], len(samples.time) - len(late[k]), axis=0)])
         seen.append(y[:, first : first + sensor.channels])
         first += sensor.channels
-    return replace(simulation, seen=tuple(seen))
-
-
-def cut_at_tf(simulation: Simulation, structure: Structure) -> Simulation:
-    """Return the simulation without the rows after a free tf; the simulation itself if tf is fixed."""
+    simulation = replace(simulation, seen=tuple(seen))
     if not structure.has_free_tf:
         return simulation
     rows = slice(0, simulation.segments[-1].start)
@@ -280,22 +273,14 @@ class Hypotheses(NamedTuple):
         return Hypotheses(*(values[chosen] for values in self[:-1]))
 
 
-class Column(IntEnum):
-    """Columns of the table that makes children of hypotheses: (C, 7) of int64.
+Column = IntEnum("Column", "PARENT BEFORE AFTER SLOT RESET_MAP TRANSITION_COST GUARD", start=0)
+"""Columns of the table that makes children of hypotheses: (C, 7) of int64.
 
-    PARENT : position of the parent
-    BEFORE, AFTER : mode of the parent and of the child
-    SLOT : which transition happens at the first node, from 0, a birth; -1 if none does
-    RESET_MAP, TRANSITION_COST, GUARD : place of its functions in the library, -1 for none
-    """
-
-    PARENT = 0
-    BEFORE = 1
-    AFTER = 2
-    SLOT = 3
-    RESET_MAP = 4
-    TRANSITION_COST = 5
-    GUARD = 6
+PARENT : position of the parent
+BEFORE, AFTER : mode of the parent and of the child
+SLOT : which transition happens at the first node, from 0, a birth; -1 if none does
+RESET_MAP, TRANSITION_COST, GUARD : place of its functions in the library, -1 for none
+"""
 
 
 class Tolerances(NamedTuple):

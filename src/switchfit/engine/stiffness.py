@@ -21,7 +21,7 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
@@ -47,8 +47,6 @@ millisecond, and the program with implicit rows takes a second to compile."""
 LOOKS_TO_STOP = 20
 """Looks in a row at which stability limits the step after which the explicit solve is given up: the steps that it would
 take are known well enough from its pace. It took 25 ms to the end, where friction is regularised at 1e-6 m/s."""
-
-_LOOKS_THAT_MAY_STOP = range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
 
 LIMITED = 2.0
 """``|lambda| h`` from which stability limits the step: the region of stability reaches to 3.3 for eigenvalues whose
@@ -121,11 +119,11 @@ class Watch:
 
     Parameters
     ----------
-    most : mapping of str to float, optional
+    most : dict of str to float, optional
         Work in a mode after which `add` raises `TooManyStepsError`.
     between : int
         Steps in a mode between two looks.
-    refused : container of str, optional
+    refused : set of str, optional
         Modes that take explicit steps although they are stiff; by default all do.
 
     Attributes
@@ -136,10 +134,7 @@ class Watch:
     """
 
     def __init__(
-        self,
-        most: Mapping[str, float] | None = None,
-        between: int = STEPS_BETWEEN,
-        refused: Container[str] | None = None,
+        self, most: dict[str, float] | None = None, between: int = STEPS_BETWEEN, refused: set[str] | None = None
     ) -> None:
         self.modes: dict[str, _ModeSteps] = {}
         self.most, self.between, self.refused = most or {}, between, refused
@@ -206,7 +201,8 @@ class Watch:
         """Return whether the current mode is stiff, however its solve goes on, and may take implicit steps."""
         looks = self.modes[self.current].looks
         # 20 of at most 60 looks are more than a quarter of them.
-        if self.refused is None or self.current in self.refused or len(looks) not in _LOOKS_THAT_MAY_STOP:
+        may_stop = len(looks) in range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
+        if self.refused is None or self.current in self.refused or not may_stop:
             return False
         last = looks[-LOOKS_TO_STOP:]
         rates = _measure_rates(last)

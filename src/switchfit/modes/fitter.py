@@ -32,9 +32,9 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.engine.jax import JaxEngine
-from switchfit.engine.native.engine import NativeEngine
-from switchfit.engine.native.experiment import (
+from switchfit.engine.native.engine import (
     FailedCheckError,
+    NativeEngine,
     NativeExperiment,
     native_experiment,
     places_in_library,

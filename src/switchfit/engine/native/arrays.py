@@ -80,6 +80,12 @@ class Integer:
         return cls(graph.constant(float(value)), int(value), int(value))
 
 
+def _check_size(count: int, most: int, what: str) -> None:
+    """Refuse what would take too many operations, or too much memory."""
+    if count > most:
+        raise Unsupported(f"{what} (limit: {most})")
+
+
 def _is_known_integer(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
@@ -135,10 +141,8 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
         return entries[0]
     if len(starts) > MOST_SELECTIONS and all(known_number(e) is not None for e in entries):
         return _look_up(graph, list(map(known_number, entries)), index)
-    if len(starts) > MOST_CHOICES:
-        raise Unsupported(
-            f"takes one of {len(starts)} numbers by an index that depends on the state (limit: {MOST_CHOICES})"
-        )
+    count = len(starts)
+    _check_size(count, MOST_CHOICES, f"takes one of {count} numbers by an index that depends on the state")
 
     def select_run(runs: list[int]) -> Any:
         if len(runs) == 1:
@@ -167,8 +171,7 @@ def _is_same(one: Any, other: Any) -> bool:
 
 
 def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
-    if len(entries) > MOST_ROWS_OF_TABLE:
-        raise Unsupported(f"looks up numbers in a table of {len(entries)} entries (limit: {MOST_ROWS_OF_TABLE})")
+    _check_size(len(entries), MOST_ROWS_OF_TABLE, f"looks up numbers in a table of {len(entries)} entries")
     node = graph.lookup(np.array(entries, dtype=float), index.node - float(index.low))
     if all(isinstance(e, bool | np.bool_) for e in entries):
         return graph.apply("ne", node, 0.0)
@@ -177,8 +180,10 @@ def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     return node
 
 
-Meaning = Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]
-"""Takes a graph, the parameters of a JAX operation and the type of its result; returns the operation on entries."""
+Meaning = Callable[..., Any]
+"""What a JAX operation does to entries: takes a graph, the parameters of the operation, the type of the last operand,
+then an entry of each operand.
+"""
 
 LARGEST = 2**51
 """Bound below which sums, products and quotients of doubles are exact for integers."""
@@ -203,17 +208,14 @@ def within(graph: Graph, found: Integer, dtype: np.dtype[Any]) -> Any:
 def _exactly(op: str, value: Callable[..., int]) -> Meaning:
     """Return an operation on doubles; its result is between the extremes at the bounds of the operands and at zero."""
 
-    def get_meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-        def apply(*given: Any) -> Any:
-            args = [Integer.of(graph, a) for a in given]
-            corners = [value(*c) for c in product(*((a.low, a.high, min(max(0, a.low), a.high)) for a in args))]
-            low, high = min(corners), max(corners)
-            node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
-            return within(graph, Integer(node, low, high), dtype)
+    def apply(graph: Graph, params: Any, dtype: np.dtype[Any], *given: Any) -> Any:
+        args = [Integer.of(graph, a) for a in given]
+        corners = [value(*c) for c in product(*((a.low, a.high, min(max(0, a.low), a.high)) for a in args))]
+        low, high = min(corners), max(corners)
+        node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
+        return within(graph, Integer(node, low, high), dtype)
 
-        return apply
-
-    return get_meaning
+    return apply
 
 
 def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
@@ -222,35 +224,23 @@ def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -
     return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
 
 
-def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """Return division rounded towards zero; division by zero yields -1."""
-
-    def divide(one: Any, other: Any) -> Any:
-        a, b = Integer.of(graph, one), Integer.of(graph, other)
-        largest = max(abs(a.low), abs(a.high), 1)
-        low = 0 if a.low >= 0 and b.low >= 0 else -largest
-        node = _drop_sign_of_zero(graph, graph.apply("trunc", a.node / b.node), -largest, largest, "trunc")
-        return choose(graph, equal(graph, b, 0), -1, within(graph, Integer(node, low, largest), dtype))
-
-    return divide
+def _divide(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, other: Any) -> Any:
+    """Divide, rounded towards zero; division by zero yields -1."""
+    a, b = Integer.of(graph, one), Integer.of(graph, other)
+    largest = max(abs(a.low), abs(a.high), 1)
+    low = 0 if a.low >= 0 and b.low >= 0 else -largest
+    node = _drop_sign_of_zero(graph, graph.apply("trunc", a.node / b.node), -largest, largest, "trunc")
+    return choose(graph, equal(graph, b, 0), -1, within(graph, Integer(node, low, largest), dtype))
 
 
-def _remainder(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def _find_remainder(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, other: Any) -> Any:
     """Return the remainder with the sign of the dividend; for a division by zero, it is the dividend itself."""
-
-    def remainder(one: Any, other: Any) -> Any:
-        a, b = Integer.of(graph, one), Integer.of(graph, other)
-        nonzero = Integer.of(graph, choose(graph, equal(graph, b, 0), 1, b))
-        largest = max(abs(b.low), abs(b.high)) - 1
-        node = a.node - nonzero.node * graph.apply("trunc", a.node / nonzero.node)
-        low, high = (0 if a.low >= 0 else -max(largest, 0)), (0 if a.high <= 0 else max(largest, 0))
-        return choose(graph, equal(graph, b, 0), a, Integer(node, low, high))
-
-    return remainder
-
-
-def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
-    return lambda a: choose(graph, less(graph, a, 0), -1, choose(graph, less(graph, 0, a), 1, 0))
+    a, b = Integer.of(graph, one), Integer.of(graph, other)
+    nonzero = Integer.of(graph, choose(graph, equal(graph, b, 0), 1, b))
+    largest = max(abs(b.low), abs(b.high)) - 1
+    node = a.node - nonzero.node * graph.apply("trunc", a.node / nonzero.node)
+    low, high = (0 if a.low >= 0 else -max(largest, 0)), (0 if a.high <= 0 else max(largest, 0))
+    return choose(graph, equal(graph, b, 0), a, Integer(node, low, high))
 
 
 def _choose_extreme(graph: Graph, extreme: Callable[..., int], a: Any, b: Any) -> Integer:
@@ -261,18 +251,13 @@ def _choose_extreme(graph: Graph, extreme: Callable[..., int], a: Any, b: Any) -
     return Integer(node, extreme(one.low, other.low), extreme(one.high, other.high))
 
 
-def from_double(graph: Graph, kind: np.dtype[Any]) -> Callable[[Any], Any]:
-    """Return the conversion of doubles to integers of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
-    least, most = _bounds(kind)
-
-    def convert(a: Any) -> Any:
-        rounded = graph.apply("trunc", a)
-        number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)
-        if kind.itemsize == 8:
-            graph.require(graph.apply("le", graph.apply("abs", number), float(most)))
-        return clamp(graph, Integer(number, least - 1, most + 1), least, most)
-
-    return convert
+def from_double(graph: Graph, kind: np.dtype[Any], a: Any) -> Any:
+    """Return a double as an integer of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
+    (least, most), rounded = _bounds(kind), graph.apply("trunc", a)
+    number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)
+    if kind.itemsize == 8:
+        graph.require(graph.apply("le", graph.apply("abs", number), float(most)))
+    return clamp(graph, Integer(number, least - 1, most + 1), least, most)
 
 
 OF_INTEGERS: dict[str, Meaning] = {
@@ -281,17 +266,17 @@ OF_INTEGERS: dict[str, Meaning] = {
     "mul": _exactly("mul", operator.mul),
     "neg": _exactly("neg", operator.neg),
     "abs": _exactly("abs", abs),
-    "div": _quotient,
-    "rem": _remainder,
-    "sign": _sign,
-    "max": lambda graph, params, dtype: partial(_choose_extreme, graph, max),
-    "min": lambda graph, params, dtype: partial(_choose_extreme, graph, min),
-    "lt": lambda graph, params, dtype: partial(less, graph),
-    "gt": lambda graph, params, dtype: lambda a, b: less(graph, b, a),
-    "le": lambda graph, params, dtype: lambda a, b: graph.apply("not", less(graph, b, a)),
-    "ge": lambda graph, params, dtype: lambda a, b: graph.apply("not", less(graph, a, b)),
-    "eq": lambda graph, params, dtype: partial(equal, graph),
-    "ne": lambda graph, params, dtype: lambda a, b: graph.apply("not", equal(graph, a, b)),
+    "div": _divide,
+    "rem": _find_remainder,
+    "sign": lambda graph, _, __, a: choose(graph, less(graph, a, 0), -1, choose(graph, less(graph, 0, a), 1, 0)),
+    "max": lambda graph, _, __, a, b: _choose_extreme(graph, max, a, b),
+    "min": lambda graph, _, __, a, b: _choose_extreme(graph, min, a, b),
+    "lt": lambda graph, _, __, a, b: less(graph, a, b),
+    "gt": lambda graph, _, __, a, b: less(graph, b, a),
+    "le": lambda graph, _, __, a, b: graph.apply("not", less(graph, b, a)),
+    "ge": lambda graph, _, __, a, b: graph.apply("not", less(graph, a, b)),
+    "eq": lambda graph, _, __, a, b: equal(graph, a, b),
+    "ne": lambda graph, _, __, a, b: graph.apply("not", equal(graph, a, b)),
 }
 """Operations on each entry of arrays of integers; comparisons too."""
 
@@ -306,7 +291,9 @@ Combine = Callable[[Any, Any, Any], Any]
 def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
-    a = a[tuple(_get_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
+    # What the window may reach along each axis.
+    ends = [(s.low, s.high) if isinstance(s, Integer) else (s, s) for s in starts]
+    a = a[tuple(slice(low, high + size) for (low, high), size in zip(ends, sizes, strict=True))]
     if len(moving) > 1 and all(known_number(e) is not None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
     for axis in moving:
@@ -319,14 +306,9 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
     return a
 
 
-def _get_reach(start: Any, size: int) -> slice:
-    """Return the range of indices that a window may reach."""
-    return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
-
-
 def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:
     """Take a window of a known array that moves along several axes: each entry by one index into a table."""
-    multiply, add, subtract = (OF_INTEGERS[op](graph, {}, np.dtype(np.int64)) for op in ("mul", "add", "sub"))
+    multiply, add, subtract = (partial(OF_INTEGERS[op], graph, {}, np.dtype(int)) for op in ("mul", "add", "sub"))
     spans = [start.high - start.low + 1 for start in starts]
     index: Any = 0
     for start, span in zip(starts, spans, strict=True):
@@ -345,10 +327,7 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
     """Change a window of an array of objects in place, at starts that are in range where the condition holds."""
     ranges = [range(s.low, s.high + 1) if isinstance(s, Integer) else (s,) for s in starts]
     count = int(np.prod([len(r) for r in ranges]))
-    if count > MOST_CHOICES:
-        raise Unsupported(
-            f"changes one of {count} numbers at an index that depends on the state (limit: {MOST_CHOICES})"
-        )
+    _check_size(count, MOST_CHOICES, f"changes one of {count} numbers at an index that depends on the state")
     for first in product(*ranges):
         here = condition
         for start, value in zip(starts, first, strict=True):
@@ -389,13 +368,8 @@ def _list_windows(
     """
     gathers = hasattr(numbers, "start_index_map")
     axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
-    batched = dict(
-        zip(
-            numbers.operand_batching_dims,
-            numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims,
-            strict=True,
-        )
-    )
+    own = numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims
+    batched = dict(zip(numbers.operand_batching_dims, own, strict=True))
     outside = [k for k in range(many) if k not in inside]
     for place in np.ndindex(*indices.shape[:-1]):
         starts: list[Any] = [place[batched[axis]] if axis in batched else 0 for axis in range(len(shape))]
@@ -479,8 +453,7 @@ def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
 def _sort_entries(graph: Graph, entries: list[Entries], kinds: list[str]) -> list[Entries]:
     """Sort entries by exchanging neighbors."""
     n = len(entries)
-    if n > MOST_SORTED:
-        raise Unsupported(f"sorts {n} numbers that depend on the state (limit: {MOST_SORTED})")
+    _check_size(n, MOST_SORTED, f"sorts {n} numbers that depend on the state")
     for front in range(n - 1):
         for k in reversed(range(front, n - 1)):
             one, other = entries[k], entries[k + 1]
@@ -528,8 +501,7 @@ def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
     if np.isnan(numbers).any() or (np.diff(numbers) < 0.0).any():
         return None
     K = len(numbers)
-    if K > MOST_ROWS_OF_TABLE:
-        raise Unsupported(f"searches a table of {K} entries (limit: {MOST_ROWS_OF_TABLE})")
+    _check_size(K, MOST_ROWS_OF_TABLE, f"searches a table of {K} entries")
     turns = K.bit_length()
     padded = np.concatenate([numbers, np.full(2**turns - 1 - K, np.inf)])
 
@@ -563,8 +535,7 @@ def _map_matrices(graph: Graph, function: Callable[..., tuple[Any, ...]], *array
 
 
 def _check_rows(rows: int, most: int) -> None:
-    if rows > most:
-        raise Unsupported(f"works with a matrix of {rows} rows (limit: {most})")
+    _check_size(rows, most, f"works with a matrix of {rows} rows")
 
 
 def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.implicit_rows import couple
-from switchfit.discretization.rows import FloatArray
+from switchfit.discretization.rows import FloatArray, couple
 from switchfit.engine.native.arrays import known_number
 from switchfit.engine.native.llvm import count_doubles
 from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
@@ -27,7 +26,7 @@ KEPT = "kept"
 
 
 def eliminate(a: FloatArray, h: Node, f_x: Sequence[Objects], place: int | None = None) -> Elimination | Routine:
-    """Factorize the matrix of the coupled equations: see `switchfit.discretization.implicit_rows`.
+    """Factorize the matrix of the coupled equations: see `switchfit.discretization.rows`.
 
     With a place behind `KEPT`, another function can `load` the factors from there, once their `stores` are written.
     """

@@ -1,34 +1,533 @@
-"""Many hypotheses on the mode sequence of one experiment, propagated over its mesh by machine code."""
+"""Many hypotheses on the mode sequence of one experiment, propagated over its mesh by machine code.
+
+A hypothesis is a *record* of doubles, see `divide_record`. `propagate` takes it from node to node, changes its mode at
+births, computes its score, and moves its point of linearisation to the minimum.
+
+Names of the pointers of straight-line functions are those of `switchfit.engine.native.kernels`; x, Z, J, g, H and check
+are those of one hypothesis. All derivatives are propagated forward, so that a cost of (t, x, p) adds ``Z' g_x + g_p``
+to g and its Gauss-Newton matrix to H at once, without a costate. Further pointers:
+
+    K           f and the running cost ell at a birth, (n + 1,)
+    error       largest estimate of the error of a step so far, relative to the tolerances, which are the entries of
+    tolerances  relative; size of a state at which the relative and the absolute error count the same; information of a
+                guard on the time of its transition
+    along       derivative of a guard along theta, a vector, and its information
+    shift       a change of the unknowns, (D,), and moved the sum of all changes so far
+"""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.discretization import rows
 from switchfit.discretization.mesh import Arguments
-from switchfit.engine.native.experiment import count_samples, get_address
-from switchfit.engine.native.hypothesis_loops import (
-    COLUMNS,
-    OF_SAMPLES,
-    PER_PLACE,
-    divide_record,
-    measure_record,
-    scratch_sizes,
-)
-from switchfit.engine.native.llvm import Program
-from switchfit.engine.native.program import PREFIX
-from switchfit.engine.native.templates import Order, Sizes, constants_of
+from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine, times_vector
+from switchfit.engine.native.elimination import eliminate
+from switchfit.engine.native.engine import count_samples, get_address
+from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, as_vector, list_entries, store_all
+from switchfit.engine.native.llvm import Module, Program, Value, Variable
+from switchfit.engine.native.program import PREFIX, compile_library, write_slope
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
+from switchfit.engine.native.segments import Pointers, Writer, add_curvature, solve_stages, write_newton
+from switchfit.engine.native.templates import COST_TO_GO, F_X, F, Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
+from switchfit.problem.structure import Structure
 
-SLOT = int(Column.SLOT)
+MOST_PARTS = 64
+"""Largest number of steps in a cell."""
+
+SMALL_ERROR = 1 / 64
+"""Error, relative to the tolerances, at which steps of twice the length are tried next: their error is 16 times it."""
+
+COLUMNS = len(Column)
+
+PER_PLACE = 3
+"""Hypotheses that `follow_order` keeps in each place of a given order of modes: as many as a beam of one sequence."""
+
+WINDOW = 4
+"""What limits the births at the end of a place, in doubles: how long its mode lasts at least, the times between which
+the birth is, and how long the next mode lasts at least."""
+
+GIVEN = "nodes", "signals", "c", "units", "tolerances", "low", "high", "most", "jump_first", "jump_map"
+"""Pointers in the table, before those of the scratch space and of the samples. `jump_first` (G + 2,) has the place in
+`jump_map` of the first jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far
+it may move at once."""
+
+OF_SAMPLES = ("first", "time", "value", "weight")
+"""For each Measurements: the place of the first sample at each node (G + 2,), then as `segments.OF_SAMPLES`."""
+
+SMALLEST_RATE = 1e-30
+"""Square of the rate of a guard below which it says nothing on the time."""
 
 
-SampleArrays = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+def divide_record(sizes: Sizes) -> dict[str, slice]:
+    """Return where the parts of a record are, in doubles.
+
+    J : (), cost
+    error : (), largest estimate of the error of a step since the last block, relative to the tolerances
+    score : (), ``J - g' H^-1 g / 2``, the cost with all unknowns free, where the model is linear in them; NaN where H
+        is not positive definite
+    check : (), NaN once a value that was presumed finite is not
+    parts : (), number of steps in a cell
+    p, moved : (M,), the point of linearisation; (D,), how far the unknowns have moved there from where they began
+    x, Z, g, H : (n,), (n, width), (width,), (D, width)
+    """
+    n, D, width = sizes.n, sizes.D, sizes.width
+    lengths = dict.fromkeys(("J", "error", "score", CHECKED, "parts"), 1) | {"p": sizes.M, "moved": D}
+    lengths |= {"x": n, "Z": n * width, "g": width, "H": D * width}
+    ends = accumulate(lengths.values())
+    return {name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)}
+
+
+def measure_record(sizes: Sizes) -> int:
+    """Return the length of a record: a multiple of four doubles."""
+    return -(-divide_record(sizes)["H"].stop // 4) * 4
+
+
+def scratch_sizes(sizes: Sizes) -> dict[str, int]:
+    """Return the sizes of the scratch space, in doubles: the eliminated [H; g'], the entries of g as they were
+    eliminated, and what the straight-line functions exchange.
+    """
+    n, D, width = sizes.n, sizes.D, sizes.width
+    lengths = {"rows": (D + 1) * width, "reduced": D, "shift": D, "g_after": width, "K": n + 1, "along": width}
+    lengths |= {"information": 1, "XZ": STAGES * n * width, "entries": STAGES * (1 + n + sizes.M) ** 2}
+    return lengths | {"increments": STIFF.coupled * n, "newton": 2}
+
+
+class HypothesisKernels(Kernels):
+    """Writes the straight-line functions of hypotheses; the order of derivatives is that of Gauss-Newton."""
+
+    def step(self, mode: int, stage: Template, costs: bool) -> list[tuple[int, int]]:
+        """Write a step in a mode: state, tangents, running costs and the estimate of the error.
+
+        Its ends do not move: births change Z by `move` and `hold`, between steps. Return which second derivatives of
+        the running costs are stored for each stage, as `Kernels.backward_row`.
+        """
+        self._chosen: list[tuple[int, int]] = []
+        if self.library.implicit[mode]:
+            self.newton(f"newton_{mode}", stage)
+        self.forward_row(f"step_{mode}", stage, False, costs, self.tableau(mode))
+        return self._chosen
+
+    def _add_to_row(
+        self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
+    ) -> list[Store]:
+        """Return stores of the largest error so far, and of what the running costs add to g and H."""
+        at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
+        if tableau.coupled:
+            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
+            error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
+        else:
+            error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
+        # The larger of the error so far and that of this step, relative to rtol (smallest + |x|).
+        (rtol, smallest), xp, largest = graph.loads("tolerances", 2), Namespace(graph), graph.load("error", 0)
+        for relative in xp.abs(error) / (rtol * (smallest + xp.abs(x))):
+            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
+        stores = [("error", 0, largest)]
+        if not costs:
+            return stores
+        g, second = graph.load("g", 0, vector=True), []
+        for j, (weight, t, X, X_d) in enumerate(zip(tableau.b.tolist(), *found[:2], along.states, strict=True)):
+            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
+            # J.
+            given = at(t, X, hb=h * weight)
+            g_x, g_p, S = stage(graph, *given, only=COST_TO_GO[1:], checked=True)
+            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
+            # future.
+            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
+            second.append(list_entries(S, with_time=False))
+            stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
+        self._chosen, entries = self._store_entries(graph, tableau, second)
+        return [*stores, ("g", 0, as_vector(graph, g)), *entries]
+
+    def move(self, name: str, sign: float, costs: bool) -> None:
+        """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.
+
+        With 1 this leads from derivatives at a fixed time to those at the time of a transition, with -1 back.
+        """
+        graph, n = Graph(), self.sizes.n
+        moves = graph.load("moves", 0, vector=True)
+        Z = graph.loads("Z", n, vector=True) + sign * graph.loads("K", n) * moves
+        stores = store_all("Z", 0, Z)
+        if costs:
+            stores.append(("g", 0, graph.load("g", 0, vector=True) + sign * graph.load("K", n) * moves))
+        self.module.write_straight_line(name, stores)
+
+    def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
+        """Return stores of a guard as a measurement ``c(tau, x(tau-), p) = 0``, so precise that it determines tau.
+
+        Its sigma is a small time, given by `tolerances`, times the rate ``D_t c + D_x c f`` at which c changes.
+        """
+        c, c_t, c_x, c_p = found[:4]
+        # Derivative of c along theta at a tau that moves: Z is that of x(tau-), after `move`.
+        along = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
+        along = as_vector(graph, (along + c_t * graph.load("moves", 0, vector=True)).item())
+        # c changes by rate dtau: an error sigma_t of the time is one of rate sigma_t of c. J gets c^2 / (2 (rate
+        # sigma_t)^2), in its own units.
+        rate = (times_vector(c_x, graph.loads("K", self.sizes.n)) + c_t).item()
+        weight = graph.load("tolerances", 2) / (rate * rate + SMALLEST_RATE)
+        g = graph.load("g", 0, vector=True) + weight * c.item() * along
+        J = graph.load("J", 0) + 0.5 * weight * c.item() * c.item()
+        return [("along", 0, along), ("information", 0, weight), ("g", 0, as_vector(graph, g)), ("J", 0, J)]
+
+    def square(self) -> None:
+        """Write ``H += information along along'``."""
+        graph = Graph()
+        weight, along = graph.load("information", 0), graph.load("along", 0, vector=True)
+        rows = [graph.load("H", d, vector=True) + weight * graph.load("along", d) * along for d in range(self.sizes.D)]
+        self.module.write_straight_line("square", store_all("H", 0, rows))
+
+    def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
+        """Return stores that add a cost of (t, x, p), given with its derivatives, to J, g and H."""
+        cost, *derivatives = found
+        Z = graph.loads("Z", self.sizes.n, vector=True)
+        # `_scalar` leaves g_x to a costate, which hypotheses do not have: it is added by Z.
+        (pointer, offset, g), *rows = self._scalar(graph, derivatives, moving)
+        g = as_vector(graph, g + (derivatives[1] * Z).sum())
+        return [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
+
+    def shift(self) -> None:
+        """Write the change d of the point of linearisation to the minimum of the cost, inside its bounds: ``x += Z d``,
+        ``g+ = g + H d``, then ``J += (g + g+)'d / 2`` and ``p += d``.
+
+        It follows from the rows that `score` has eliminated. Those of p are the last: birth times are the best for p
+        inside its bounds.
+        """
+        graph, n, D, N, width = Graph(), self.sizes.n, self.sizes.D, self.sizes.N, self.sizes.width
+        W = [graph.loads("rows", D, k * width) for k in range(D)]
+        reduced, moved, low, high, most = (graph.loads(name, D) for name in ("reduced", "moved", "low", "high", "most"))
+        xp, d = Namespace(graph), np.full(D, graph.constant(0.0), dtype=object)
+        # Backward from the last unknown: step_k = (reduced_k + sum_{j > k} W_kj d_j) / W_kk, whose d_j are final. So an
+        # unknown at its limit is a limit for those before it: the birth times are the best for the p that was possible.
+        for k in reversed(range(D)):
+            step = (reduced[k] + (W[k][k + 1 :] * d[k + 1 :]).sum()) / W[k][k]
+            # First the limit of one move, then the bounds, which hold in any case.
+            target = xp.minimum(xp.maximum(moved[k] - step, moved[k] - most[k]), moved[k] + most[k])
+            d[k] = xp.minimum(xp.maximum(target, low[k]), high[k]) - moved[k]
+        # The quadratic model at the new point: g+ = g + H d and J + g'd + d'H d / 2 = J + (g + g+)'d / 2; H stays.
+        x = [graph.load("x", i) + (graph.loads("Z", D, i * width) * d).sum() for i in range(n)]
+        g = graph.load("g", 0, vector=True) + (graph.loads("H", D, vector=True) * d).sum()
+        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g)), *store_all("shift", 0, d)]
+        self.module.write_straight_line("shift", stores)
+
+        graph = Graph()
+        # A second function: J needs the entries of g+ one by one, and g+ is a vector until it has been stored.
+        d, g, after = (graph.loads(name, D) for name in ("shift", "g", "g_after"))
+        J = graph.load("J", 0) + 0.5 * (d * (g + after)).sum()
+        moved, p = graph.loads("moved", D) + d, graph.loads("p", self.sizes.M) + d[N:]
+        stores = [("J", 0, J), *store_all("g", 0, after), *store_all("moved", 0, moved), *store_all("p", 0, p)]
+        self.module.write_straight_line("shift_back", stores)
+
+
+class HypothesisWriter(Writer):
+    """Emits the loops of hypotheses."""
+
+    def __init__(self, library: Structure, sizes: Sizes, module: Module) -> None:
+        super().__init__(library, sizes, Order.GAUSS_NEWTON, module)
+        own = (f"{name}_{k}" for k in range(len(library.measurements)) for name in OF_SAMPLES)
+        self.names = (*GIVEN, *scratch_sizes(sizes), *own)
+
+    def find(self, record: Value) -> Pointers:
+        """Emit the addresses in the table, and those of the fields of a record."""
+        parts = divide_record(self.sizes)
+        return self.pointers() | {name: self.at(record, part.start) for name, part in parts.items()}
+
+    def write_node(self) -> str:
+        """Write what happens at a node: samples add their costs, then jumps at known times act."""
+        _, record, node = self.begin("void @at_node(ptr %table, ptr %record, i64 %node)")
+        found = self.find(record)
+        # Nodes are at known times: `moves` is the row of zeros. A jump maps x and Z in place.
+        found |= {"moves": found["units"], "x_after": found["x"], "Z_after": found["Z"]}
+        found["time"] = self.at(found["nodes"], node)
+        for k, sensor in enumerate(self.library.measurements):
+            lengths = {"time": 1, "value": sensor.channels, "weight": sensor.channels}
+            begin, end = (self.get("i64", found[f"first_{k}"], at) for at in (node, node + 1))
+            with self.loop(begin, end) as place:
+                here = {name: self.at(found[f"{name}_{k}"], place, length) for name, length in lengths.items()}
+                self.call(f"sample_{k}", found | here)
+        if self.library.reset_maps:
+            begin, end = (self.get("i64", found["jump_first"], at) for at in (node, node + 1))
+            with self.loop(begin, end) as place:
+                # Jumps come after the samples: a sample at the time of a jump sees the state before it.
+                for k in self.cases(self.get("i64", found["jump_map"], place), len(self.library.reset_maps)):
+                    self.call(f"reset_{k}", found)
+        return self.end()
+
+    def write_score(self) -> str:
+        """Write the elimination of all unknowns from ``J + g'd + d'H d / 2``, row by row of [H; g']."""
+        _, record = self.begin("void @score(ptr %table, ptr %record)")
+        D, width, vector, found = self.sizes.D, self.sizes.width, self.module.vector, self.find(record)
+        W, score = found["rows"], Variable(self, "double", self.load("double", found["J"]))
+        # L D L' of [H; g'] on a copy W (D + 1, width). For k = 0 .. D - 1, with the pivot W_kk and the slope W_Dk:
+        #     score -= slope^2 / (2 pivot),  reduced_k = slope,  W_i -= (W_ik / pivot) W_k for the rows i = k + 1 .. D
+        # so that after all k the score is J - g' H^-1 g / 2. H needs no pivoting: H_0 makes it positive definite.
+        self.copy(W, found["H"], D * width)
+        self.copy(self.at(W, D * width), found["g"], width)
+        with self.loop(0, D) as k:
+            row = self.at(W, k, width)
+            pivot, slope = self.get("double", row, k), self.get("double", self.at(W, D * width), k)
+            # `shift` solves backward from the slopes as they were when their unknown was eliminated: W_D is
+            # overwritten.
+            self.put(slope, found["reduced"], k)
+            inverse = 1.0 / pivot
+            # A pivot that is not positive, or NaN, makes the score NaN: the hypothesis drops out when the lowest are
+            # selected.
+            score.value = (pivot > 0.0).choose(score.value - slope * slope * inverse * 0.5, float("nan"))
+            # Whole rows are subtracted as vectors: what becomes of the columns before k is never read.
+            own = self.load(vector, row)
+            with self.loop(k + 1, D + 1) as i:
+                other = self.at(W, i, width)
+                factor = self.spread(self.get("double", other, k) * inverse, width)
+                product = self.let(vector, f"fmul contract {vector} {factor}, {own}")
+                self.store(self.let(vector, f"fsub contract {vector} {self.load(vector, other)}, {product}"), other)
+        # The check is 0 or NaN.
+        self.store(score.value + self.load("double", found[CHECKED]), found["score"])
+        return self.end()
+
+    def write_birth(self) -> str:
+        """Write a change of mode at a time inside a cell, or at its first node.
+
+        With tau the time of the change, x(tau-) moves by f_before dtau. The cost and the reset map of the transition
+        are differentiated along that, and at a fixed time after it the state moves by ``- f_after dtau`` more: without
+        a reset map the derivative along tau is ``f_before - f_after``.
+        """
+        signature = "void @birth(ptr %table, ptr %record, ptr %child, i64 %cell, double %time)"
+        _, record, child, cell, time = self.begin(signature)
+        found, time_at, library = self.find(record), self.allocate("double", 2), self.library
+        self.store(time, time_at)
+        self.put(self.get("double", found["nodes"], cell), time_at, 1)
+        # Row 0 of `units` is zero: the unit vector of birth time k is row k + 1.
+        slot = self.get("i64", child, Column.SLOT) + 1
+        found |= {"signal": self.at(found["signals"], cell, 4 * self.sizes.signals)}
+        found |= {"time": time_at, "moment": time_at, "origin": self.at(time_at, 1), "y": found["x"]}
+        found |= {"moves": self.at(found["units"], slot, self.sizes.width), "multiplier": found["units"]}
+        found |= {"x_after": found["x"], "Z_after": found["Z"]}
+
+        def call(column: Column, functions: Sequence[Any], *names: str) -> None:
+            """Emit the calls of the functions of what is in a column of the child."""
+            for k in self.cases(self.get("i64", child, column), len(functions)):
+                for name in names:
+                    self.call(name.format(k), found)
+
+        # Z += f_before dtau: from here to "hold", Z and g are those at the time of the birth, which moves.
+        call(Column.BEFORE, library.modes, "slope_{}", "move")
+        call(Column.GUARD, library.guards, "guards_{}", "square")
+        call(Column.TRANSITION_COST, library.transition_costs, "transition_costs_{}")
+        call(Column.RESET_MAP, library.reset_maps, "reset_{}")
+        # Z -= f_after dtau at the state behind the reset map: back to derivatives at a fixed time. Without a reset map
+        # the column of this birth is now X^i, (8) of the paper, and all others are as before.
+        call(Column.AFTER, library.modes, "slope_{}", "hold")
+        return self.end()
+
+    def write_steps(self, curvatures: list[Curvature]) -> str:
+        """Write steps in a mode between two times of a cell."""
+        settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
+        _, record, mode, cell, parts, begin, end = self.begin(f"void @steps(ptr %table, ptr %record, {settings})")
+        found, row = self.find(record), self.allocate("double", 3)
+        self.put(begin, row, 1)
+        self.put(self.get("double", found["nodes"], cell), row, 2)
+        found |= {"row": row, "signal": self.at(found["signals"], cell, 4 * self.sizes.signals)}
+        # Ends of steps do not move with theta.
+        found |= {"opens": found["units"], "closes": found["units"], "x_after": found["x"], "Z_after": found["Z"]}
+        with self.loop(0, parts) as part:
+            # Ends of steps are begin + length k / parts, and the last one is `end` itself: sums of steps would miss the
+            # node.
+            inside = begin + (end - begin) * ((part + 1).to("double") / parts.to("double"))
+            self.store(self.get("double", row, 1), row)
+            self.put((part + 1 >= parts).choose(end, inside), row, 1)
+            for k in self.cases(mode, len(self.library.modes)):
+                if self.library.implicit[k]:
+                    solve_stages(self, f"newton_{k}", found)
+                self.call(f"step_{k}", found)
+                add_curvature(self, curvatures[k], found, moving=False)
+        return self.end()
+
+    def write_propagation(self) -> str:
+        """Write the loop over hypotheses that go on from one node to another, with births at any times.
+
+        Each cell has the steps that it needs: where the estimate of the error is too large, it alone begins again, with
+        steps of half the length; the next one begins with twice the length where this one was far more accurate than it
+        has to be.
+
+        If `restarts`, which is only possible at the first node, x and Z become those at t0, and the samples there are
+        added; the records have p, moved, and the J, g and H of the priors. Of each hypothesis, `children` (B, births,
+        columns) are its births, `times` (B, births) when they are, `counts` (B, 3) their number, the first mode, and
+        which of the `parents` it is a copy of.
+        """
+        given = "ptr %records, ptr %parents, ptr %children, ptr %times, ptr %counts, i64 %births, i64 %first, i64 %last"
+        settings = "i64 %restarts, i64 %count, i64 %at_end, i64 %recentres"
+        arguments = self.begin(f"void @propagate(ptr %table, {given}, {settings})")
+        table, records, parents, children, times, counts = arguments[:6]
+        births, first, last, restarts, count, at_end, recentres = arguments[6:]
+        size, place, library = measure_record(self.sizes), divide_record(self.sizes), self.library
+        before, has_costs = self.allocate("double", size), library.running or library.references or library.guards
+
+        def copy_changed(target: Value, source: Value) -> None:
+            """Emit the copy of what steps change: if nothing costs on the way, neither g nor H."""
+            end = place["H" if has_costs or library.transition_costs else "Z"].stop
+            for part in (slice(0, place["p"].start), slice(place["x"].start, end)):
+                self.copy(self.at(target, part.start), self.at(source, part.start), part.stop - part.start)
+
+        with self.loop(0, count) as index:
+            record, own = self.at(records, index, size), self.at(counts, index, 3)
+            self.copy(record, self.at(parents, self.get("i64", own, 2), size), size)
+            of_times, of_births = self.at(times, index, births), self.at(children, index, births * COLUMNS)
+            found, birth = self.find(record), Variable(self, "i64", 0)
+            mode, parts = Variable(self, "i64", self.get("i64", own, 1)), Variable(self, "i64", 1)
+            with self.when(restarts > 0):
+                self.call("start", found | {"x_after": found["x"], "Z_after": found["Z"]})
+                self.invoke("at_node", table, record, 0)
+            with self.loop(first, last) as here:
+                start, end = (self.get("double", found["nodes"], k) for k in (here, here + 1))
+                # Numbers of steps are doubles in a record, since it has nothing else.
+                taken = self.load("double", found["parts"])
+                is_small = self.load("double", found["error"]) < SMALL_ERROR
+                parts.value = (is_small & (taken > 1.0)).choose(taken * 0.5, taken).to("i64")
+                birth_of_cell, mode_of_cell, begin = birth.value, mode.value, Variable(self, "double", start)
+                copy_changed(before, record)
+                with self.repeat() as accept:
+                    self.store(0.0, found["error"])
+                    with self.repeat() as leave:
+                        leave(birth.value >= self.load("i64", own))
+                        # A birth exactly at the end of the cell belongs to the next one, behind the samples of that
+                        # node.
+                        tau = self.get("double", of_times, birth.value)
+                        leave((tau < end).equals(False))
+                        with self.when(tau > begin.value):
+                            self.invoke("steps", table, record, mode.value, here, parts.value, begin.value, tau)
+                        child = self.at(of_births, birth.value, COLUMNS)
+                        self.invoke("birth", table, record, child, here, tau)
+                        mode.value = self.get("i64", child, Column.AFTER)
+                        birth.value, begin.value = birth.value + 1, tau
+                    self.invoke("steps", table, record, mode.value, here, parts.value, begin.value, end)
+                    # An error that is NaN fails the comparison: such a hypothesis tries up to the most, then its score
+                    # is NaN.
+                    accept((self.load("double", found["error"]) <= 1.0) | (parts.value >= MOST_PARTS))
+                    parts.value, birth.value, mode.value = parts.value * 2, birth_of_cell, mode_of_cell
+                    begin.value = start
+                    copy_changed(record, before)
+                self.store(parts.value.to("double"), found["parts"])
+                self.invoke("at_node", table, record, here + 1)
+            if library.terminal:
+                with self.when(at_end > 0):
+                    self.call("end", found)
+            self.invoke("score", table, record)
+            score = self.load("double", found["score"])
+            with self.when((recentres > 0) & score.equals(score)):  # the rows have been eliminated then
+                self.call("shift", found)
+                self.call("shift_back", found)
+        return self.end()
+
+    def write_following(self) -> str:
+        """Write the loop over the stops of a beam whose modes are in a given order: hypotheses differ in their times.
+
+        From stop to stop, those in each of the `places` go on as they are, then come births into the next place; of
+        each place the `PER_PLACE` with the lowest scores are kept. There are two generations in memory, that at a stop
+        and that at the next one; in each, a place has `PER_PLACE` + 1 records, of which the last is spare. For each
+        place there are `numbers` (2, places) of hypotheses and the `ranks` (2, places, PER_PLACE + 1) of its records,
+        the lowest score first; for each record, `births` (2, places, PER_PLACE + 1, births + 1) has the time of its
+        last birth, or t0, then those of all. At the `final` node only the last place is left. The generation at the end
+        is the first one after an even number of steps.
+        """
+        arrays = "ptr %records, ptr %numbers, ptr %ranks, ptr %births, ptr %children, ptr %counts, ptr %windows"
+        settings = "ptr %stops, i64 %places, i64 %length, i64 %first, i64 %last, i64 %final"
+        given = self.begin(f"void @follow_order(ptr %table, {arrays}, {settings})")
+        table, records, numbers, ranks, births, children, counts, windows, stops = given[:9]
+        places, length, first, last, final = given[9:]
+        size, room, nodes = measure_record(self.sizes), PER_PLACE + 1, self.pointers()["nodes"]
+        tf, now = self.get("double", nodes, final), Variable(self, "i64", 0)
+        with self.loop(first, last) as step:
+            here, there = (self.get("i64", stops, k) for k in (step, step + 1))
+            time_at, at_end = self.at(nodes, here), (there >= final).to("i64")
+            time, old, new = self.load("double", time_at), now.value, 1 - now.value
+            self.zero(self.at(numbers, new * places), places)
+            with self.loop(0, 2) as born, self.loop(0, places - born) as place:
+                entry, window = place + born, self.at(windows, place, WINDOW)
+                count = self.get("i64", numbers, old * places + place)
+                is_open = (at_end < 1) | (entry + 1 >= places)
+                with self.loop(0, is_open.choose(count, 0)) as rank:
+                    parent = self.get("i64", ranks, (old * places + place) * room + rank)
+                    past = self.at(births, parent, length)
+                    least, earliest, latest, after = (self.get("double", window, k) for k in range(WINDOW))
+                    may_leave = (time - self.load("double", past) >= least) & (time > earliest) & (time < latest)
+                    with self.when((born < 1) | (may_leave & (time + after <= tf))):
+                        kept = self.get("i64", numbers, new * places + entry)
+                        own_ranks = self.at(ranks, new * places + entry, room)
+                        child = self.get("i64", own_ranks, kept)
+                        record, own_births = self.at(records, child, size), self.at(births, child, length)
+                        own_counts = self.at(counts, born * places + place, 3)
+                        birth, before = self.at(children, place, COLUMNS), self.at(records, parent, size)
+                        whole = (table, record, before, birth, time_at, own_counts, 1, here, there, 0, 1, at_end, 1)
+                        self.invoke("propagate", *whole)
+                        with self.loop(0, length) as k:
+                            self.put(self.get("double", past, k), own_births, k)
+                        with self.when(born > 0):
+                            self.store(time, own_births)
+                            self.put(time, own_births, entry)
+                        score = self._load_score(record)
+                        with self.when((score < float("inf")) & (score > float("-inf"))):
+                            self._insert(records, own_ranks, kept, child, score)
+                            is_full = kept >= PER_PLACE
+                            self.put(is_full.choose(kept, kept + 1), numbers, new * places + entry)
+            now.value = new
+        return self.end()
+
+    def _load_score(self, record: Value) -> Value:
+        return self.get("double", record, divide_record(self.sizes)["score"].start)
+
+    def _insert(self, records: Value, ranks: Value, count: Value, child: Value, score: Value) -> None:
+        """Emit the insertion of a record behind those of its place, `count` of them, whose scores are no higher."""
+        size, rank = measure_record(self.sizes), Variable(self, "i64", count)
+        with self.repeat() as leave:
+            leave(rank.value < 1)
+            other = self.get("i64", ranks, rank.value - 1)
+            leave(score >= self._load_score(self.at(records, other, size)))
+            self.put(other, ranks, rank.value)
+            rank.value = rank.value - 1
+        self.put(child, ranks, rank.value)
+
+
+def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
+    """Return the machine code of hypotheses of a library, or the reason why it cannot be compiled."""
+    return compile_library(library, sizes, (Order.GAUSS_NEWTON,), _write, "No beam")
+
+
+def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> Iterator[str]:
+    kernels = HypothesisKernels(library, sizes, order, module, goes_back=False)
+    costs = bool(library.running or library.references)
+    curvatures = []
+    for mode in range(len(library.modes)):
+        stage = kernels.templates.stage(mode, running=costs)
+        chosen = kernels.step(mode, stage, costs)
+        curvatures.append(kernels.share_curvature(f"curvature_{mode}", chosen, kernels.tableau(mode)))
+        write_slope(kernels, mode, stage)
+    kernels.shift()
+    kernels.move("move", 1.0, costs)
+    kernels.move("hold", -1.0, costs)
+    kernels.square()
+    kernels.nodes()
+    writer = HypothesisWriter(library, sizes, module)
+    for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
+        module.add(write_newton(writer, f"newton_{mode}"))
+    module.add(writer.write_steps(curvatures))
+    module.add(writer.write_node())
+    module.add(writer.write_score())
+    module.add(writer.write_birth())
+    module.add(writer.write_propagation())
+    module.add(writer.write_following())
+    yield module.take()
+
+
+Integers = NDArray[np.int64]
+
+SampleArrays = tuple[Integers, FloatArray, FloatArray, FloatArray]
 """Of one Measurements: the place of the first sample at each node (G + 2,), times (K,), values and weights (K, q)."""
 
 
@@ -45,10 +544,10 @@ class OrderTables(NamedTuple):
     stops : (L,), nodes between which births are
     """
 
-    children: NDArray[np.int64]
-    counts: NDArray[np.int64]
+    children: Integers
+    counts: Integers
     windows: FloatArray
-    stops: NDArray[np.int64]
+    stops: Integers
 
 
 class NativeHypotheses:
@@ -99,12 +598,9 @@ class NativeHypotheses:
             self._set_samples(k, first, *values)
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
-        self._propagate = program.function(
-            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 7
-        )
-        self._follow_order = program.function(
-            f"{PREFIX[Order.GAUSS_NEWTON]}follow_order", *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 5
-        )
+        prefix, kind = PREFIX[Order.GAUSS_NEWTON], ctypes.c_int64  # of numbers, and of addresses
+        self._propagate = program.function(f"{prefix}propagate", *[kind] * 13)
+        self._follow_order = program.function(f"{prefix}follow_order", *[kind] * 14)
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
         self._arrays |= {f"{name}_{k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
@@ -152,26 +648,20 @@ class NativeHypotheses:
         counts, children = np.zeros((1, 2), dtype=np.int64), np.zeros((1, 0, COLUMNS), dtype=np.int64)
         return self.replay(start, p[None], counts, children, np.zeros((1, 0)), 0, recentres=False)
 
-    def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
+    def advance(self, parents: Hypotheses, children: Integers, first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
 
         The samples at the first node are those of the parents; the births come after them.
         """
         times, counts = np.empty((len(children), 1)), np.empty((len(children), 3), dtype=np.int64)
-        parent, before, after, slot = children.T[: SLOT + 1]
+        parent, before, after, slot = children.T[: Column.SLOT + 1]
         times[:] = self._arrays["nodes"][first]
         counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
-        return self._go_on(parents.records, counts, children, times, (first, last, False))
+        return self._go_on(parents.records, (children, times, counts), (first, last, False))
 
     def follow_order(
-        self,
-        parents: FloatArray,
-        places: NDArray[np.int64],
-        births: FloatArray,
-        order: OrderTables,
-        first: int,
-        last: int,
-    ) -> tuple[NDArray[np.int64], FloatArray, Hypotheses]:
+        self, parents: FloatArray, places: Integers, births: FloatArray, order: OrderTables, first: int, last: int
+    ) -> tuple[Integers, FloatArray, Hypotheses]:
         """Take hypotheses from one stop to another in a given order of modes; the lowest scores of each place are kept.
 
         Parameters
@@ -206,8 +696,8 @@ class NativeHypotheses:
         self,
         start: Hypotheses,
         p: FloatArray,
-        counts: NDArray[np.int64],
-        children: NDArray[np.int64],
+        counts: Integers,
+        children: Integers,
         times: FloatArray,
         last: int,
         first: int | None = None,
@@ -236,23 +726,17 @@ class NativeHypotheses:
         if first is not None:
             own.states[:], own.tangents[:] = start.states, start.tangents
         counts = np.column_stack([counts, np.arange(len(counts))])
-        return self._go_on(own.records, counts, children, times, (first or 0, last, first is None), recentres)
+        return self._go_on(own.records, (children, times, counts), (first or 0, last, first is None), recentres)
 
     def _go_on(
-        self,
-        parents: FloatArray,
-        counts: NDArray[np.int64],
-        children: NDArray[np.int64],
-        times: FloatArray,
-        places: tuple[int, int, bool],
-        recentres: bool = True,
+        self, parents: FloatArray, births: tuple[Any, ...], places: tuple[int, int, bool], recentres: bool = True
     ) -> Hypotheses:
-        """Propagate copies of records."""
-        records = np.empty((len(counts), self.record_size))
-        arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
-        addresses = map(get_address, (records, parents, *arrays))
+        """Propagate copies of records; `births` are their children, times and counts."""
+        children, times, counts = map(np.ascontiguousarray, births)
+        records, last = np.empty((len(counts), self.record_size)), places[1]
+        addresses = map(get_address, (records, parents, children, times, counts))
         ends = last == self._cells, recentres and self._recentres
-        self._propagate(self._table_at, *addresses, times.shape[1], first, last, restarts, len(records), *ends)
+        self._propagate(self._table_at, *addresses, times.shape[1], *places, len(records), *ends)
         return self.view(records)
 
     def view(self, records: FloatArray) -> Hypotheses:

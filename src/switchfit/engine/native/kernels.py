@@ -31,54 +31,26 @@ A straight-line function reads and writes through pointers. The name of a pointe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.discretization import implicit_rows
-from switchfit.discretization import rows as explicit_rows
+from switchfit.discretization import rows
 from switchfit.discretization.model import AT_TRANSITIONS
-from switchfit.discretization.rows import (
-    EXPLICIT,
-    EXPLICIT_BEND,
-    EXPLICIT_ERROR,
-    STIFF,
-    STIFF_BEND,
-    Stages,
-    Tableau,
-    Tangent,
-    combine,
-    cost_of_row,
-    invert_stages,
-    length_factor,
-    measure_jump,
-    times_derivative,
-    times_vector,
-)
+from switchfit.discretization.rows import EXPLICIT, STIFF, Stages, Tableau, Tangent, combine, times_vector
 from switchfit.engine.native.elimination import Elimination, Routine, count_factors, eliminate
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.scalars import CHECKED, MAY_FAIL, Graph, Namespace, Node, Objects, Template
-from switchfit.engine.native.templates import (
-    ELL,
-    ELL_X,
-    F_P,
-    F_T,
-    F_X,
-    GRADIENT,
-    SECOND,
-    SLOPES,
-    F,
-    Order,
-    Sizes,
-    Templates,
-)
+from switchfit.engine.native.templates import COST_TO_GO, ELL, ELL_X, F_P, F_T, F_X, SLOPES, F, Order, Sizes, Templates
 from switchfit.problem.structure import Structure
 
 STAGES = len(EXPLICIT.b)
 """Stages of a row, or stages and slopes of an implicit one, that have memory."""
 
 Store = tuple[str, int, Node]
+Factors = Elimination | Routine | None
+"""Those of the coupled equations of an implicit row; None for an explicit one."""
 Along = list[tuple[Node, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
@@ -174,7 +146,7 @@ class Kernels:
         states = [x + combine(row, k) for row in STIFF.a]
         found = [field(j, X) for j, X in enumerate(states)]
         slopes, jacobians = zip(*found, strict=True)
-        corrected = implicit_rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
+        corrected = rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
         after = np.concatenate([x + combine(row, corrected) for row in STIFF.a])
         change = xp.abs(after - np.concatenate(states))
         size = xp.abs(after) + xp.abs(np.concatenate([x] * len(k)))
@@ -191,9 +163,7 @@ class Kernels:
         n = self.sizes.n
         return [graph.loads("increments", n, j * n) for j in range(STIFF.coupled)]
 
-    def forward_row(
-        self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau
-    ) -> Elimination | Routine | None:
+    def forward_row(self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau) -> Factors:
         """Write the forward step of a row: its stages, the state after it, their derivatives and its running cost.
 
         Return the factors that it keeps.
@@ -210,7 +180,7 @@ class Kernels:
 
         # The increments k_j = h K_j were found by the loop of `segments.write_newton` before; here they are inputs.
         k = self.load_increments(graph) if tableau.coupled else []
-        found = explicit_rows.stages(tableau, field, start, end, x, k)
+        found = rows.stages(tableau, field, start, end, x, k)
         after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         stores, factors = store_all("x_after", 0, after), None
         keep: Callable[..., list[Store]] = store_all if self.goes_back else lambda *_: []
@@ -220,7 +190,7 @@ class Kernels:
             # has from its stages, those of an implicit row are k / h and have to be stored.
             if k:
                 f_x = stage(graph, *at(start, x), only=(F_X,))[0]
-                found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
+                found = found._replace(slopes=rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
                 at_points = at_points + (found.slopes if moving else [])
             stores += keep("X", 0, np.concatenate(at_points))
             if kept:
@@ -241,22 +211,19 @@ class Kernels:
             if moving:
                 start_d, end_d = self._ends(graph)
                 h_d = end_d - start_d
-                times_d = times_derivative(tableau, start_d, end_d)
+                times_d = rows.times_derivative(tableau, start_d, end_d)
                 # D_2 f t_j' + D_p f p', the part of K_j' that does not depend on X_j'.
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
-            tangent: Callable[..., explicit_rows.Tangent] = explicit_rows.tangent
-            if factors is not None:
-                tangent = partial(implicit_rows.tangent, factors=factors)
             # Without `moving` h_d is None: the graph then has none of the products with h', which all other rows would
             # pay for.
-            along = tangent(tableau, h, found.slopes, of_x, forcing, Z, h_d)
+            along = rows.tangent(tableau, h, found.slopes, of_x, forcing, Z, h_d, factors)
             vectors = along.states + (along.slopes if k and moving else [])
             stores += keep("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
             stores += self._add_to_row(graph, stage, tableau, found, along, costs)
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
-            stores.append(("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)))
+            stores.append(("J", 0, graph.load("J", 0) + rows.cost_of_row(tableau, h, densities)))
         if checked:
             stores += graph.check()
         self.module.write_straight_line(name, stores)
@@ -275,14 +242,14 @@ class Kernels:
         graph = Graph()
         at, (x, h, _, after) = self._row(graph), self._load_row(graph, tableau)
         # The slopes are not in memory, but h K_j follow from the states: a linear map, whose weights are known numbers.
-        inverse = invert_stages(tableau)
+        inverse = rows.invert_stages(tableau)
         if tableau.coupled:
             slope, f_x = stage(graph, *at(graph.load("row", 0), x), only=(F, F_X))
             k = [combine(row, [X - x for X in after]) for row in inverse]
-            errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
+            errors = rows.estimate_error(h, k, slope, f_x, eliminate)
         else:
             # sum_j e_j h K_j with h K = inverse (X - x): the weights of the states, and what they leave of x.
-            weights = EXPLICIT_ERROR @ inverse
+            weights = rows.EXPLICIT_ERROR @ inverse
             errors = combine(weights, after) - weights.sum() * x
         self._add_to_errors(f"error_{mode}", graph, Namespace(graph).abs(errors))
 
@@ -291,13 +258,13 @@ class Kernels:
         # The middle stage and the bend see a jump that the first and the last one straddle; see `rows.measure_jump`.
         changes = [X - x for X in after]
         first, middle, last = (combine(inverse[j], changes) for j in (0, len(inverse) // 2, -1))
-        bend = combine((STIFF_BEND if tableau.coupled else EXPLICIT_BEND) @ inverse, changes)
+        bend = combine((rows.STIFF_BEND if tableau.coupled else rows.EXPLICIT_BEND) @ inverse, changes)
         times = [graph.load("row", 0) + c * h for c in tableau.c[[0, -1]].tolist()]
         ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
         # The mean of the derivatives at both ends times the change of (t, X) is how f would change if it were smooth.
         f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
         smooth = 0.5 * h * (times_vector(f_x, states[-1] - states[0]) + f_t * (times[1] - times[0]))
-        jump = measure_jump(first, middle, last, bend, smooth, Namespace(graph))
+        jump = rows.measure_jump(first, middle, last, bend, smooth, Namespace(graph))
         self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * jump)
 
     def _load_row(self, graph: Graph, tableau: Tableau) -> tuple[Objects, Node, list[Objects], list[Objects]]:
@@ -318,14 +285,7 @@ class Kernels:
         self.module.write_straight_line(name, store_all("errors", 0, largest))
 
     def backward_row(
-        self,
-        name: str,
-        stage: Template,
-        moving: bool,
-        costs: bool,
-        tableau: Tableau,
-        factors: Elimination | Routine | None,
-        late: bool = False,
+        self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, factors: Factors, late: bool
     ) -> list[tuple[int, int]]:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
@@ -353,21 +313,19 @@ class Kernels:
 
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
             given = at(times[j], states[j], w, hb)
-            g_t, g_x, g_p, S = stage(graph, *given, only=GRADIENT + SECOND, checked=True, known=known[j])
+            g_t, g_x, g_p, S = stage(graph, *given, only=COST_TO_GO, checked=True, known=known[j])
             second[j] = list_entries(S, with_time=moving)
             if moving:
                 slopes[j] = stage(graph, *given, only=SLOPES, known=known[j])
             return g_t.item(), g_x, g_p
 
+        ell_x: list[Objects] = []
         if factors is not None:
-            # The w_j of an implicit row depend on one another: its matrix is factorized from D_1 f at all stages before
-            # any `pull`.
+            # The w_j of an implicit row depend on one another: D_1 ell at all stages is needed before any `pull`.
             points = zip(times, states, known, strict=True)
-            of_x = [stage(graph, *at(t, X), only=(ELL_X,), known=kept_there) for t, X, kept_there in points]
-            ell_x = [each[0] for each in of_x]
-            found = implicit_rows.adjoint(tableau, h, psi, pull, ell_x, factors.load(graph))
-        else:
-            found = explicit_rows.adjoint(tableau, h, psi, pull)
+            ell_x = [stage(graph, *at(t, X), only=(ELL_X,), known=kept_there)[0] for t, X, kept_there in points]
+            factors = factors.load(graph)
+        found = rows.adjoint(tableau, h, psi, pull, ell_x, factors)
         # A late sample ends a row of its own, which starts where the row around it does: `late` is its costate there.
         before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
         stores = store_all("psi", 0, before)
@@ -378,9 +336,9 @@ class Kernels:
             # D_tau J of a row that tau opens or closes: t_j' times D_2 (w_j . f + h b_j ell), and h' times V. Summed
             # over the two rows beside tau this is psi X^i, (6), of the discretized cost.
             start_d, end_d = self._ends(graph)
-            times_d = times_derivative(tableau, start_d, end_d)
+            times_d = rows.times_derivative(tableau, start_d, end_d)
             K = [graph.loads("X", n, (count + j) * n) if tableau.coupled else s[0] for j, s in enumerate(slopes)]
-            factor = length_factor(tableau, psi, found.states, K, [s[4].item() for s in slopes])
+            factor = rows.length_factor(tableau, psi, found.states, K, [s[4].item() for s in slopes])
             g = g + factor * (end_d - start_d) + sum(g_t * t_d for g_t, t_d in zip(found.times, times_d, strict=True))
             if self.order == Order.HESSIAN:
                 # V' along theta with psi and mu held: how these move is in Z' S Z already. V is linear in K_j and
@@ -394,7 +352,7 @@ class Kernels:
                     else:
                         K_d.append(times_vector(D_1f, X_d) + self._along_p(graph, f_p) + f_t * times_d[j])
                     ell_d.append((l_x * X_d).sum() + self._along_p(graph, l_p) + l_t.item() * times_d[j])
-                factor_d = length_factor(tableau, psi, found.states, K_d, ell_d)
+                factor_d = rows.length_factor(tableau, psi, found.states, K_d, ell_d)
                 stores.append(("length", 0, as_vector(graph, factor_d)))
         stores.append(("g", 0, as_vector(graph, g)))
         chosen, entries = self._store_entries(graph, tableau, second)
@@ -475,21 +433,21 @@ class Kernels:
             if self.goes_back:
                 self._map_back(name, template, of_start=name == "start")
         for kind in AT_TRANSITIONS:
-            inputs: tuple[str, ...] = ("time", "x", "p", "multiplier", "origin", "signal")
+            inputs = "time", "x", "p", "multiplier", "origin", "signal"
             add = self._constraint if kind == "guards" else self._cost
             for which in range(len(getattr(library, kind))):
                 template = self.templates.transition(kind, which)
-                self._write_node(f"{kind}_{which}", add, template, inputs, moving=True, multiplier=1)
+                self._write_node(f"{kind}_{which}", add, template, True, *inputs, multiplier=1)
         for k, sensor in enumerate(library.measurements):
-            template, inputs = self.templates.sample(k), ("time", "value", "weight", "x", "p")
-            lengths = dict.fromkeys(("value", "weight"), sensor.channels)
+            template, lengths = self.templates.sample(k), dict.fromkeys(("value", "weight"), sensor.channels)
             is_late = sensor.delay is not None  # its time depends on theta then
-            self._write_node(f"sample_{k}", self._cost, template, inputs, is_late, **lengths)
+            self._write_node(f"sample_{k}", self._cost, template, is_late, "time", *lengths, "x", "p", **lengths)
         if library.terminal:
-            self._write_node("end", self._cost, self.templates.end(), ("x", "p"), moving=False)
+            self._write_node("end", self._cost, self.templates.end(), False, "x", "p")
         if library.terminal_constraints:
-            template, inputs, m = self.templates.end_constraint(), ("x", "p", "multiplier"), self.sizes.m
-            self._write_node("end_constraint", self._constraint, template, inputs, moving=False, multiplier=m)
+            given = False, "x", "p", "multiplier"
+            template = self.templates.end_constraint()
+            self._write_node("end_constraint", self._constraint, template, *given, multiplier=self.sizes.m)
 
     def _map_forward(self, name: str, template: Template) -> None:
         graph, n, checked = Graph(), self.sizes.n, not self.goes_back
@@ -537,15 +495,11 @@ class Kernels:
         self.module.write_straight_line("end_of_late", stores)
 
     def _write_node(
-        self,
-        name: str,
-        add: Callable[[Graph, Sequence[Objects], bool], list[Store]],
-        template: Template,
-        inputs: tuple[str, ...],
-        moving: bool,
-        **lengths: int,
+        self, name: str, add: Callable[..., Any], template: Template, moving: bool, *inputs: str, **lengths: int
     ) -> None:
-        """Write a cost, or constraints, at a node; `moving` if its time depends on theta."""
+        """Write the stores that `add` returns for a cost, or constraints, at a node; `moving` if its time depends on
+        theta.
+        """
         graph = Graph()
         found = template(graph, *self._load_inputs(graph, *inputs, **lengths), checked=True)
         self.module.write_straight_line(name, add(graph, found, moving) + graph.check())

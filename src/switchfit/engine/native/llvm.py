@@ -37,7 +37,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.scalars import FROM_LIBM, LONG, OPERATIONS, Node, Operation, list_needed
+from switchfit.engine.native.scalars import FROM_LIBM, OPERATIONS, Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
 Found = TypeVar("Found")
@@ -393,10 +393,6 @@ LOOKUP = 3
 """Cost of a table lookup, in additions."""
 
 
-EFFORT = dict.fromkeys(LONG, 20) | {"div": 4, "sqrt": 4, "lookup": 3}
-"""Cost of operations, in additions, where it is not 1."""
-
-
 class Module:
     """Text of LLVM functions, collected one by one and taken in parts.
 
@@ -483,13 +479,6 @@ _CALLED = re.compile(r"call \w+ @([\w.]+)\(")
 _HEADER = re.compile(r"^define (\w+ @([\w.]+)\(.*\))", re.MULTILINE)
 
 
-def _write_declaration(operation: Operation) -> str:
-    """Return the declaration of the function that an operation calls; C functions are declared without side effects."""
-    operands = ", ".join(["double"] * operation.operands)
-    memory = " memory(none) nounwind willreturn" if operation.function in FROM_LIBM else ""
-    return f"declare double @{operation.function}({operands}){memory}"
-
-
 class _Writer(Lines):
     """Emits the instructions of one function, one for each operation; `used` are the names of its pointers."""
 
@@ -538,7 +527,10 @@ class _Writer(Lines):
             return self._solve(node)
         operation = OPERATIONS[op]
         if operation.function is not None:
-            self.module.declare(operation.function, _write_declaration(operation))
+            operands = ", ".join(["double"] * operation.operands)
+            # C functions have no side effects that matter.
+            memory = " memory(none) nounwind willreturn" if operation.function in FROM_LIBM else ""
+            self.module.declare(operation.function, f"declare double @{operation.function}({operands}){memory}")
         return self.let(kind, operation.code.format(*(self._as(a, node.vector) for a in args), type=kind))
 
     def _factorize(self, node: Node) -> Value:
@@ -596,8 +588,6 @@ class Program:
     ----------
     key : str
         Hash of the module, the same in every process.
-    row_work : list of int
-        Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
     lock : held during a call, since ctypes releases the GIL
     memory : array of doubles
         Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.

@@ -19,29 +19,23 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections import namedtuple
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from itertools import chain
 
-from switchfit.discretization.rows import STIFF
-from switchfit.engine.native.adaptive import TIMES, Adaptive, write_slope, write_step
+import numpy as np
+
+from switchfit.discretization import rows
+from switchfit.discretization.rows import ADAPTIVE, STIFF, combine
+from switchfit.engine.native import segments
+from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variable, compile_modules
-from switchfit.engine.native.segments import (
-    constraint_pointers,
-    count_rows,
-    estimate_row,
-    solve_stages,
-    state_pointers,
-    write_backward,
-    write_forward,
-    write_late_samples,
-    write_newton,
-    write_samples,
-)
-from switchfit.engine.native.templates import Order, Sizes
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
+from switchfit.engine.native.segments import GIVEN, OF_SAMPLES, Pointers, Writer
+from switchfit.engine.native.templates import ELL, ELL_X, F_X, F, Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import GIVEN, OF_SAMPLES, ZEROED, Pointers, Writer, layout_of
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
 
@@ -58,7 +52,7 @@ DATA, DIMENSIONS = 24, 40
 def write_handler(writer: Writer) -> str:
     """Return the text of the handler, which fills the table of pointers and calls `evaluate`.
 
-    Arguments are those of `writer.GIVEN`, then those of the samples; results are all accumulators in one array, and
+    Arguments are those of `GIVEN`, then those of the samples; results are all accumulators in one array, and
     the scratch space.
     """
     measurements = len(writer.library.measurements)
@@ -83,11 +77,11 @@ def write_handler(writer: Writer) -> str:
     for name, length in writer.layout.sums.items():
         found[name] = writer.at(totals, position)
         position += length
-    rows = count_rows(writer, found)
+    rows = segments.count_rows(writer, found)
     place: Operand = 0
-    for name, extent in writer.layout.memory.items():
+    for name, (fixed, each_row) in writer.layout.memory.items():
         found[name] = writer.at(between, place)
-        place = rows * extent.each_row + extent.fixed + place
+        place = rows * each_row + fixed + place
     for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
         writer.put(found[name], table, k)
     of_cells = (names.index(f"{OF_SAMPLES[0]} {k}") for k in range(measurements))
@@ -103,18 +97,23 @@ def write_evaluation(writer: Writer) -> str:
     of_samples = "".join(f", i64 %count_{k}" for k in range(len(writer.library.measurements)))
     table, *counts = writer.begin(f"void @evaluate(ptr %table{of_samples})")
     found, layout = writer.pointers(), writer.layout
-    rows = count_rows(writer, found)
+    rows = segments.count_rows(writer, found)
     # The sums are one block of memory, so that one call clears all of them.
     writer.zero(found[next(iter(layout.sums))], sum(layout.sums.values()))
-    for name in ZEROED:
-        writer.zero(found[name], rows * layout.memory[name].each_row + layout.memory[name].fixed)
-    first = state_pointers(writer, found, 0)
+    for name in segments.ZEROED:
+        fixed, each_row = layout.memory[name]
+        writer.zero(found[name], rows * each_row + fixed)
+    first = segments.state_pointers(writer, found, 0)
     writer.call("start", found | {f"{name}_after": pointer for name, pointer in first.items()})
     with writer.loop(0, N + 1) as segment:
         writer.invoke("forward", table, segment)
     for k, count in enumerate(counts):
         writer.invoke(f"samples_{k}", table, count)
-    _call_end(writer, found)
+    # No row follows the end: what the terminal terms add to the costate goes to psi itself.
+    library, given = writer.library, found | segments.state_pointers(writer, found, rows) | {"jump": found["psi"]}
+    given |= segments.constraint_pointers(writer, found, layout.constraint_rows["end"])
+    for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
+        writer.call(name, given)
     if writer.order > Order.COST:
         with writer.loop(0, N + 1) as turn:
             writer.invoke("backward", table, N - turn)
@@ -122,15 +121,77 @@ def write_evaluation(writer: Writer) -> str:
     return writer.end()
 
 
-def _call_end(writer: Writer, found: Pointers) -> None:
-    """Call the terminal cost and constraints."""
-    library, last = writer.library, state_pointers(writer, found, count_rows(writer, found))
-    # No row follows the end: what the terminal terms add to the costate goes to psi itself.
-    given = (
-        found | last | {"jump": found["psi"]} | constraint_pointers(writer, found, writer.layout.constraint_rows["end"])
-    )
-    for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
-        writer.call(name, given)
+TIMES = {False: [*ADAPTIVE.c.tolist(), 1.0], True: [0.0, *STIFF.c.tolist()]}
+"""Times at which an explicit (False) or implicit step evaluates the mode, as fractions of it."""
+
+
+Adaptive = namedtuple("Adaptive", "t step refused stuck end rtol atol low high")
+
+AT = Adaptive(*range(9))
+"""Offsets in the state of the adaptive solver, in doubles: t, step, refused and stuck are those of `Progress`, truth
+values being 0 or 1; the end of the solve; rtol and atol of `Tolerances`; low and high, the times between which a signal
+may be looked up.
+"""
+
+
+def write_slope(kernels: Kernels, mode: int, stage: Template) -> None:
+    """Write f and ell of a mode at one time: the derivative of y = (x, running cost so far)."""
+    graph = Graph()
+    f, ell = _evaluate(kernels, graph, stage)(graph.loads("y", kernels.sizes.n), (F, ELL))
+    stores = [("K", k, node) for k, node in enumerate([*f, ell.item()])]
+    kernels.module.write_straight_line(f"slope_{mode}", stores + graph.check())
+
+
+def _evaluate(
+    kernels: Kernels, graph: Graph, stage: Template, number: str = "", checked: bool = True
+) -> Callable[[Objects, Sequence[int]], list[Objects]]:
+    """Return some outputs of a mode as a function of the state, at the time of a `moment` with this number."""
+    t, origin = graph.loads(f"moment{number}", 2)
+    at = kernels.take_inputs(graph, origin, f"signal{number}")
+    return lambda x, only: stage(graph, *at(t, x), only=only, checked=checked)
+
+
+@np.errstate(divide="ignore")  # the error of a mode at rest is the number zero
+def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
+    """Write a step in a mode, with the error control behind it; an implicit one follows the iterations of Newton."""
+    n, is_implicit = kernels.sizes.n, kernels.library.implicit[mode]
+    graph, count = Graph(), len(TIMES[is_implicit])
+    state, y = graph.loads("state", len(AT)), graph.loads("y", n + 1)
+    # y is (x, running cost): the mesh has to resolve both.
+    points = [_evaluate(kernels, graph, stage, str(j)) for j in range(count)]
+    flags = (graph.apply("ne", state[k], 0.0) for k in (AT.refused, AT.stuck))
+    progress = rows.Progress(state[AT.t], state[AT.step], *flags)
+    given = progress, state[AT.end], rows.Tolerances(state[AT.rtol], state[AT.atol]), y
+    h, xp = progress.step, Namespace(graph)
+    if is_implicit:
+        k, (at_start, *at_stages) = kernels.load_increments(graph), points
+        f, f_x, ell, ell_x = at_start(y[:n], (F, F_X, ELL, ELL_X))
+        # The running cost needs no iterations: its increments are h ell at the stages that the states have.
+        densities = [each(y[:n] + combine(row, k), (ELL,))[0] for each, row in zip(at_stages, STIFF.a, strict=True)]
+        k = [np.append(each, h * density.item()) for each, density in zip(k, densities, strict=True)]
+        # d (x, cost) / dt = (f, ell) does not depend on the cost: its column is zero.
+        jacobian = np.block([[f_x, np.zeros((n, 1))], [ell_x[None], 0.0]])
+        error = rows.estimate_error(h, k, np.append(f, ell), jacobian, eliminate)
+        now, y_now = rows.judge_error(*given, y + combine(STIFF.b, k), error, rows.STIFF_EXPONENT, xp)
+    else:
+        K: list[Objects] = []
+        for row, evaluate in zip((*ADAPTIVE.a, ADAPTIVE.b), points, strict=True):
+            after = y + h * combine(row, K)
+            K.append(np.concatenate([np.ravel(value) for value in evaluate(after[:n], (F, ELL))]))
+        now, y_now = rows.judge_error(*given, after, h * combine(rows.ADAPTIVE_ERROR, K), rows.EXPONENT, xp)
+    stores = [("state", AT.t, now.t), ("state", AT.step, now.step), *(("y", k, node) for k, node in enumerate(y_now))]
+    for place, flag in ((AT.refused, now.refused), (AT.stuck, now.stuck)):
+        stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
+    # The stages of a step that is rejected may be anywhere.
+    for pointer, offset, node in graph.check():
+        stores.append((pointer, offset, graph.apply("select", now.refused, graph.load(CHECKED, 0), node)))
+    kernels.module.write_straight_line(f"step_{mode}", stores)
+    if is_implicit:
+        graph = Graph()
+        stages = [_evaluate(kernels, graph, stage, str(j), checked=False) for j in range(1, count)]
+        field = lambda j, X: stages[j](X, (F, F_X))  # noqa: E731
+        found = kernels.correct(graph, graph.load("state", AT.step), graph.loads("y", n), field)
+        kernels.module.write_straight_line(f"newton_step_{mode}", found)
 
 
 def write_loop(writer: Writer, name: str) -> str:
@@ -148,11 +209,11 @@ def write_loop(writer: Writer, name: str) -> str:
 
 def _store_moment(writer: Writer, found: Pointers, cells: Value, time: Value, moment: Value) -> Value:
     """Store a time, and the first node of the cell that holds it, clipped to [low, high]; return the signals there."""
-    S, at = writer.sizes.signals, Adaptive()
+    S = writer.sizes.signals
     writer.store(time, moment)
     if not S:
         return found["signals"]
-    low, high = (writer.get("double", found["state"], k) for k in (at.low, at.high))
+    low, high = (writer.get("double", found["state"], k) for k in (AT.low, AT.high))
     # At the ends of a stretch an input may jump: the time is kept inside [low, high], so that the cell is one of the
     # stretch.
     later = (time < low).choose(low, time)
@@ -173,7 +234,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
 
     It ends at the end time, after `most` accepted steps, or when the solver is stuck.
     """
-    n, at, is_implicit = writer.sizes.n, Adaptive(), writer.library.implicit[mode]
+    n, is_implicit = writer.sizes.n, writer.library.implicit[mode]
     given = "i64 %cells, ptr %state, ptr %y, ptr %rows, i64 %most, ptr %count"
     _, cells, state, y, rows, most, count = writer.begin(f"void @adaptive_{mode}_steps(ptr %table, {given})")
     found = writer.pointers() | {"state": state, "y": y}
@@ -182,19 +243,19 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     found["J"] = found["newton"]  # NaN if the iterations do not converge, as the increments are
     writer.store(0, count, "i64")
     with writer.repeat() as leave:
-        t, end, stuck, step = (writer.get("double", state, k) for k in (at.t, at.end, at.stuck, at.step))
+        t, end, stuck, step = (writer.get("double", state, k) for k in (AT.t, AT.end, AT.stuck, AT.step))
         # Go on while t < end, not stuck, and with room for accepted times.
         leave(((t < end) & stuck.equals(0.0) & (writer.load("i64", count) < most)).equals(False))
         for j, c in enumerate(TIMES[is_implicit]):
             found[f"moment{j}"] = writer.allocate("double", 2)
             found[f"signal{j}"] = _store_moment(writer, found, cells, t + step * c, found[f"moment{j}"])
         if is_implicit:
-            solve_stages(writer, f"newton_step_{mode}", found)
+            segments.solve_stages(writer, f"newton_step_{mode}", found)
         writer.call(f"step_{mode}", found)
-        with writer.when(writer.get("double", state, at.refused).equals(0.0)):
+        with writer.when(writer.get("double", state, AT.refused).equals(0.0)):
             accepted = writer.load("i64", count)
             row = writer.at(rows, accepted, 2 + n)
-            writer.store(writer.get("double", state, at.t), row)
+            writer.store(writer.get("double", state, AT.t), row)
             writer.copy(writer.at(row, 1), y, 1 + n)
             writer.store(accepted + 1, count)
     return writer.end()
@@ -267,7 +328,7 @@ def drop_programs() -> None:
     """Drop cached programs that are not in use, and what is known of their memory."""
     with _one_at_a_time:
         _program_of.cache_clear()
-        layout_of.cache_clear()
+        segments.layout_of.cache_clear()
 
 
 def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> Iterator[str]:
@@ -279,25 +340,25 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
         if order > Order.COST:
-            module.row_work.append(estimate_row(writer, mode, curvatures[mode]["inner"]))
+            module.row_work.append(segments.estimate_row(writer, mode, curvatures[mode]["inner"]))
         yield module.take()
     kernels.nodes()
     for k in range(len(library.measurements)):
         if k in late:
             kernels.late_time(k)
-            module.add(write_late_samples(writer, k, curvatures))
+            module.add(segments.write_late_samples(writer, k, curvatures))
         else:
-            module.add(write_samples(writer, k))
+            module.add(segments.write_samples(writer, k))
     for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
         module.add(write_loop(writer, name))
     kernels.state()
     if order != Order.GRADIENT:
         kernels.outputs()
         module.add(write_loop(writer, "outputs"))
-    module.add(write_forward(writer))
+    module.add(segments.write_forward(writer))
     module.add(write_evaluation(writer))
     if order > Order.COST:
-        module.add(write_backward(writer, curvatures))
+        module.add(segments.write_backward(writer, curvatures))
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
     yield module.take()
@@ -314,7 +375,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))
     if library.implicit[mode]:
         kernels.newton(f"newton_{mode}", stage)
-        module.add(write_newton(writer, f"newton_{mode}"))
+        module.add(segments.write_newton(writer, f"newton_{mode}"))
     tableau, curvatures = kernels.tableau(mode), {}
     for kind, template, moving, costs, is_late in kinds:
         name = f"{kind}_{mode}"
@@ -334,6 +395,6 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         module.add(write_loop(writer, f"slope_{mode}"))
         write_step(kernels, mode, stage)
         if library.implicit[mode]:
-            module.add(write_newton(writer, f"newton_step_{mode}"))
+            module.add(segments.write_newton(writer, f"newton_step_{mode}"))
         module.add(write_adaptive_solve(writer, mode))
     return curvatures

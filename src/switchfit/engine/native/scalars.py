@@ -90,18 +90,12 @@ def _logic(name: str, value: Callable[..., Any], of_truth: tuple[str, ...], **mo
     return Operation(name, value, takes_truth=True, gives_truth=True, of_truth=of_truth, **given)
 
 
-def _call(name: str, value: Callable[..., Any], function: str, operands: int = 1, **more: Any) -> Operation:
-    given = ", ".join(f"double {{{k}}}" for k in range(operands))
-    code = f"call double @{function}({given})"
-    return Operation(name, value, code, operands, function=function, **({"primitives": (name,)} | more))
-
-
-def _intrinsic(name: str, value: Callable[..., Any], intrinsic: str, **more: Any) -> Operation:
-    return _call(name, value, f"llvm.{intrinsic}.f64", **more)
-
-
-def _from_libm(name: str, value: Callable[..., Any], function: str | None = None, **more: Any) -> Operation:
-    return _call(name, value, function or name, effort=MANY, **more)
+def _call(name: str, value: Callable[..., Any], function: str = "", operands: int = 1, **more: Any) -> Operation:
+    """Return an operation that calls an intrinsic, "llvm.*", or a function of the C library, by default of its name."""
+    function = function or name
+    code = f"call double @{function}({', '.join(f'double {{{k}}}' for k in range(operands))})"
+    given: dict[str, Any] = {"primitives": (name,), "effort": 1 if "." in function else MANY} | more
+    return Operation(name, value, code, operands, function=function, **given)
 
 
 def _round_half_away(a: Any) -> Any:
@@ -128,38 +122,38 @@ OPERATIONS = {
         _logic("xor", np.bitwise_xor, ("xor", "ne")),
         _logic("not", np.invert, ("not",), operands=1, code="xor i1 {0}, true", commutes=False),
         Operation("select", np.where, "select i1 {0}, {type} {1}, {type} {2}", 3),
-        _intrinsic("max", np.maximum, "maximum", operands=2, commutes=True),
-        _intrinsic("min", np.minimum, "minimum", operands=2, commutes=True),
-        _intrinsic("abs", np.abs, "fabs"),
-        _intrinsic("sqrt", np.sqrt, "sqrt", effort=4, may_fail=True),
-        _intrinsic("floor", np.floor, "floor", gives_integer=True),
-        _intrinsic("ceil", np.ceil, "ceil", gives_integer=True),
-        _intrinsic("trunc", np.trunc, "trunc", primitives=(), gives_integer=True),
-        _intrinsic("rint", np.rint, "rint", primitives=(), gives_integer=True),
-        _intrinsic("round", _round_half_away, "round", primitives=(), gives_integer=True),
-        _from_libm("exp", np.exp, may_fail=True),
-        _from_libm("exp2", np.exp2, may_fail=True),
-        _from_libm("expm1", np.expm1, may_fail=True),
-        _from_libm("log", np.log, may_fail=True),
-        _from_libm("log1p", np.log1p, may_fail=True),
-        _from_libm("pow", np.float_power, operands=2, may_fail=True),  # np.power(-inf, 0.5) is NaN
-        _from_libm("rem", np.fmod, "fmod", operands=2, may_fail=True),
-        _from_libm("cbrt", np.cbrt),
-        _from_libm("sin", np.sin),
-        _from_libm("cos", np.cos),
-        _from_libm("tan", np.tan),
-        _from_libm("asin", np.arcsin, may_fail=True),
-        _from_libm("acos", np.arccos, may_fail=True),
-        _from_libm("atan", np.arctan),
-        _from_libm("atan2", np.arctan2, operands=2),
-        _from_libm("sinh", np.sinh, may_fail=True),
-        _from_libm("cosh", np.cosh, may_fail=True),
-        _from_libm("tanh", np.tanh),
-        _from_libm("asinh", np.arcsinh),
-        _from_libm("acosh", np.arccosh, may_fail=True),
-        _from_libm("atanh", np.arctanh, may_fail=True),
-        _from_libm("erf", np.vectorize(math.erf, otypes=[float])),
-        _from_libm("erfc", np.vectorize(math.erfc, otypes=[float])),
+        _call("max", np.maximum, "llvm.maximum.f64", operands=2, commutes=True),
+        _call("min", np.minimum, "llvm.minimum.f64", operands=2, commutes=True),
+        _call("abs", np.abs, "llvm.fabs.f64"),
+        _call("sqrt", np.sqrt, "llvm.sqrt.f64", effort=4, may_fail=True),
+        _call("floor", np.floor, "llvm.floor.f64", gives_integer=True),
+        _call("ceil", np.ceil, "llvm.ceil.f64", gives_integer=True),
+        _call("trunc", np.trunc, "llvm.trunc.f64", primitives=(), gives_integer=True),
+        _call("rint", np.rint, "llvm.rint.f64", primitives=(), gives_integer=True),
+        _call("round", _round_half_away, "llvm.round.f64", primitives=(), gives_integer=True),
+        _call("exp", np.exp, may_fail=True),
+        _call("exp2", np.exp2, may_fail=True),
+        _call("expm1", np.expm1, may_fail=True),
+        _call("log", np.log, may_fail=True),
+        _call("log1p", np.log1p, may_fail=True),
+        _call("pow", np.float_power, operands=2, may_fail=True),  # np.power(-inf, 0.5) is NaN
+        _call("rem", np.fmod, "fmod", operands=2, may_fail=True),
+        _call("cbrt", np.cbrt),
+        _call("sin", np.sin),
+        _call("cos", np.cos),
+        _call("tan", np.tan),
+        _call("asin", np.arcsin, may_fail=True),
+        _call("acos", np.arccos, may_fail=True),
+        _call("atan", np.arctan),
+        _call("atan2", np.arctan2, operands=2),
+        _call("sinh", np.sinh, may_fail=True),
+        _call("cosh", np.cosh, may_fail=True),
+        _call("tanh", np.tanh),
+        _call("asinh", np.arcsinh),
+        _call("acosh", np.arccosh, may_fail=True),
+        _call("atanh", np.arctanh, may_fail=True),
+        _call("erf", np.vectorize(math.erf, otypes=[float])),
+        _call("erfc", np.vectorize(math.erfc, otypes=[float])),
     )
 }
 
@@ -243,17 +237,15 @@ class Node:
 def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
     """Return whether an operation yields a truth value; raise TypeError if its arguments have the wrong type for it."""
     operation = OPERATIONS.get(op)
+    if operation is None:
+        return op == "const" and isinstance(args[0], bool)
     if op == "select":
-        condition, yes, no = args
-        if not condition.truth or yes.truth is not no.truth:
-            raise TypeError("select takes a truth value, then two cases of one type")
-        return bool(yes.truth)
-    if operation is not None:
-        for a in args:
-            if a.truth is not operation.takes_truth:
-                raise TypeError(f"{op} does not take {'a truth value' if a.truth else 'a double'}")
-        return operation.gives_truth
-    return op == "const" and isinstance(args[0], bool)
+        takes, gives = (True, args[1].truth, args[1].truth), args[1].truth
+    else:
+        takes, gives = (operation.takes_truth,) * len(args), operation.gives_truth
+    if any(a.truth is not each for a, each in zip(args, takes, strict=True)):
+        raise TypeError(f"{op} takes other types: truth values for doubles, or the other way round")
+    return bool(gives)
 
 
 class Graph:
@@ -465,10 +457,6 @@ def list_needed(outputs: Sequence[Node]) -> list[Node]:
     return [graph.nodes[k] for k in np.flatnonzero(wanted)]
 
 
-def _look_up(table: NDArray[np.float64], index: Any) -> Any:
-    return table[np.asarray(index, int)]
-
-
 class Template:
     """A traced function of scalars that can be copied into graphs; inputs and outputs are lists of arrays.
 
@@ -500,10 +488,22 @@ class Template:
         node, they are not computed again.
         """
         chosen = tuple(range(len(self._flat)) if only is None else only)
-        presumed = self.presumed if checked else []
-        made = self._copy(graph, inputs, self._list_needed(chosen, checked), known or {})
+        given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
+        made: dict[int, Node] = dict(known or {})  # the copies by the index of the node here
+        for node in self._list_needed(chosen, checked):
+            if node.index in made:
+                continue
+            if node.op == "load":
+                value = given[int(node.args[0])][node.args[1]]
+                made[node.index] = value if isinstance(value, Node) else graph.constant(value)
+            elif node.op == "const":
+                made[node.index] = graph.constant(node.args[0])
+            elif node.op == "lookup":
+                made[node.index] = graph.lookup(node.args[0].values, made[node.args[1].index])
+            elif node.op != "table":
+                made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
         # What the template left out as a product with zero is presumed in the graph that uses it, with these inputs.
-        for node in presumed:
+        for node in self.presumed if checked else ():
             graph.presume(made[node.index])
         results = []
         for k in chosen:
@@ -518,7 +518,8 @@ class Template:
         loads = [(node.index, int(node.args[0]), node.args[1]) for node in nodes if node.op == "load"]
         known = {node.index: node.number for node in nodes if node.op == "const"}
         known |= {node.index: node.values for node in nodes if node.op == "table"}
-        values = {name: operation.value for name, operation in OPERATIONS.items()} | {"lookup": _look_up}
+        values = {name: operation.value for name, operation in OPERATIONS.items()}
+        values["lookup"] = lambda table, index: table[np.asarray(index, int)]
         return loads, known, [(n.index, values[n.op], [a.index for a in n.args]) for n in nodes if n.op in values]
 
     def evaluate(self, *inputs: Any) -> list[NDArray[np.float64]]:
@@ -550,23 +551,3 @@ class Template:
             wanted = [v for k in chosen for v in self._flat[k] if isinstance(v, Node)]
             self._needed[key] = list_needed([*wanted, *(self.presumed if checked else [])])
         return self._needed[key]
-
-    def _copy(
-        self, graph: Graph, inputs: Sequence[Any], nodes: Sequence[Node], known: Mapping[int, Node]
-    ) -> dict[int, Node]:
-        """Copy nodes into a graph, but those that are known; return the copies by the index of the node here."""
-        given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
-        made: dict[int, Node] = dict(known)
-        for node in nodes:
-            if node.index in known:
-                continue
-            if node.op == "load":
-                value = given[int(node.args[0])][node.args[1]]
-                made[node.index] = value if isinstance(value, Node) else graph.constant(value)
-            elif node.op == "const":
-                made[node.index] = graph.constant(node.args[0])
-            elif node.op == "lookup":
-                made[node.index] = graph.lookup(node.args[0].values, made[node.args[1].index])
-            elif node.op != "table":
-                made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
-        return made

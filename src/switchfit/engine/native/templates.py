@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +23,7 @@ F, F_T, F_X, F_P, ELL, _, ELL_X = range(7)
 SLOPES = tuple(range(8))
 """Positions in the outputs of `Templates.stage`: f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p."""
 
-GRADIENT = (8, 9, 10)
-SECOND = (11,)
+COST_TO_GO = (8, 9, 10, 11)
 """Positions of the derivatives of ``w . f + hb ell``: first in t, x and p; second along (t, x, p), as one matrix."""
 
 
@@ -38,8 +36,7 @@ class Order(IntEnum):
     GAUSS_NEWTON = 3
 
 
-@dataclass(frozen=True)
-class Sizes:
+class Sizes(NamedTuple):
     """Sizes on which a program depends, in addition to the library.
 
     Attributes
@@ -96,18 +93,12 @@ class Templates:
     def model(self, constants: tuple[Any, ...]) -> Model:
         """Return the model with traced constants."""
         fixed = sum(not read for _, _, read in self.library.parameters)
-        arguments = Arguments(
-            nodes=jnp.zeros(2),
-            signals=jnp.zeros((1, 4, self.sizes.signals)),
-            fixed=tuple(constants[:fixed]),
-            initial_state=constants[-1],
-            samples=(),
-            weights=tuple(constants[fixed:-1]),
-        )
-        return Model(self.library, arguments)
+        parameters, weights, initial_state = constants[:fixed], constants[fixed:-1], constants[-1]
+        nodes, signals = jnp.zeros(2), jnp.zeros((1, 4, self.sizes.signals))
+        return Model(self.library, Arguments(nodes, signals, parameters, initial_state, (), weights))
 
     def stage(self, mode: int, running: bool = True) -> Template:
-        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `SECOND` are their positions.
+        """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `COST_TO_GO` are their positions.
 
         Without `running`, ell is zero. At order COST there are f and ell alone, with D_1 f and D_1 ell in a mode that
         takes implicit steps.
@@ -115,27 +106,23 @@ class Templates:
         n, M = self.sizes.n, self.sizes.M
 
         def stage(model: Model, t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any) -> Any:
-            piece = Piece(origin, coefficients)
-            f, ell = model.field(mode, piece), model.density(mode, piece)
-            costs = running and model.has_running_cost
-            zero = jnp.zeros(())
+            piece, zero = Piece(origin, coefficients), jnp.zeros(())
+            costs, f = running and model.has_running_cost, model.field(mode, piece)
+            ell = model.density(mode, piece) if costs else lambda t, x, p: zero
             # A simulation has no derivatives, but Newton's method for implicit steps needs D_1 f, and their error D_1
             # ell too.
             if self.order == Order.COST:
                 if not self.library.implicit[mode]:
-                    return [f(t, x, p), zero, zero, zero, ell(t, x, p) if running else zero]
-                value, ell_x = jax.value_and_grad(ell, argnums=1)(t, x, p) if costs else (zero, jnp.zeros(n))
+                    return [f(t, x, p), zero, zero, zero, ell(t, x, p)]
+                value, ell_x = jax.value_and_grad(ell, argnums=1)(t, x, p)
                 return [f(t, x, p), zero, jax.jacfwd(f, argnums=1)(t, x, p), zero, value, zero, ell_x]
             slope = (f(t, x, p), *jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p))
-            cost = (zero, zero, jnp.zeros(n), jnp.zeros(M))
-            if costs:
-                value, gradient = jax.value_and_grad(ell, argnums=(0, 1, 2))(t, x, p)
-                cost = (value, *gradient)
+            value, gradient = jax.value_and_grad(ell, argnums=(0, 1, 2))(t, x, p)
 
             # With the w_j and h b_j of a row its derivatives are mu_j, and those in t_j and p, of
             # `discretization.rows.adjoint`.
             def cost_to_go(t: Any, x: Any, p: Any) -> Any:
-                return w @ f(t, x, p) + (hb * ell(t, x, p) if costs else 0.0)
+                return w @ f(t, x, p) + hb * ell(t, x, p)
 
             def gauss_newton() -> Any:
                 second = self._no_second()
@@ -153,7 +140,7 @@ class Templates:
 
                 return second + _differentiate_twice(cost_of_state, t, x, p)
 
-            return [*slope, *cost, *self._differentiate(cost_to_go, t, x, p, gauss_newton)]
+            return [*slope, value, *gradient, *self._differentiate(cost_to_go, t, x, p, gauss_newton)]
 
         also = " or a running cost" if running and (self.library.running or self.library.references) else ""
         shapes = (), (n,), (M,), (n,), (), (), (4, self.sizes.signals)

@@ -17,27 +17,8 @@ import jax
 import numpy as np
 from jax.interpreters import partial_eval
 
-from switchfit.engine.native.arrays import (
-    OF_INTEGERS,
-    Integer,
-    Meaning,
-    Unsupported,
-    cholesky,
-    choose,
-    compare_in_order,
-    dynamic_slice,
-    dynamic_update_slice,
-    from_double,
-    gather,
-    known_number,
-    less,
-    lu,
-    scatter,
-    search,
-    sort,
-    triangular_solve,
-    within,
-)
+from switchfit.engine.native import arrays
+from switchfit.engine.native.arrays import Integer, Meaning, Unsupported, choose, known_number, less
 from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
 from switchfit.problem.jaxprs import MOVES as SELECTIONS
 from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
@@ -141,7 +122,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
-            places = search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
+            places = arrays.search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
             if places is not None:
                 return [np.asarray(places, dtype=object)]
         return _run(graph, inner, args)
@@ -179,10 +160,10 @@ def _evaluate_known(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    """Return what an operation does to entries of arrays of a type."""
-    table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, OF_INTEGERS)
+    """Return what an operation does to entries, of arrays of which the last has a type."""
+    table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, arrays.OF_INTEGERS)
     if name in table:
-        return table[name](graph, params, dtype)
+        return partial(table[name], graph, params, dtype)
     if dtype.kind in "iu" and name not in OTHER_NAMES:
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     raise Unsupported(f"calls {OTHER_NAMES.get(name, f'jax.lax.{name}')}")
@@ -236,7 +217,7 @@ def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     if known is not None:
         return _run(graph, branches[int(np.clip(known, 0, len(branches) - 1))], operands)
     results = [_run(graph, branch, operands) for branch in branches]
-    select = np.frompyfunc(partial(_select(graph), choice), len(branches), 1)
+    select = np.frompyfunc(partial(_select, graph, None, None, choice), len(branches), 1)
     return [np.asarray(select(*cases), dtype=object) for cases in zip(*results, strict=True)]
 
 
@@ -277,10 +258,6 @@ def _pad(params: Any, a: Any, value: Any) -> Any:
     return result
 
 
-def _split(params: Any, a: Any) -> Any:
-    return np.split(a, np.cumsum(params["sizes"])[:-1], axis=params["axis"])
-
-
 MOVES: dict[str, Callable[..., Any]] = {
     **{name: lambda params, a, *_, move=move: move(a, params) for name, move in SELECTIONS.items()},
     "broadcast_in_dim": _broadcast,
@@ -288,7 +265,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "pad": _pad,
     "rev": lambda params, a: np.flip(a, params["dimensions"]),
     "tile": lambda params, a: np.tile(a, params["reps"]),
-    "split": _split,
+    "split": lambda params, a: np.split(a, np.cumsum(params["sizes"])[:-1], axis=params["axis"]),
     "stack": lambda params, *a: np.stack(a, axis=params["axis"]),
     "unstack": lambda params, a: list(np.moveaxis(a, params["axis"], 0)),
     "copy": lambda params, a: a,
@@ -316,62 +293,53 @@ NUMPY: dict[str, Callable[..., Any]] = {
 # Entries of any type
 
 
-def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+def _convert(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
     kind = np.dtype(params["new_dtype"])
     if kind.kind not in "biu" and kind != np.float64:
         raise Unsupported(f"converts what depends on the state to {kind}")
     if kind.kind == dtype.kind and kind.kind in "bf":
-        return lambda a: a
-    if kind.kind == "b":
-        return lambda a: graph.apply("ne", a if dtype.kind == "f" else Integer.of(graph, a).node, 0.0)
+        return a
     if dtype.kind == "f":
-        return from_double(graph, kind)
-    if kind.kind == "f":
-        return lambda a: Integer.of(graph, a).node
-    return lambda a: within(graph, Integer.of(graph, a), kind)
+        return graph.apply("ne", a, 0.0) if kind.kind == "b" else arrays.from_double(graph, kind, a)
+    number = Integer.of(graph, a)
+    if kind.kind in "iu":
+        return arrays.within(graph, number, kind)
+    return number.node if kind.kind == "f" else graph.apply("ne", number.node, 0.0)
 
 
-def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+def _raise_to_integer(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
     exponent, multiply = int(params["y"]), _get_meaning(graph, "mul", {}, dtype)
-
-    def power(a: Any) -> Any:
-        # By squares: x^k takes about 2 log2 k products.
-        result, square, left = 1, a, abs(exponent)
-        while left:
-            if left & 1:
-                result = multiply(result, square)
-            left >>= 1
-            square = multiply(square, square) if left else square
-        return graph.apply("div", 1.0, result) if exponent < 0 else result
-
-    return power
+    # By squares: x^k takes about 2 log2 k products.
+    result, square, left = 1, a, abs(exponent)
+    while left:
+        if left & 1:
+            result = multiply(result, square)
+        left >>= 1
+        square = multiply(square, square) if left else square
+    return graph.apply("div", 1.0, result) if exponent < 0 else result
 
 
-def _select(graph: Graph, *_: Any) -> Callable[..., Any]:
+def _select(graph: Graph, params: Any, dtype: Any, which: Any, *cases: Any) -> Any:
     """Select one of several cases by a truth value or an integer."""
-
-    def select(which: Any, *cases: Any) -> Any:
-        if not isinstance(which, Node | Integer):
-            return cases[int(which)]
-        if isinstance(which, Node):
-            return choose(graph, which, cases[1], cases[0])
-        result = cases[0]
-        for k, case in enumerate(cases[1:], start=1):
-            result = choose(graph, less(graph, which, k), result, case)
-        return result
-
-    return select
+    if not isinstance(which, Node | Integer):
+        return cases[int(which)]
+    if isinstance(which, Node):
+        return choose(graph, which, cases[1], cases[0])
+    result = cases[0]
+    for k, case in enumerate(cases[1:], start=1):
+        result = choose(graph, less(graph, which, k), result, case)
+    return result
 
 
-def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any], low: Any, a: Any, high: Any) -> Any:
     smaller, larger = (_get_meaning(graph, name, {}, dtype) for name in ("min", "max"))
-    return lambda low, a, high: smaller(larger(a, low), high)
+    return smaller(larger(a, low), high)
 
 
 OF_ALL: dict[str, Meaning] = {
     "clamp": _clamp,
     "convert_element_type": _convert,
-    "integer_pow": _integer_power,
+    "integer_pow": _raise_to_integer,
     "select_n": _select,
 }
 """Operations on each entry of arrays of any type."""
@@ -381,33 +349,30 @@ OF_ALL: dict[str, Meaning] = {
 
 
 def _apply_operation(op: str) -> Meaning:
-    return lambda graph, params, dtype: partial(graph.apply, op)
+    return lambda graph, params, dtype, *entries: graph.apply(op, *entries)
 
 
-def _round(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+def _round(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
     """Round to the nearest integer; a half to the even one, or away from zero."""
     to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
-    return partial(graph.apply, "rint" if to_even else "round")
+    return graph.apply("rint" if to_even else "round", a)
 
 
-def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
-    def sign(a: Any) -> Any:
-        negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
-        return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
-
-    return sign
+def _sign(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
+    negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
+    return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
 
 
 OF_DOUBLES: dict[str, Meaning] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
-    "square": lambda graph, params, dtype: lambda a: a * a,
-    "rsqrt": lambda graph, params, dtype: lambda a: 1.0 / graph.apply("sqrt", a),
-    "logistic": lambda graph, params, dtype: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
+    "square": lambda graph, _, __, a: a * a,
+    "rsqrt": lambda graph, _, __, a: 1.0 / graph.apply("sqrt", a),
+    "logistic": lambda graph, _, __, a: 1.0 / (1.0 + graph.apply("exp", -a)),
     "sign": _sign,
     "round": _round,
-    "lt_to": lambda graph, params, dtype: partial(compare_in_order, graph, "lt"),
-    "le_to": lambda graph, params, dtype: partial(compare_in_order, graph, "le"),
-    "is_finite": lambda graph, params, dtype: lambda a: graph.apply("eq", a - a, 0.0),
+    "lt_to": lambda graph, _, __, a, b: arrays.compare_in_order(graph, "lt", a, b),
+    "le_to": lambda graph, _, __, a, b: arrays.compare_in_order(graph, "le", a, b),
+    "is_finite": lambda graph, _, __, a: graph.apply("eq", a - a, 0.0),
 }
 """Operations on each entry of arrays of doubles."""
 
@@ -415,7 +380,7 @@ OF_DOUBLES: dict[str, Meaning] = {
 # Truth values
 
 
-OF_TRUTH: dict[str, Meaning] = OF_INTEGERS | {
+OF_TRUTH: dict[str, Meaning] = arrays.OF_INTEGERS | {
     name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth
 }
 """Operations on each entry of arrays of truth values, which are compared as integers are."""
@@ -498,7 +463,7 @@ def _scatter(name: str | None) -> Callable[..., Any]:
                 return OPERATIONS[name].value(old, update)
             return choose(graph, here, _get_meaning(graph, name, {}, dtype)(old, update), old)
 
-        return scatter(graph, equation, a, indices, updates, combine)
+        return arrays.scatter(graph, equation, a, indices, updates, combine)
 
     return scatter_entries
 
@@ -506,9 +471,9 @@ def _scatter(name: str | None) -> Callable[..., Any]:
 SUMS = {"sum": "add", "prod": "mul", "max": "max", "min": "min"}
 
 INDEXED: dict[str, Callable[..., Any]] = {
-    "gather": gather,
-    "dynamic_slice": dynamic_slice,
-    "dynamic_update_slice": dynamic_update_slice,
+    "gather": arrays.gather,
+    "dynamic_slice": arrays.dynamic_slice,
+    "dynamic_update_slice": arrays.dynamic_update_slice,
     "scatter": _scatter(None),
     "scatter-add": _scatter("add"),
     "scatter-mul": _scatter("mul"),
@@ -520,10 +485,10 @@ INDEXED: dict[str, Callable[..., Any]] = {
 RULES: dict[str, Callable[..., Any]] = {
     "argmax": _find_first("ge"),
     "argmin": _find_first("le"),
-    "lu": lu,
-    "cholesky": cholesky,
-    "triangular_solve": triangular_solve,
-    "sort": sort,
+    "lu": arrays.lu,
+    "cholesky": arrays.cholesky,
+    "triangular_solve": arrays.triangular_solve,
+    "sort": arrays.sort,
     "dot_general": _dot,
     **{f"reduce_{name}": _reduce(op) for name, op in SUMS.items()},
     **{f"reduce_{name}": _reduce(name) for name in ("and", "or", "xor")},
