@@ -21,7 +21,7 @@ SOURCE = ROOT / "src" / "switchfit"
 PAPER, ROWS, IMPLICIT_ROWS = "paper_adjoint.py", "discretization/rows.py", "discretization/implicit_rows.py"
 MODEL, PROPAGATION = "discretization/model.py", "discretization/propagation.py"
 STRUCTURE, CORNERS, EVALUATOR = "problem/structure.py", "problem/corners.py", "fit/evaluator.py"
-ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
+ALGEBRA, MERIT = (f"optimize/{name}.py" for name in ("algebra", "line_search"))
 DIRECTION, POINT, QP, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "qp", "state"))
 PROGRAMS, COURSE, SPLIT = "engine/jax.py", "engine/branches.py", "engine/choice.py"
 HYPOTHESES, HYPOTHESIS_LOOPS = "engine/native/hypothesis_kernels.py", "engine/native/hypothesis_loops.py"
@@ -204,8 +204,8 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             MERIT, "return equalities.predict(normal) > FALL * point.violation", "return True"
         ),
         "the constraints in the Hessian of the Lagrangian": swap(POINT, "self.multipliers / units)", "0.0 * units)"),
-        "bounds of the normal step": swap(COMPOSITE, "if cube.holds(shortest):", "if True:"),
-        "dependent rows": swap(COMPOSITE, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),
+        "bounds of the normal step": swap(QP, "if cube.holds(shortest):", "if True:"),
+        "dependent rows": swap(QP, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),
         "curvature along the constraints alone": swap(
             STATE,
             "np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])",

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from optimizer import box, minimize, rows, solve_qp
 
-from switchfit.optimize.arrow import Arrow, ArrowFactor, ArrowLayout
-from switchfit.optimize.matrix import Dense, diagonal_scaling, null_space
+from switchfit.optimize.matrix import Arrow, ArrowFactor, ArrowLayout, Dense, diagonal_scaling, null_space
 from switchfit.optimize.qp import Room
 
 PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7, 10, 9]), np.array([8, 9])]
@@ -74,7 +73,7 @@ def test_operations_are_those_of_the_full_matrix(seed):
     vector, scaling, free = rng.normal(size=11), rng.uniform(0.1, 9.0, 11), rng.random(11) > 0.3
     labels, sides = rng.integers(0, 2, 11).astype(float), rng.integers(-1, 2, 11).astype(float)
     np.testing.assert_array_equal(arrow.dense(), full)
-    np.testing.assert_allclose(arrow @ vector, full @ vector, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(arrow.dot(vector), full @ vector, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(arrow.diagonal(), np.diag(full))
     np.testing.assert_array_equal(abs(arrow).dense(), abs(full))
     np.testing.assert_array_equal(abs(arrow).largest_in_rows(), abs(full).max(1))

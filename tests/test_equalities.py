@@ -11,8 +11,7 @@ import scipy.optimize
 from optimizer import box, free, minimize, rows
 
 from switchfit.optimize import Status
-from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
-from switchfit.optimize.qp import Room
+from switchfit.optimize.qp import Equalities, Room, find_normal_step, solve_composite
 from switchfit.problem.functions import use_float64
 
 

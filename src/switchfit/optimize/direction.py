@@ -27,12 +27,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from switchfit.optimize.algebra import MANY_BREAKPOINTS, BoolArray, FloatArray, IntArray, largest
-from switchfit.optimize.arrow import Hessian
-from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
-from switchfit.optimize.matrix import Dense
+from switchfit.optimize.matrix import Dense, Hessian
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
-from switchfit.optimize.qp import NONE, Room, is_definite
+from switchfit.optimize.qp import NONE, Equalities, Room, find_normal_step, is_definite, solve_composite
 from switchfit.optimize.state import State
 
 FIRST_RADIUS = 1.0
@@ -98,7 +96,7 @@ def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piec
     labels = np.arange(gradient.size, dtype=float) if state.careful else problem.labels
     matrix, floor, descends = hessian, state.floor, _descends(problem, hessian, free)
     if descends:
-        matrix, floor = Dense.identity(gradient.size, 1.0 / state.metric), np.zeros(gradient.size)
+        matrix, floor = Dense(np.eye(gradient.size) / state.metric), np.zeros(gradient.size)
     elif labels is not None:
         matrix = hessian.mask(labels)
     found = _minimize_model(problem, state, gradient, matrix, floor, room, free)

@@ -41,7 +41,6 @@ from switchfit.optimize.algebra import (
     mix_sides,
     optimality_allows,
 )
-from switchfit.optimize.composite import find_normal_step
 from switchfit.optimize.direction import (
     FIRST_CONSTRAINED_RADIUS,
     MAX_BACKTRACKS,
@@ -53,7 +52,7 @@ from switchfit.optimize.direction import (
 )
 from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import Trial, move
-from switchfit.optimize.qp import Room
+from switchfit.optimize.qp import Room, find_normal_step
 from switchfit.optimize.state import Accepted, Finding, State
 from switchfit.optimize.threads import one_thread
 

@@ -36,11 +36,9 @@ from switchfit.optimize.algebra import (
     norm,
     unit_rows,
 )
-from switchfit.optimize.arrow import Arrow, Hessian
-from switchfit.optimize.composite import Equalities, Rows
-from switchfit.optimize.matrix import Curvature, Dense
+from switchfit.optimize.matrix import Arrow, Curvature, Dense, Hessian
 from switchfit.optimize.problem import Problem, Trial
-from switchfit.optimize.qp import NONE, find_least_distance
+from switchfit.optimize.qp import NONE, Equalities, Rows, find_least_distance
 
 
 def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
