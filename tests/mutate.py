@@ -192,7 +192,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
     },
     "equalities": {
-        "second-order correction": swap(MERIT, "if found is not None or not first:", "if True:"),
+        "second-order correction": swap(MERIT, "or not correcting:", "or True:"),
         "the penalty is raised": swap(
             MERIT, "return penalty if penalty >= needed else RAISED * needed", "return penalty"
         ),

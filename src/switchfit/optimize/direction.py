@@ -47,6 +47,9 @@ HALF = 0.5
 """Part of the violation of equality constraints that a step may leave while coordinates are held at kinks."""
 
 
+NO_MULTIPLIERS: FloatArray = np.zeros(0)
+
+
 class Direction(NamedTuple):
     """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd).
 
@@ -61,7 +64,7 @@ class Direction(NamedTuple):
     regular: bool
     radius: float = np.inf
     descends: bool = False
-    multipliers: FloatArray | None = None
+    multipliers: FloatArray = NO_MULTIPLIERS
     left: float = 0.0
 
 
@@ -218,7 +221,7 @@ def _shrink(problem: Problem) -> float:
 def next_radius(problem: Problem, direction: Direction, decrease: float, predicted: float, noise: float) -> float:
     """Return the radius that follows an accepted step, from the actual and the predicted decrease and their error."""
     radius = direction.radius
-    if predicted <= noise:
+    if predicted <= noise or not problem.has_region:
         return radius
     ratio = decrease / predicted
     if ratio < POOR:

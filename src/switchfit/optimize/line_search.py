@@ -91,35 +91,27 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
 def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
     """Shrink the trust region until the step of the programme in it is accepted."""
     problem, point, whole, piece = oracle.problem, state.point, direction.step, None
+    constrained = bool(problem.equalities)
     for k in range(MAX_BACKTRACKS):
         crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
         state = state._replace(penalty=raise_penalty(state.penalty, point, direction))
         fraction = ARMIJO_ACROSS if crossed else ARMIJO
-        if problem.equalities:
-            accepted = _attempt_merit(oracle, state, direction, fraction, k == 0)
-        else:
-            accepted = _attempt_in_box(oracle, state, direction, fraction)
-            # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
-            if accepted is None and k == 0 and state.iteration >= PATIENCE:
-                accepted = _step_back(oracle, state, direction)
+        accepted = _attempt(oracle, state, direction, 1.0, fraction, correcting=constrained and k == 0)
+        # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
+        if accepted is None and k == 0 and state.iteration >= PATIENCE and not constrained:
+            accepted = _step_back(oracle, state, direction)
+        length = measure_in_box(problem, direction.step)
         if accepted is not None:
-            part = measure_in_box(problem, direction.step) / measure_in_box(problem, whole) if k else 1.0
-            return accepted._replace(step_length=part)
-        if problem.equalities and measure_in_box(problem, direction.step) < SMALLEST_RADIUS:
-            return None
-        if not problem.equalities and k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
+            return accepted._replace(step_length=length / measure_in_box(problem, whole) if k else 1.0)
+        if length < SMALLEST_RADIUS if constrained else _is_hopeless(state, direction, k):
             return None
         direction, piece = shrink_region(problem, state, direction, piece)
     return None
 
 
-def _attempt_in_box(oracle: Oracle, state: State, direction: Direction, fraction: float) -> Accepted | None:
-    """Return the point of a step inside the trust region that decreases J, and the next radius."""
-    accepted = _attempt(oracle, state, direction, 1.0, fraction)
-    if accepted is None:
-        return None
-    decrease, noise = state.point.cost - accepted.point.cost, NOISE * abs(state.point.cost)
-    return accepted._replace(radius=next_radius(oracle.problem, direction, decrease, direction.reduction, noise))
+def _is_hopeless(state: State, direction: Direction, k: int, alpha: float = 1.0) -> bool:
+    """Return whether the slope promises a decrease that J cannot show, after k steps that failed."""
+    return k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost)
 
 
 def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -134,8 +126,10 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     radius = min(direction.radius, measure_in_box(problem, direction.step))
     second = find_direction(problem, state._replace(point=trial, radius=radius))
     back = move(problem, trial.theta, second.step, state.scale)
-    end = _judge(oracle, state, back, -direction.slope, ARMIJO_ACROSS)  # None where it leads back to the point itself
-    return None if end is None else Accepted(end, 1.0, direction.radius)
+    first = oracle.first(back)
+    # None where it leads back to the point itself.
+    end = None if first is None else _judge(oracle, state, direction, back, first, 1.0, ARMIJO_ACROSS)
+    return None if end is None else end._replace(radius=direction.radius)
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -146,7 +140,7 @@ def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted |
         if accepted is not None:
             return accepted
         alpha *= 0.5 if k < 5 else 0.25
-        if k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost):
+        if _is_hopeless(state, direction, k, alpha):
             break
     return None
 
@@ -161,7 +155,7 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
     alpha, longer = 1.0, direction
     for k in range(MAX_HALVINGS):
         accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_DESCENT)
-        if accepted is not None or (k > 5 and -direction.slope < 0.01 * NOISE * abs(state.point.cost)):
+        if accepted is not None or _is_hopeless(state, direction, k):
             break
         alpha *= 0.5
         longer, direction = direction, find_direction(problem, state._replace(metric=alpha * state.metric))
@@ -176,31 +170,61 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
     return None if accepted is None else Accepted(accepted.point, alpha)
 
 
-def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float) -> Accepted | None:
-    """Return the point at step length alpha if it is acceptable."""
-    theta = state.point.theta
-    step = direction.step if alpha == 1.0 else alpha * direction.step
-    there = move(oracle.problem, theta, step, state.scale)
-    trial = None if there.is_at(theta) else _judge(oracle, state, there, -alpha * direction.slope, fraction)
-    return None if trial is None else Accepted(trial, alpha)
+def _attempt(
+    oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float, correcting: bool = False
+) -> Accepted | None:
+    """Return the point at step length alpha if it is acceptable, or after a second-order correction."""
+    problem, theta = oracle.problem, state.point.theta
+    # A trial is evaluated with the multipliers of its step, so that its Hessian is that of the Lagrangian there.
+    oracle.multipliers = direction.multipliers
+    there = move(problem, theta, direction.step if alpha == 1.0 else alpha * direction.step, state.scale)
+    first = None if there.is_at(theta) else oracle.first(there)
+    found = None if first is None else _judge(oracle, state, direction, there, first, alpha, fraction)
+    if first is None or found is not None or not correcting:
+        return found
+    moved = correct(oracle, there, first, state.scale)
+    # What is longer than the step that it is to correct corrects nothing.
+    length = measure_in_box(problem, there.theta - theta)
+    if moved is None or not measure_in_box(problem, moved.theta - there.theta) < length:
+        return None
+    first = oracle.first(moved)
+    return None if first is None else _judge(oracle, state, direction, moved, first, alpha, fraction)
 
 
-def _judge(oracle: Oracle, state: State, there: Trial, decrease: float, fraction: float) -> Point | None:
-    """Return the point at a trial if it is acceptable: if it achieves a fraction of the predicted linear decrease.
+def measure_merit(sample: Sample, state: State) -> float:
+    """Return the merit function, which is J where there are no equality constraints."""
+    return sample.cost + state.penalty * sample.violation
 
-    Where the predicted decrease is below the rounding error of J, comparing costs says nothing ([2]_): then a
-    smaller KKT residual counts, or a cost below every earlier one.
+
+def _judge(
+    oracle: Oracle, state: State, direction: Direction, there: Trial, first: Sample, alpha: float, fraction: float
+) -> Accepted | None:
+    """Return the point of a trial that decreases the merit function by a fraction of what is predicted.
+
+    Where the predicted decrease is below the rounding error, comparing costs says nothing ([2]_): then the residuals of
+    the optimality conditions have to fall, or a cost is below every earlier one.
     """
-    point, lowest = state.point, state.lowest_cost
-    noise = NOISE * abs(point.cost)
-    first = oracle.first(there)
-    if first is None or not cost_allows(first.cost, point.cost, lowest, decrease, noise, fraction):
+    point, penalty, constrained = state.point, state.penalty, bool(oracle.problem.equalities)
+    merit, before = measure_merit(first, state), measure_merit(point.plus, state)
+    noise = NOISE * (abs(point.cost) + penalty * point.violation)
+    # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
+    reduction = direction.reduction + penalty * (point.violation - direction.left)
+    predicted, lowest = (reduction, before) if constrained else (-alpha * direction.slope, state.lowest_cost)
+    if not cost_allows(merit, before, lowest, predicted, noise, fraction):
         return None
     trial = oracle.complete(there, first, state.scale)
     if trial is None:
         return None
-    allowed = optimality_allows(trial.optimality, point.optimality, trial.cost, lowest, decrease, noise)
-    return trial if allowed else None
+    lowest = -math.inf if constrained else lowest  # of a merit function whose penalty changes there is no lowest one
+    if not optimality_allows(_residual(state, trial), _residual(state, point), merit, lowest, predicted, noise):
+        return None
+    radius = next_radius(oracle.problem, direction, before - merit, reduction, noise)
+    return Accepted(trial, alpha, radius, penalty)
+
+
+def _residual(state: State, point: Point) -> float:
+    """Return how far a point is from the optimality conditions: relative optimality and violation."""
+    return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
 
 
 #: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [3]_, (18.36).
@@ -245,64 +269,13 @@ def is_stuck(oracle: Oracle, state: State) -> bool:
     return equalities.predict(normal) > FALL * point.violation
 
 
-def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, radius: float) -> Trial | None:
+def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray) -> Trial | None:
     """Return the trial moved by the second-order correction: the shortest step to where the constraints there lead."""
     problem = oracle.problem
-    if sample.equalities is None:
-        return None
     room = Room.around(problem.constraints, trial.slack)
-    step = find_normal_step(sample.equalities, room, problem.reach, radius)
+    step = find_normal_step(sample.equalities, room, problem.reach, np.inf)
     moved = move(problem, trial.theta, step, scale)
     return None if moved.is_at(trial.theta) else moved
-
-
-def _attempt_merit(oracle: Oracle, state: State, direction: Direction, fraction: float, first: bool) -> Accepted | None:
-    """Return the point of a step that decreases the merit function, the first one after a correction if need be."""
-    problem, theta = oracle.problem, state.point.theta
-    # The trial is evaluated with the multipliers of this step, so that its Hessian is that of the Lagrangian there.
-    if direction.multipliers is not None:
-        oracle.multipliers = direction.multipliers
-    trial = move(problem, theta, direction.step, state.scale)
-    sample = None if trial.is_at(theta) else oracle.first(trial)
-    if sample is None:
-        return None
-    found = _judge_merit(oracle, state, direction, trial, sample, fraction)
-    if found is not None or not first:
-        return found
-    moved = correct(oracle, trial, sample, state.scale, np.inf)
-    # What is longer than the step that it is to correct corrects nothing.
-    length = measure_in_box(problem, trial.theta - theta)
-    if moved is None or not measure_in_box(problem, moved.theta - trial.theta) < length:
-        return None
-    sample = oracle.first(moved)
-    return None if sample is None else _judge_merit(oracle, state, direction, moved, sample, fraction)
-
-
-def _judge_merit(
-    oracle: Oracle, state: State, direction: Direction, trial: Trial, first: Sample, fraction: float
-) -> Accepted | None:
-    """Return the point of a trial that decreases the merit function by a fraction of what is predicted.
-
-    Where the predicted decrease is below the rounding error of the merit function, the residuals of the optimality
-    conditions have to fall.
-    """
-    point, penalty = state.point, state.penalty
-    noise = NOISE * (abs(point.cost) + penalty * point.violation)
-    # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
-    reduction = direction.reduction + penalty * (point.violation - direction.left)
-    decrease = point.cost + penalty * point.violation - first.cost - penalty * first.violation
-    below_noise = reduction <= noise
-    if not (decrease >= -noise if below_noise else decrease >= fraction * reduction):
-        return None
-    there = oracle.complete(trial, first, state.scale)
-    if there is None or (below_noise and not _residual(state, there) < _residual(state, point)):
-        return None
-    return Accepted(there, 1.0, next_radius(oracle.problem, direction, decrease, reduction, noise), penalty)
-
-
-def _residual(state: State, point: Point) -> float:
-    """Return how far a point is from the optimality conditions: relative optimality and violation."""
-    return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
 
 
 def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> bool:

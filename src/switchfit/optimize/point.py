@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -161,31 +161,23 @@ MET = 1e-8
 LARGE_JUMP = 1e-6
 
 
-NO_FORCES: FloatArray = np.zeros(0)
-
-
 class Sample(NamedTuple):
     """One evaluation: cost, gradient, shape (d,), and Hessian, symmetric.
 
-    If there are equality constraints c, `violation` is ‖c‖₂ in the units of `Oracle.units`, and the Hessian is that of
-    the Lagrangian with these multipliers, shape (k,).
+    The k >= 0 equality constraints c are in the units of `Oracle.units`, `violation` is ‖c‖₂, and the Hessian is that
+    of the Lagrangian with the multipliers of the oracle.
     """
 
     cost: float
     gradient: FloatArray
     hessian: Hessian
-    equalities: Equalities | None = None
-    multipliers: FloatArray | None = None
-    violation: float = 0.0
+    equalities: Equalities
+    violation: float
 
     def lagrangian(self, multipliers: FloatArray) -> tuple[float, FloatArray]:
-        """Return ``J + lam . c`` and its gradient (d,); J and its own where there are no equality constraints."""
-        if self.equalities is None:
-            return self.cost, self.gradient
-        return (
-            self.cost + float(multipliers @ self.equalities.values),
-            self.gradient + self.equalities.jacobian.T @ multipliers,
-        )
+        """Return ``J + lam . c`` and its gradient (d,)."""
+        c, A = self.equalities
+        return self.cost + float(multipliers @ c), self.gradient + A.T @ multipliers
 
 
 @dataclass(eq=False)  # frozen, one takes five times longer to make
@@ -228,7 +220,7 @@ class Point:
     multipliers: FloatArray
     downhill: IntArray
     idle: BoolArray | None
-    forces: FloatArray = field(default_factory=lambda: NO_FORCES)
+    forces: FloatArray
     curvatures: dict[bytes, Curvature] = field(default_factory=dict)
 
     @property
@@ -286,8 +278,6 @@ class Point:
     def equalities(self, sides: IntArray) -> Equalities:
         """Return the equality constraints with their derivatives on the given sides."""
         right, left = self.plus.equalities, self.minus.equalities
-        if right is None or left is None:
-            raise ValueError("there are no equality constraints")
         return right if right is left else Equalities(right.values, mix_sides(right.jacobian, left.jacobian, sides))
 
 
@@ -314,21 +304,24 @@ class Oracle:
         d = problem.constraints.size
         self._no_side: IntArray = np.zeros(d, dtype=int)
         self._no_multipliers = np.zeros(len(problem.constraints.names))
+        self._no_equalities = Equalities(np.zeros(0), np.zeros((0, d)))
 
     def sample(self, theta: FloatArray, side: int) -> Sample | None:
         """Evaluate once; None if the cost or a derivative that is needed is not finite."""
         self.evaluations += 1
         d = theta.size
-        equalities = None
+        equalities, violation = self._no_equalities, 0.0
         if not self.problem.equalities:
             value = self.problem.evaluate(theta.copy(), side)
         else:
             units = 1.0 if self.units is None else self.units
             # c / units, lam * units inside; the caller has c and lam in its own units, with the same product.
             value = self.problem.evaluate(theta.copy(), side, self.multipliers / units)
-            equalities = self._scale(value)
-            if equalities is None:
+            c, A = np.asarray(value.constraints, dtype=float), np.asarray(value.jacobian, dtype=float)
+            if not (is_finite(c) and is_finite(A)):
                 return None
+            equalities = self._scale(c, A)
+            violation = norm(equalities.values)
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: Hessian = given if isinstance(given, Arrow) else Dense.of(given, d)
@@ -336,14 +329,10 @@ class Oracle:
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
-        violation = 0.0 if equalities is None else equalities.violation
-        return Sample(cost, gradient, hessian, equalities, self.multipliers, violation)
+        return Sample(cost, gradient, hessian, equalities, violation)
 
-    def _scale(self, value: Any) -> Equalities | None:
-        """Return the equality constraints of an evaluation in their units; None if they are not finite."""
-        c, A = np.asarray(value.constraints, dtype=float), np.asarray(value.jacobian, dtype=float)
-        if not (is_finite(c) and is_finite(A)):
-            return None
+    def _scale(self, c: FloatArray, A: FloatArray) -> Equalities:
+        """Return equality constraints in their units, which those of the first point determine."""
         if self.units is None:
             self.units = unit_rows(A * self.problem.reach)[1]
             self.multipliers = self.multipliers * self.units
@@ -355,12 +344,9 @@ class Oracle:
         A constraint that hardly depends on the unknowns at the start would else be measured by rounding: its violation
         would never count as met, and its penalty would make every step along it short.
         """
-        held = point.plus.equalities
-        if held is None or self.units is None:
+        if self.units is None:
             return False
-        rows = held.jacobian * self.problem.reach
-        if norm(rows.reshape(-1)) <= GROWN:
-            return False
+        rows = point.plus.equalities.jacobian * self.problem.reach
         lengths = np.sqrt((rows * rows).sum(1))
         grown = lengths > GROWN
         if not np.count_nonzero(grown):
@@ -399,11 +385,11 @@ class Oracle:
             if other is None:
                 return None
             minus = other
-        forces = NO_FORCES
-        if plus.equalities is not None:
+        forces = self.multipliers
+        if problem.equalities:
             optimality, values, downhill, forces = self._weigh_constraints(plus, minus, kink, side, active)
         elif active.size == 0 and plus is minus:
-            optimality, values, downhill = norm(plus.gradient), NO_FORCES, side
+            optimality, values, downhill = norm(plus.gradient), forces, side
         else:
             normals = constraints.rows(active)
             optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, normals, idle)
@@ -417,8 +403,6 @@ class Oracle:
         self, plus: Sample, minus: Sample, kink: BoolArray | None, side: IntArray, active: IntArray
     ) -> tuple[float, FloatArray, IntArray, FloatArray]:
         """Return what `steepest_descent` does, and the multipliers of equality constraints, which have either sign."""
-        if plus.equalities is None:
-            raise ValueError("there are no equality constraints")
         A, normals = plus.equalities.jacobian, self.problem.constraints.rows(active)
         count, k = len(normals), len(A)
         if plus is not minus:

@@ -447,11 +447,6 @@ class Equalities(NamedTuple):
     values: FloatArray
     jacobian: FloatArray
 
-    @property
-    def violation(self) -> float:
-        """‖c‖₂."""
-        return norm(self.values)
-
     def predict(self, step: FloatArray) -> float:
         """Return ‖c + A d‖₂ for a step d (d,)."""
         return norm(self.values + self.jacobian.dot(step))

@@ -42,9 +42,16 @@ from switchfit.optimize.algebra import (
     is_negligible,
 )
 from switchfit.optimize.direction import Direction, find_direction, measure_in_box
-from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search
+from switchfit.optimize.line_search import (
+    correct,
+    explain_failure,
+    is_below_rounding,
+    is_stuck,
+    measure_merit,
+    search,
+)
 from switchfit.optimize.matrix import Curvature, Spectrum
-from switchfit.optimize.point import MET, Oracle, Point, Sample
+from switchfit.optimize.point import MET, Oracle, Point
 from switchfit.optimize.problem import Problem, Trial, feasible_start, move, snap_to_rows
 from switchfit.optimize.state import (
     Accepted,
@@ -103,11 +110,6 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
     return None
 
 
-def _merit(sample: Sample, state: State) -> float:
-    """Return J, with the penalty of the equality constraints if there are any."""
-    return sample.cost + state.penalty * sample.violation
-
-
 def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | None:
     """Backtrack on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
     problem, point = oracle.problem, state.point
@@ -131,9 +133,9 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
         first = oracle.first(there)
         if first is not None and problem.equalities:
             # The ray is tangential to the equality constraints, which bend.
-            moved = correct(oracle, there, first, state.scale, np.inf)
+            moved = correct(oracle, there, first, state.scale)
             there, first = (there, first) if moved is None else (moved, oracle.first(moved))
-        if first is not None and _merit(first, state) < _merit(point.plus, state) - ARMIJO * decrease:
+        if first is not None and measure_merit(first, state) < measure_merit(point.plus, state) - ARMIJO * decrease:
             trial = oracle.complete(there, first, state.scale)
             if trial is not None:
                 return Accepted(trial, length)
@@ -347,6 +349,8 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = curvature_at(problem, state, point.active)
     held = () if point.kink is None else np.flatnonzero(state.genuine_kinks)
+    equalities = _list_equalities(oracle, point)
+    missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(max(len(equalities), 1))
     return Result(
         theta=point.theta,
         cost=point.cost,
@@ -362,29 +366,18 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         curvature=curvature,
         tolerance=problem.tolerance,
         history=history,
-        violated=_list_violated(oracle, point),
+        violated=tuple(equalities[k][:2] for k in np.flatnonzero(missed) if point.violation > MET),
         idle=idle_coordinates(problem, state),
         explain=state.explain,
         predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
-        equalities=_list_equalities(oracle, point),
+        equalities=equalities,
     )
-
-
-def _list_violated(oracle: Oracle, point: Point) -> tuple[tuple[str, float], ...]:
-    """Return the name and value of each equality constraint that is not met."""
-    if point.violation <= MET or point.plus.equalities is None:
-        return ()
-    missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(len(oracle.problem.equalities))
-    found = zip(_list_equalities(oracle, point), missed.tolist(), strict=True)
-    return tuple((name, value) for (name, value, _), violated in found if violated)
 
 
 def _list_equalities(oracle: Oracle, point: Point) -> tuple[tuple[str, float, float], ...]:
     """Return the name, value and multiplier of each equality constraint, in the caller's units."""
-    held = point.plus.equalities
-    if held is None or oracle.units is None:
-        return ()
-    values, multipliers = held.values * oracle.units, point.forces / oracle.units
+    units = 1.0 if oracle.units is None else oracle.units
+    values, multipliers = point.plus.equalities.values * units, point.forces / units
     return tuple(zip(oracle.problem.equalities, values.tolist(), multipliers.tolist(), strict=True))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from switchfit.optimize import algebra
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, SMALLEST_JUMP, BoolArray, FloatArray, IntArray, norm
-from switchfit.optimize.matrix import Curvature, Dense
+from switchfit.optimize.matrix import Curvature
 from switchfit.optimize.point import Point
 from switchfit.optimize.problem import Problem
 
@@ -355,11 +355,8 @@ def _curvature_on(problem: Problem, state: State, rows: IntArray) -> Curvature:
     point, constraints = state.point, problem.constraints
     hessian, flat = point.derivatives(point.reported_sides)[1], state.flatness
     held = state.genuine_kinks | ~constraints.movable
-    if problem.equalities:
-        normals = np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])
-        return Dense(hessian.dense()).curvature(normals, held, flat)
     held = held if point.idle is None else held | point.idle
-    normals = constraints.rows(rows)
+    normals = np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])
     found = hessian.curvature(normals, held, flat)
     if problem.idle is not None and problem.rows_hold(point.active):
         bounds = point.active[point.active >= constraints.b.size]
