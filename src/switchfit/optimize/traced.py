@@ -59,13 +59,9 @@ class Constraints(NamedTuple):
     upper: Array
     size: Array | float = 0.0
 
-    def slack(self, theta: Array) -> Array:
-        """Of rows, lower and upper bounds: (m + 2 d,)."""
-        return algebra.slack(self, theta, jnp)
-
     @property
     def normals(self) -> Array:
-        """Inward normals in the same order: (m + 2 d, d)."""
+        """Inward normals of rows, lower and upper bounds: (m + 2 d, d)."""
         identity = jnp.eye(self.lower.shape[0])
         return jnp.concatenate([self.A, identity, -identity])
 
@@ -392,18 +388,8 @@ def build_outcome(state: State, constraints: Constraints) -> Outcome:
     # I.
     smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(hessian / jnp.outer(scaling, scaling)))[0]
     settled = state.stationary & interior & (smallest > algebra.EIGENVALUE_FLOOR)
-    return Outcome(
-        point.theta,
-        point.cost,
-        point.right.gradient,
-        point.right.hessian,
-        point.optimality,
-        state.iterations,
-        state.evaluations,
-        settled,
-        point.left.gradient,
-        held,
-    )
+    spent = state.iterations, state.evaluations
+    return Outcome(point.theta, *point.right, point.optimality, *spent, settled, point.left.gradient, held)
 
 
 def _without(held: Array, hessian: Array) -> Array:
@@ -415,7 +401,8 @@ def _without(held: Array, hessian: Array) -> Array:
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
     """Return which constraints hold with equality up to rounding: (m + 2 d,) bool."""
     size = jnp.maximum(jnp.maximum(scale, constraints.size), jnp.abs(theta))
-    return algebra.is_active(constraints.slack(theta), size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
+    slack = algebra.slack(constraints, theta, jnp)
+    return algebra.is_active(slack, size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
 
 
 def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient: Array) -> Array:
