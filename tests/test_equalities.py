@@ -353,8 +353,7 @@ def test_composite_steps_satisfy_the_conditions_of_their_programmes(seed):
     offsets = -rng.uniform(0.0, 1.0, size=2 * d) * (rng.random(2 * d) > 0.2)
     reach, radius = 10 ** rng.uniform(-1, 1, size=d), 10 ** rng.uniform(-1, 1)
     room = Room(np.eye(d), offsets[:d], -offsets[d:])
-    found = solve_composite(g, H, Equalities(c, A), room, reach, radius)
-    step = found.step
+    step, _, _ = solve_composite(g, H, Equalities(c, A), room, reach, radius)
     assert np.all(np.abs(step) <= radius * reach * (1 + 1e-9))
     assert np.all(N @ step >= offsets - 1e-9)
     normal = find_normal_step(Equalities(c, A), room, reach, 0.95 * radius)

@@ -26,7 +26,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import MANY_BREAKPOINTS, BoolArray, FloatArray, IntArray, largest
+from switchfit.optimize import algebra
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.matrix import Dense, Hessian
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
@@ -90,44 +91,32 @@ def find_direction(problem: Problem, state: State, piece: Piece | None = None) -
 
 
 def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> Direction:
-    """Solve the quadratic programme with kinks held or confined as `sides` say."""
-    gradient, hessian = state.point.derivatives(sides)
+    """Solve the quadratic programme with kinks held or confined as `sides` say.
+
+    Its matrix B is H made positive definite where it is not, inside the room and the trust region.
+    """
+    constraints, point, d = problem.constraints, state.point, problem.constraints.size
+    gradient, hessian = point.derivatives(sides)
     room, free = _room(problem, state, sides, piece)
     if problem.equalities:
         return _solve_constrained(problem, state, sides, room, free)
     # After a failed line search each unknown is taken by itself.
-    labels = np.arange(gradient.size, dtype=float) if state.careful else problem.labels
-    matrix, floor, descends = hessian, state.floor, _descends(problem, hessian, free)
+    labels = np.arange(d, dtype=float) if state.careful else problem.labels
+    # Curvature of each unknown that counts as none.
+    floor = algebra.curvature_floor(state.scale, state.cost_scale, point.largest_slopes)
+    matrix, descends = hessian, _descends(problem, hessian, free)
     if descends:
-        matrix, floor = Dense(np.eye(gradient.size) / state.metric), np.zeros(gradient.size)
+        matrix, floor = Dense(np.eye(d) / state.metric), np.zeros(d)
     elif labels is not None:
         matrix = hessian.mask(labels)
-    found = _minimize_model(problem, state, gradient, matrix, floor, room, free)
-    return found._replace(regular=found.regular and matrix is hessian, descends=descends)
-
-
-def _minimize_model(
-    problem: Problem,
-    state: State,
-    gradient: FloatArray,
-    hessian: Hessian,
-    floor: FloatArray,
-    room: Room,
-    free: BoolArray | None,
-) -> Direction:
-    """Minimize ``gᵀd + ½ dᵀBd`` inside the room and the trust region, B being H made positive definite where it is not.
-
-    `floor` (d,) is the curvature of each unknown that counts as none.
-    """
-    constraints, point = problem.constraints, state.point
     # Expected to be active: those with a multiplier at this point.
     pressed = constraints.normals[point.multipliers > 0.0 if point.active.size else slice(0)]
-    kept, part, own, reach = hessian, NONE, gradient, problem.reach
+    kept, part, own, reach = matrix, NONE, gradient, problem.reach
     if free is not None:
         if not free.any():
-            return Direction(np.zeros(gradient.size), 0.0, 0.0, False, state.radius)
+            return Direction(np.zeros(d), 0.0, 0.0, False, state.radius, descends)
         # What is held is left out, or decoupled.
-        kept, part = hessian.keep(free)
+        kept, part = matrix.keep(free)
         own, pressed, floor = (gradient * free)[part], (pressed * free)[:, part], (floor * free)[part]
         room, reach = room.of(part, free), reach[part]
     convex: Hessian
@@ -141,11 +130,11 @@ def _minimize_model(
     step, _ = convex.solve(own, factor, room)
     curvature = float(step.dot(convex.dot(step)))
     if free is not None:
-        moved, step = step, np.zeros(gradient.size)
+        moved, step = step, np.zeros(d)
         step[part] = moved
     slope = float(gradient.dot(step))
-    regular = definite and free is None and point.is_interior
-    return Direction(step, slope, -(slope + 0.5 * curvature), regular, radius)
+    regular = definite and matrix is hessian and free is None and point.is_interior
+    return Direction(step, slope, -(slope + 0.5 * curvature), regular, radius, descends)
 
 
 def _solve_constrained(
@@ -157,15 +146,12 @@ def _solve_constrained(
     full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
     part = np.arange(gradient.size) if free is None else np.flatnonzero(free)
     own = Equalities(equalities.values, equalities.jacobian[:, part])
-    found = solve_composite(gradient[part], full[np.ix_(part, part)], own, room.of(part), problem.reach[part], radius)
-    step = np.zeros(gradient.size)
-    step[part] = found.step
-    product = full.dot(step)
+    step, (block, reach) = np.zeros(gradient.size), (full[np.ix_(part, part)], problem.reach[part])
+    step[part], multipliers, definite = solve_composite(gradient[part], block, own, room.of(part), reach, radius)
     slope = float(gradient.dot(step))
-    reduction = -(slope + 0.5 * float(step.dot(product)))
-    left = equalities.predict(step)
-    regular = found.definite and free is None and state.point.is_interior and not state.careful
-    return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left)
+    reduction = -(slope + 0.5 * float(step.dot(full.dot(step))))
+    regular = definite and free is None and state.point.is_interior and not state.careful
+    return Direction(step, slope, reduction, regular, radius, False, multipliers, equalities.predict(step))
 
 
 def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> tuple[Room, BoolArray | None]:
@@ -211,7 +197,7 @@ MAX_BACKTRACKS = 60
 
 def measure_in_box(problem: Problem, step: FloatArray) -> float:
     """Return the radius of the smallest box that holds a step (d,)."""
-    return largest(np.abs(step) / problem.reach)
+    return algebra.largest(np.abs(step) / problem.reach)
 
 
 def _shrink(problem: Problem) -> float:
@@ -238,7 +224,7 @@ def shrink_region(
     A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
     """
     theta, radius = state.point.theta, direction.radius
-    if piece is None and 0 < problem.breakpoints.count_crossed(theta, direction.step) < MANY_BREAKPOINTS:
+    if piece is None and 0 < problem.breakpoints.count_crossed(theta, direction.step) < algebra.MANY_BREAKPOINTS:
         piece = problem.breakpoints.piece(theta, problem.constraints)
     else:
         radius = _shrink(problem) * measure_in_box(problem, direction.step)

@@ -29,18 +29,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import (
-    ARMIJO,
-    ARMIJO_ACROSS,
-    ARMIJO_DESCENT,
-    MANY_BREAKPOINTS,
-    NOISE,
-    FloatArray,
-    IntArray,
-    cost_allows,
-    mix_sides,
-    optimality_allows,
-)
+from switchfit.optimize import algebra
+from switchfit.optimize.algebra import FloatArray, IntArray
 from switchfit.optimize.direction import (
     FIRST_CONSTRAINED_RADIUS,
     MAX_BACKTRACKS,
@@ -77,12 +67,12 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
     # Across breakpoints the slope at theta says little: a larger part of the decrease is asked for, until few are
     # crossed.
     while crossed > 0:
-        accepted = _attempt(oracle, state, direction, alpha, ARMIJO_ACROSS)
+        accepted = _attempt(oracle, state, direction, alpha, algebra.ARMIJO_ACROSS)
         if accepted is not None:
             return accepted
         alpha *= 0.5
         crossed = problem.breakpoints.count_crossed(theta, alpha * direction.step)
-        if crossed < MANY_BREAKPOINTS:
+        if crossed < algebra.MANY_BREAKPOINTS:
             direction = find_direction(problem, state, problem.breakpoints.piece(theta, problem.constraints))
             break
     return _backtrack(oracle, state, direction)
@@ -95,7 +85,7 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
     for k in range(MAX_BACKTRACKS):
         crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
         state = state._replace(penalty=raise_penalty(state.penalty, point, direction))
-        fraction = ARMIJO_ACROSS if crossed else ARMIJO
+        fraction = algebra.ARMIJO_ACROSS if crossed else algebra.ARMIJO
         accepted = _attempt(oracle, state, direction, 1.0, fraction, correcting=constrained and k == 0)
         # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
         if accepted is None and k == 0 and state.iteration >= PATIENCE and not constrained:
@@ -111,7 +101,7 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
 
 def _is_hopeless(state: State, direction: Direction, k: int, alpha: float = 1.0) -> bool:
     """Return whether the slope promises a decrease that J cannot show, after k steps that failed."""
-    return k > 5 and alpha * -direction.slope < 0.01 * NOISE * abs(state.point.cost)
+    return k > 5 and alpha * -direction.slope < 0.01 * algebra.NOISE * abs(state.point.cost)
 
 
 def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -128,7 +118,7 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     back = move(problem, trial.theta, second.step, state.scale)
     first = oracle.first(back)
     # None where it leads back to the point itself.
-    end = None if first is None else _judge(oracle, state, direction, back, first, 1.0, ARMIJO_ACROSS)
+    end = None if first is None else _judge(oracle, state, direction, back, first, 1.0, algebra.ARMIJO_ACROSS)
     return None if end is None else end._replace(radius=direction.radius)
 
 
@@ -136,7 +126,7 @@ def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     """Backtrack from the full step by Armijo's rule ([1]_, algorithm 3.1)."""
     alpha = 1.0
     for k in range(MAX_BACKTRACKS):
-        accepted = _attempt(oracle, state, direction, alpha, ARMIJO)
+        accepted = _attempt(oracle, state, direction, alpha, algebra.ARMIJO)
         if accepted is not None:
             return accepted
         alpha *= 0.5 if k < 5 else 0.25
@@ -154,17 +144,17 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
     problem, theta = oracle.problem, state.point.theta
     alpha, longer = 1.0, direction
     for k in range(MAX_HALVINGS):
-        accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_DESCENT)
+        accepted = _attempt(oracle, state, direction, 1.0, algebra.ARMIJO_DESCENT)
         if accepted is not None or _is_hopeless(state, direction, k):
             break
         alpha *= 0.5
         longer, direction = direction, find_direction(problem, state._replace(metric=alpha * state.metric))
     crossed = 0 if longer is direction else problem.breakpoints.count_crossed(theta, longer.step)
-    if accepted is None or 0 < crossed < MANY_BREAKPOINTS:
+    if accepted is None or 0 < crossed < algebra.MANY_BREAKPOINTS:
         piece = problem.breakpoints.piece(theta, problem.constraints)
         length = 1.0 if accepted is None else 2.0 * alpha
         nearer = find_direction(problem, state._replace(metric=length * state.metric), piece)
-        stop = _attempt(oracle, state, nearer, 1.0, ARMIJO_ACROSS)
+        stop = _attempt(oracle, state, nearer, 1.0, algebra.ARMIJO_ACROSS)
         if stop is not None and (accepted is None or stop.point.jumps):
             return Accepted(stop.point, alpha)
     return None if accepted is None else Accepted(accepted.point, alpha)
@@ -206,17 +196,17 @@ def _judge(
     """
     point, penalty, constrained = state.point, state.penalty, bool(oracle.problem.equalities)
     merit, before = measure_merit(first, state), measure_merit(point.plus, state)
-    noise = NOISE * (abs(point.cost) + penalty * point.violation)
+    noise = algebra.NOISE * (abs(point.cost) + penalty * point.violation)
     # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
     reduction = direction.reduction + penalty * (point.violation - direction.left)
     predicted, lowest = (reduction, before) if constrained else (-alpha * direction.slope, state.lowest_cost)
-    if not cost_allows(merit, before, lowest, predicted, noise, fraction):
+    if not algebra.cost_allows(merit, before, lowest, predicted, noise, fraction):
         return None
     trial = oracle.complete(there, first, state.scale)
     if trial is None:
         return None
     lowest = -math.inf if constrained else lowest  # of a merit function whose penalty changes there is no lowest one
-    if not optimality_allows(_residual(state, trial), _residual(state, point), merit, lowest, predicted, noise):
+    if not algebra.optimality_allows(_residual(state, trial), _residual(state, point), merit, lowest, predicted, noise):
         return None
     radius = next_radius(oracle.problem, direction, before - merit, reduction, noise)
     return Accepted(trial, alpha, radius, penalty)
@@ -284,7 +274,7 @@ def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> boo
     This error is a part of J or, where J is a small difference of large terms, as at a perfect fit, more. The largest J
     seen is a bound on it, which says little where the start was far away: between the two the error is measured.
     """
-    smallest, largest = 10 * NOISE * abs(state.point.cost), 10 * NOISE * state.cost_scale
+    smallest, largest = 10 * algebra.NOISE * abs(state.point.cost), 10 * algebra.NOISE * state.cost_scale
     if not smallest < direction.reduction <= largest:
         return direction.reduction <= smallest
     return direction.reduction <= 10 * _measure_noise(oracle, state, direction.step)
@@ -333,7 +323,7 @@ class _Line(NamedTuple):
         """Its begin, on the sides of kinks to which the step leads; it is not evaluated again."""
         point = self.state.point
         cost, right = point.plus.lagrangian(point.forces)
-        gradient = mix_sides(right, point.minus.lagrangian(point.forces)[1], self.step)
+        gradient = algebra.mix_sides(right, point.minus.lagrangian(point.forces)[1], self.step)
         return _Place(0.0, point.theta, cost, float(gradient @ self.step), gradient)
 
     def see(self, fraction: float) -> _Place:
@@ -372,7 +362,7 @@ NAMED = 4
 @one_thread()
 def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Finding:
     """Find out why no fraction of a step decreases J although its slope is negative."""
-    step, noise = direction.step, NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
+    step, noise = direction.step, algebra.NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
     line = _Line(oracle, state, step, noise)
     begin = line.begin
     if not begin.slope < 0.0:
@@ -440,8 +430,10 @@ def _contradict_slope(line: _Line) -> float | None:
     They have to contradict the slopes farther on as well: at a kink within the shortest difference they do not.
     """
     begin, values, errors, farther = line.begin, [], [], []
-    # J is smooth, if it is what it is said to be, up to the next breakpoint.
-    smooth = min(line.oracle.problem.breakpoints.next_on(begin.theta, line.step), 1.0)
+    # J is smooth, if it is what it is said to be, up to the next breakpoint or bound.
+    low, high = line.oracle.problem.breakpoints.piece(begin.theta, line.oracle.problem.constraints)
+    ends = np.where(line.step > 0.0, high, low) - begin.theta
+    smooth = np.min(ends / line.step, where=ends * line.step > 0.0, initial=1.0)
     for length in LENGTHS * smooth:
         half, full = line.see(0.5 * length), line.see(length)
         if max(half.cost, full.cost) < np.inf:

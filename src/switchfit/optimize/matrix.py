@@ -29,22 +29,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import (
-    EIGENVALUE_FLOOR,
-    EQUILIBRATED,
-    EQUILIBRATIONS,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    equilibrate,
-    is_finite,
-    jacobi_scaling,
-    mix_sides,
-    norm,
-    positive_eigenvalues,
-    smallest,
-    unit_rows,
-)
+from switchfit.optimize import algebra
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.qp import (
     CholeskyFactor,
     Room,
@@ -128,7 +114,7 @@ class SymmetricMatrix:
     @property
     def finite(self) -> bool:
         """Whether all entries are."""
-        return all(map(is_finite, self.parts))
+        return all(map(algebra.is_finite, self.parts))
 
     def __abs__(self) -> Self:
         return self.with_parts(*map(np.abs, self.parts))
@@ -144,7 +130,7 @@ class SymmetricMatrix:
     def mix_sides(self, minus: SymmetricMatrix, sides: FloatArray) -> Self:
         """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
         pairs = zip(self.parts, minus.parts, self.pairs(sides), strict=True)
-        return self.with_parts(*(mix_sides(right, left, a + b) for right, left, (a, b) in pairs))
+        return self.with_parts(*(algebra.mix_sides(right, left, a + b) for right, left, (a, b) in pairs))
 
 
 def diagonal_scaling(matrix: Dense | Arrow, floor: FloatArray | float = 0.0) -> FloatArray:
@@ -162,13 +148,13 @@ def diagonal_scaling(matrix: Dense | Arrow, floor: FloatArray | float = 0.0) -> 
         Diagonal entries too small to matter, below which D² does not go.
     """
     size = abs(matrix)
-    scaling: FloatArray = jacobi_scaling(np.maximum(size.diagonal(), floor), size.largest_in_rows())
+    scaling: FloatArray = algebra.jacobi_scaling(np.maximum(size.diagonal(), floor), size.largest_in_rows())
     # |H_ij| <= sqrt(H_ii H_jj) for a semi-definite H: Jacobi's scaling passes at once. Only an indefinite one goes on.
-    for _ in range(EQUILIBRATIONS):
+    for _ in range(algebra.EQUILIBRATIONS):
         largest = size.scale(scaling).largest_in_rows()
-        if (largest <= EQUILIBRATED).all():
+        if (largest <= algebra.EQUILIBRATED).all():
             break
-        scaling = equilibrate(scaling, largest)
+        scaling = algebra.equilibrate(scaling, largest)
     return scaling
 
 
@@ -254,7 +240,7 @@ class Dense(SymmetricMatrix):
         """
         # The usual case: a Cholesky factorization of the scaled H less the floor shows that H is definite.
         square = np.maximum(self.diagonal(), floor)
-        if smallest(square) > 0.0:
+        if algebra.smallest(square) > 0.0:
             # A positive definite matrix needs no more than Jacobi's scaling.
             scaling = np.sqrt(square)
             scaled = self.array / (scaling[:, None] * scaling)
@@ -447,7 +433,7 @@ class Arrow(SymmetricMatrix):
         layout, scaling = self.layout, diagonal_scaling(self, floor)
         scaled = self.scale(scaling)
         # N'N, with the rows of the scaled unknowns.
-        rows = unit_rows(normals / scaling)[0]
+        rows = algebra.unit_rows(normals / scaling)[0]
         own, shared = np.append(rows, np.zeros((len(rows), 1)), axis=1)[:, layout.own], rows[:, layout.shared]
         across = Arrow(
             layout, np.einsum("rek,rel->ekl", own, own), np.einsum("rek,rs->eks", own, shared), shared.T @ shared
@@ -455,12 +441,12 @@ class Arrow(SymmetricMatrix):
         for stiffness in (0.0, *STIFFENINGS) if len(normals) else (0.0,):
             pairs = zip(scaled.parts, across.parts, strict=True)
             stiff = scaled.with_parts(*(part + stiffness * other for part, other in pairs))
-            if ArrowFactor.of(stiff.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
+            if ArrowFactor.of(stiff.plus_diagonal(-algebra.EIGENVALUE_FLOOR)) is not None:
                 convex = stiff.scale(1.0 / scaling) if stiffness else self
                 break
         else:
             convex = _replace_eigenvalues(scaled).scale(1.0 / scaling)
-        factor, ridge = ArrowFactor.of(convex), EIGENVALUE_FLOOR
+        factor, ridge = ArrowFactor.of(convex), algebra.EIGENVALUE_FLOOR
         while factor is None:  # rounding, where a block is nearly singular
             convex, ridge = convex.plus_diagonal(ridge * scaling**2), 10.0 * ridge
             factor = ArrowFactor.of(convex)
@@ -583,10 +569,10 @@ def _replace_eigenvalues(scaled: Arrow) -> Arrow:
     # (v' G)^2 / lam is what an eigenvalue lam takes from the diagonal of the Schur complement, which is 1 at most after
     # scaling: with lam >= 2 sum_s (v' G_s)^2 one eigenvalue takes half of it at most.
     coupling = (np.swapaxes(vectors, 1, 2) @ scaled.borders) ** 2
-    changed = np.maximum(positive_eigenvalues(values), 2.0 * coupling.sum(2))
-    changed = np.where(values > EIGENVALUE_FLOOR, values, changed)
+    changed = np.maximum(algebra.positive_eigenvalues(values), 2.0 * coupling.sum(2))
+    changed = np.where(values > algebra.EIGENVALUE_FLOOR, values, changed)
     # Blocks that are positive definite stay as they are, to the last bit.
-    indefinite = values[:, 0] <= EIGENVALUE_FLOOR
+    indefinite = values[:, 0] <= algebra.EIGENVALUE_FLOOR
     blocks = np.where(indefinite[:, None, None], _compose(changed, vectors), scaled.blocks)
     tie = np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(blocks, scaled.borders))
     # B has the borders of H: its Schur complement C - sum_e G_e' B_e^-1 G_e is convex with the tie added to the corner.
@@ -607,17 +593,17 @@ def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatAr
     vector = np.where(free, np.random.default_rng(0).normal(size=free.size), 0.0)
     value = np.inf
     for _ in range(1000):
-        vector = np.where(free, factor.solve(vector / norm(vector)), 0.0)
-        before, value = value, 1.0 / norm(vector)
+        vector = np.where(free, factor.solve(vector / algebra.norm(vector)), 0.0)
+        before, value = value, 1.0 / algebra.norm(vector)
         if abs(value - before) <= 1e-8 * value:
             break
-    return value, vector / norm(vector)
+    return value, vector / algebra.norm(vector)
 
 
 def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals: FloatArray) -> Spectrum:
     """Return the eigenvalues of a matrix (d, d) in the null space of normals (k, f) of the free unknowns (f,)."""
     lowest = np.zeros(len(array))
-    if not is_finite(array):
+    if not algebra.is_finite(array):
         return Spectrum(np.array([np.nan]), lowest)
     block = array[np.ix_(free, free)]
     scaling = diagonal_scaling(Dense(block), flat[free])
@@ -627,27 +613,27 @@ def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals:
         return Spectrum(np.zeros(0), lowest)
     values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
     lowest[free] = null @ vectors[:, 0] / scaling
-    return Spectrum(values, lowest / norm(lowest))
+    return Spectrum(values, lowest / algebra.norm(lowest))
 
 
 def null_space(normals: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
     if normals.size == 0:
         return np.eye(normals.shape[1])
-    _, sizes, right = np.linalg.svd(unit_rows(normals)[0])
+    _, sizes, right = np.linalg.svd(algebra.unit_rows(normals)[0])
     return np.asarray(right[np.count_nonzero(sizes > 1e-11) :].T)
 
 
 def _has_curvature(scaled: FloatArray) -> bool:
     """Return whether all eigenvalues of a scaled matrix are above `EIGENVALUE_FLOOR`."""
-    return is_definite(add_to_diagonal(scaled, -EIGENVALUE_FLOOR))
+    return is_definite(add_to_diagonal(scaled, -algebra.EIGENVALUE_FLOOR))
 
 
 def _convex_on_face(
     scaled: FloatArray, normals: FloatArray, make_definite: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
     """Return a positive definite matrix that differs from a scaled one across the normals alone if that is enough."""
-    across = unit_rows(normals)[0]
+    across = algebra.unit_rows(normals)[0]
     across = across.T @ across
     # H + sigma N'N is H on the face, and positive definite for a large sigma if and only if H is there ([1]_, 17.4).
     for stiffness in STIFFENINGS if len(normals) else ():
@@ -660,7 +646,7 @@ def _convex_on_face(
 def make_absolute(matrix: FloatArray) -> FloatArray:
     """Return a symmetric matrix (d, d) with eigenvalues that are not positive replaced by absolute values."""
     values, vectors = np.linalg.eigh(matrix)
-    return _compose(positive_eigenvalues(values), vectors)
+    return _compose(algebra.positive_eigenvalues(values), vectors)
 
 
 def _compose(values: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -18,24 +18,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    choose_sides,
-    is_finite,
-    largest,
-    mix_sides,
-    norm,
-    unit_rows,
-)
+from switchfit.optimize import algebra
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.matrix import Arrow, Curvature, Dense, Hessian
 from switchfit.optimize.problem import Problem, Trial
 from switchfit.optimize.qp import NONE, Equalities, Rows, find_least_distance
@@ -66,14 +57,14 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
         return 0.0, np.zeros(normals.shape[0])
     # The steepest descent v = N' lam - g minimizes g v + v² / 2 subject to N v >= 0. At kinks, where g v is
     # max(low v, high v), it has two parts, v = v₊ - v₋: of both being positive the cost is larger than of one.
-    unit, lengths = unit_rows(normals)
+    unit, lengths = algebra.unit_rows(normals)
     low, high, slope, rows = low / size, high / size, high / size, unit
     if (low < high).any():
         slope, rows = np.concatenate([high, -low]), np.vstack([np.hstack([unit, -unit]), np.eye(2 * low.size)])
     found = find_least_distance(slope, rows, np.zeros(len(rows)), np.full(len(rows), np.inf))
     multipliers = np.zeros(len(unit)) if found is None else np.maximum(found[1][: len(unit)], 0.0)
     pull = unit.T @ multipliers
-    return size * norm(np.clip(pull, low, high) - pull), size * multipliers / lengths
+    return size * algebra.norm(np.clip(pull, low, high) - pull), size * multipliers / lengths
 
 
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.
@@ -86,7 +77,6 @@ def steepest_descent(
     kink: BoolArray | None,
     side: IntArray,
     normals: FloatArray,
-    idle: BoolArray | None,
 ) -> tuple[float, FloatArray, IntArray]:
     """Return the steepest descent over feasible directions of length one, its multipliers, and each coordinate's side.
 
@@ -104,8 +94,6 @@ def steepest_descent(
         The only side there is of other coordinates on a breakpoint, 0 elsewhere.
     normals : array, shape (k, d)
         Of the active constraints.
-    idle : array of bool, shape (d,), or None
-        Coordinates that do not move.
 
     Returns
     -------
@@ -113,13 +101,10 @@ def steepest_descent(
     multipliers : array, shape (k,)
     sides : array of int, shape (d,)
     """
-    smooth = left is right
-    if idle is not None:
-        left, right, normals = left * ~idle, right * ~idle, normals * ~idle
-    if smooth:
+    if left is right:
         return *kkt_residual(right, right, normals), side
     kink = np.zeros(left.size, dtype=bool) if kink is None else kink
-    alone = choose_sides(left, right)
+    alone = algebra.choose_sides(left, right)
     convex = kink & (left < right)
     best, force, rounding = -np.inf, np.inf, 1e-12 * float(np.abs(left).sum() + np.abs(right).sum())
     for sides in _choices(np.where(kink, alone, side), kink & (left > right), normals):
@@ -251,7 +236,7 @@ class Point:
     @property
     def largest_derivative(self) -> float:
         """Largest one-sided derivative of all unknowns, in size."""
-        return largest(self.largest_slopes)
+        return algebra.largest(self.largest_slopes)
 
     @property
     def largest_slopes(self) -> FloatArray:
@@ -272,13 +257,13 @@ class Point:
         plus, minus = self.plus, self.minus
         if plus is minus:
             return plus.gradient, plus.hessian
-        gradient = mix_sides(plus.gradient, minus.gradient, sides)
+        gradient = algebra.mix_sides(plus.gradient, minus.gradient, sides)
         return gradient, plus.hessian.mix_sides(minus.hessian, sides.astype(float))
 
     def equalities(self, sides: IntArray) -> Equalities:
         """Return the equality constraints with their derivatives on the given sides."""
-        right, left = self.plus.equalities, self.minus.equalities
-        return right if right is left else Equalities(right.values, mix_sides(right.jacobian, left.jacobian, sides))
+        (c, right), left = self.plus.equalities, self.minus.equalities.jacobian
+        return self.plus.equalities if right is left else Equalities(c, algebra.mix_sides(right, left, sides))
 
 
 class Oracle:
@@ -318,14 +303,14 @@ class Oracle:
             # c / units, lam * units inside; the caller has c and lam in its own units, with the same product.
             value = self.problem.evaluate(theta.copy(), side, self.multipliers / units)
             c, A = np.asarray(value.constraints, dtype=float), np.asarray(value.jacobian, dtype=float)
-            if not (is_finite(c) and is_finite(A)):
+            if not (algebra.is_finite(c) and algebra.is_finite(A)):
                 return None
             equalities = self._scale(c, A)
-            violation = norm(equalities.values)
+            violation = algebra.norm(equalities.values)
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: Hessian = given if isinstance(given, Arrow) else Dense.of(given, d)
-        if not (math.isfinite(cost) and is_finite(gradient)):
+        if not (math.isfinite(cost) and algebra.is_finite(gradient)):
             return None
         if self.problem.uses_hessian and not hessian.finite:
             return None
@@ -334,7 +319,7 @@ class Oracle:
     def _scale(self, c: FloatArray, A: FloatArray) -> Equalities:
         """Return equality constraints in their units, which those of the first point determine."""
         if self.units is None:
-            self.units = unit_rows(A * self.problem.reach)[1]
+            self.units = algebra.unit_rows(A * self.problem.reach)[1]
             self.multipliers = self.multipliers * self.units
         return Equalities(c / self.units, A / self.units[:, None])
 
@@ -389,10 +374,12 @@ class Oracle:
         if problem.equalities:
             optimality, values, downhill, forces = self._weigh_constraints(plus, minus, kink, side, active)
         elif active.size == 0 and plus is minus:
-            optimality, values, downhill = norm(plus.gradient), forces, side
+            optimality, values, downhill = algebra.norm(plus.gradient), forces, side
         else:
-            normals = constraints.rows(active)
-            optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, normals, idle)
+            movable = np.ones(theta.size) if idle is None else ~idle
+            right, normals = plus.gradient * movable, constraints.normals[active] * movable
+            left = right if minus is plus else minus.gradient * movable
+            optimality, values, downhill = steepest_descent(left, right, kink, side, normals)
         multipliers = self._no_multipliers
         if active.size:
             multipliers = multipliers.copy()
@@ -403,12 +390,12 @@ class Oracle:
         self, plus: Sample, minus: Sample, kink: BoolArray | None, side: IntArray, active: IntArray
     ) -> tuple[float, FloatArray, IntArray, FloatArray]:
         """Return what `steepest_descent` does, and the multipliers of equality constraints, which have either sign."""
-        A, normals = plus.equalities.jacobian, self.problem.constraints.rows(active)
+        A, normals = plus.equalities.jacobian, self.problem.constraints.normals[active]
         count, k = len(normals), len(A)
         if plus is not minus:
             # Equality constraints as two inequalities each, whose multipliers of opposite sign are one.
             stacked = np.vstack([normals, A, -A])
-            optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)
+            optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked)
             return optimality, values[:count], downhill, values[count + k :] - values[count : count + k]
         # The distance from the cone of the inequalities and the span of A is one within the null space of A.
         rows = Rows.of(A)
@@ -420,15 +407,6 @@ class Oracle:
         """Return the point at a trial, evaluated; None if J is not finite there."""
         first = self.first(trial)
         return None if first is None else self.complete(trial, first, scale)
-
-    def with_own_multipliers(self, point: Point) -> Point | None:
-        """Return a point with the Hessian of the Lagrangian at its own multipliers; None if that is not finite."""
-        self.multipliers = point.forces
-        only_left = point.plus is point.minus and (point.side < 0).any()
-        plus = minus = self.sample(point.theta, -1 if only_left else 1)
-        if point.plus is not point.minus:
-            minus = self.sample(point.theta, -1)
-        return None if plus is None or minus is None else replace(point, plus=plus, minus=minus, curvatures={})
 
     def _idle(self, theta: FloatArray, active: IntArray) -> BoolArray | None:
         """Return the coordinates on which J does not depend while the active rows stay active: (d,) bool, or None."""

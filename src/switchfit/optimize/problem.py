@@ -94,19 +94,9 @@ class Problem:
         return np.asarray(self.constraints.sizes[0] @ self.size)
 
     @cached_property
-    def row_rounding(self) -> FloatArray:
-        """Rounding error of the rows: (m,)."""
-        return np.asarray(16 * EPS * self.row_size)
-
-    @cached_property
     def largest_size(self) -> float:
         """The largest typical size of a coordinate."""
         return float(self.size.max())
-
-    @cached_property
-    def rounding(self) -> FloatArray:
-        """Rounding error of each coordinate at its typical size: (d,)."""
-        return np.asarray(8 * EPS * self.size)
 
     @property
     def has_box(self) -> bool:
@@ -190,23 +180,12 @@ class Breakpoints:
                 high[i] = min(high[i], points[above])
         return low, high
 
-    def next_on(self, theta: FloatArray, step: FloatArray) -> float:
-        """Return the fraction of a step (d,) up to the first breakpoint that a coordinate meets, or infinity."""
-        fractions = [_next(points, float(theta[i]), float(step[i])) for i, points in self.of_coordinates]
-        return min(fractions, default=np.inf)
-
 
 def _nearest(points: list[float], x: float) -> float:
     above = bisect_left(points, x)
     if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
         above -= 1
     return points[above]
-
-
-def _next(points: list[float], x: float, step: float) -> float:
-    """Return the fraction of a step of one coordinate up to the next breakpoint; infinite if it meets none."""
-    k = bisect_right(points, x) if step > 0.0 else bisect_left(points, x) - 1
-    return (points[k] - x) / step if step != 0.0 and 0 <= k < len(points) else np.inf
 
 
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
@@ -217,10 +196,8 @@ def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
         return start
     slack = constraints.slack(theta)
     if (slack < 0.0).any():
-        bounds = np.abs(np.concatenate([constraints.lower, constraints.upper]))
-        A, b = constraints.sizes
-        rows = b + A @ np.maximum(np.abs(theta), problem.size)
-        size = np.concatenate([rows, np.where(np.isfinite(bounds), bounds, 0.0)])
+        (A, b), size = constraints.sizes, np.maximum(np.abs(theta), problem.size)
+        size = np.concatenate([b + A @ size, size, size])
         violated = np.flatnonzero(slack < -1e-12 * (size + np.finfo(float).tiny))
         if violated.size:
             worst = [f"{constraints.names[i]} (by {-slack[i]:.3g})" for i in violated[:5]]
@@ -265,9 +242,9 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
         return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
-    near = np.maximum((8 * EPS) * ((step != 0.0) * reach), problem.rounding)
+    near = 8 * EPS * np.maximum((step != 0.0) * reach, problem.size)
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
-    if (constraints.A @ moved - constraints.b > problem.row_rounding).all():
+    if (constraints.A @ moved - constraints.b > 16 * EPS * problem.row_size).all():
         return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True

@@ -42,17 +42,7 @@ import daqp
 import numpy as np
 
 from switchfit.optimize import algebra, lapack
-from switchfit.optimize.algebra import (
-    EIGENVALUE_FLOOR,
-    EIGENVALUE_REPLACEMENT,
-    EPS,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    largest,
-    norm,
-    smallest,
-)
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 
 NONE = np.zeros(0, dtype=np.intp)
 """No places."""
@@ -126,10 +116,6 @@ class LinearConstraints:
                 found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
         return found
 
-    def rows(self, index: IntArray) -> FloatArray:
-        """Return the normals at the given places, shape (k, d)."""
-        return self.normals[index]
-
     def slack(self, theta: FloatArray) -> FloatArray:
         """Return how far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
         return np.asarray(algebra.slack(self, theta))
@@ -160,7 +146,7 @@ class LinearConstraints:
             Of the largest unknown; rounding is a part of it.
         """
         A, b = self._largest_sizes
-        return smallest(slack) > 32 * EPS * (b + max(A, 1.0) * size)
+        return algebra.smallest(slack) > 32 * algebra.EPS * (b + max(A, 1.0) * size)
 
     def active(self, slack: FloatArray, size: FloatArray) -> IntArray:
         """Return the places, ascending, of the constraints that hold with equality up to rounding.
@@ -236,7 +222,7 @@ def nearest_feasible(constraints: LinearConstraints, theta: FloatArray, size: Fl
     rows, lengths = algebra.unit_rows(constraints.A * size)
     lower = np.concatenate([(constraints.lower - theta) / size, (constraints.b - constraints.A @ theta) / lengths])
     upper = np.concatenate([(constraints.upper - theta) / size, constraints.open])
-    violation = max(largest(lower), -smallest(upper))
+    violation = max(algebra.largest(lower), -algebra.smallest(upper))
     normals = np.concatenate([np.eye(theta.size), rows])
     found = find_least_distance(np.zeros(theta.size), normals, lower / violation, upper / violation)
     if found is None:
@@ -299,8 +285,8 @@ class Room(NamedTuple):
 
     def move_inside(self, step: FloatArray) -> FloatArray:
         """Return the step (d,) inside that is nearest to one: itself, unless it leaves by more than `OUTSIDE`."""
-        products, size = self.normals.dot(step), largest(np.abs(step))
-        if max(largest(self.lower - products), largest(products - self.upper)) <= OUTSIDE * size:
+        products, size = self.normals.dot(step), algebra.largest(np.abs(step))
+        if max(algebra.largest(self.lower - products), algebra.largest(products - self.upper)) <= OUTSIDE * size:
             return step
         rows, lengths = algebra.unit_rows(self.normals)
         low, high = (self.lower - products) / (size * lengths), (self.upper - products) / (size * lengths)
@@ -330,14 +316,14 @@ def solve_programme(
         return newton, np.zeros(len(room.lower))
     # In white variables, d = length D⁻¹ L⁻ᵀ e, nothing has a scale any more.
     target = factor.whiten(gradient)
-    length = norm(target)
+    length = algebra.norm(target)
     rows, lengths = algebra.unit_rows(factor.whiten(room.normals))
     lower, upper = room.lower / (length * lengths), room.upper / (length * lengths)
     found = find_least_distance(target / length, rows, lower, upper)
     if found is None:  # the zero step is feasible; a search along it ends at once
         return np.zeros(gradient.size), np.zeros(lower.size)
     e, pull = found
-    if norm(e) < SHORT:
+    if algebra.norm(e) < SHORT:
         # One step of refinement, with a residual that is computed with B itself: the same programme for the error, with
         # what is active now.
         active = pull != 0.0
@@ -369,7 +355,7 @@ class CholeskyFactor(NamedTuple):
     def of(cls, matrix: FloatArray) -> CholeskyFactor:
         """Return the factorization of a matrix (d, d); ValueError if it is not positive definite."""
         variances = matrix.diagonal()
-        if smallest(variances) > 0.0:
+        if algebra.smallest(variances) > 0.0:
             diagonal = np.sqrt(variances)
             found = cls.of_scaled(matrix / (diagonal[:, None] * diagonal), diagonal)
             if found is not None:
@@ -418,10 +404,10 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
         return symmetric, True
     values = lapack.dsyev(symmetric, compute_v=0)[0]
     lowest, highest = float(values[0]), float(values[-1])
-    margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
+    margin = max(algebra.EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
     if lowest > margin:
         return symmetric, True
-    margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
+    margin = margin or algebra.EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
     return add_to_diagonal(symmetric, margin - RAISED * min(lowest, 0.0)), False
 
 
@@ -449,7 +435,7 @@ class Equalities(NamedTuple):
 
     def predict(self, step: FloatArray) -> float:
         """Return ‖c + A d‖₂ for a step d (d,)."""
-        return norm(self.values + self.jacobian.dot(step))
+        return algebra.norm(self.values + self.jacobian.dot(step))
 
 
 class Rows(NamedTuple):
@@ -484,32 +470,10 @@ class Rows(NamedTuple):
         return -np.asarray(self.left.dot(self.right.T.dot(force) / self.sizes))
 
 
-class Composite(NamedTuple):
-    """A composite step.
-
-    Attributes
-    ----------
-    step : array, shape (d,)
-    multipliers : array, shape (k,)
-        Of the equality constraints: ``g + H d + Aᵀ lam`` is what the inequalities exert, as nearly as that can be had.
-    definite : bool
-        Whether H was positive definite as it is along the constraints.
-    """
-
-    step: FloatArray
-    multipliers: FloatArray
-    definite: bool
-
-
 def solve_composite(
-    gradient: FloatArray,
-    hessian: FloatArray,
-    equalities: Equalities,
-    room: Room,
-    reach: FloatArray,
-    radius: float,
-) -> Composite:
-    """Return the composite step.
+    gradient: FloatArray, hessian: FloatArray, equalities: Equalities, room: Room, reach: FloatArray, radius: float
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Find the composite step.
 
     Parameters
     ----------
@@ -523,10 +487,18 @@ def solve_composite(
     reach : array, shape (d,)
     radius : float
         No unknown moves by more than ``radius * reach``.
+
+    Returns
+    -------
+    step : array, shape (d,)
+    multipliers : array, shape (k,)
+        Of the equality constraints: ``g + H d + Aᵀ lam`` is what the inequalities exert, as nearly as that can be had.
+    definite : bool
+        Whether H was positive definite as it is along the constraints.
     """
     d = gradient.size
     if not d:
-        return Composite(gradient, np.zeros(len(equalities.values)), True)
+        return gradient, np.zeros(len(equalities.values)), True
     # Units of `reach`: the trust region is the cube |d_i| <= radius, and unlike unknowns have comparable lengths.
     slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
     scaled, room = Equalities(equalities.values, equalities.jacobian * reach), _scale_room(room, reach)
@@ -536,14 +508,14 @@ def solve_composite(
     step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
     pull, definite, force = np.zeros(len(room.lower)), True, slope + bending.dot(step)
     if rows.null.size:
-        least = FLAT * largest(np.abs(slope)) + TINY
+        least = FLAT * algebra.largest(np.abs(slope)) + TINY
         cube = room.narrow(np.full(d, radius))
         step, pull, definite = _add_tangential_step(force, bending, rows.null, least, step, cube)
         force = slope + bending.dot(step)
     # What the inequalities exert is taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the
     # least-squares sense.
     multipliers = rows.multipliers(force - room.normals.T.dot(pull))
-    return Composite(step * reach, multipliers, definite)
+    return step * reach, multipliers, definite
 
 
 def _scale_room(room: Room, reach: FloatArray) -> Room:
@@ -557,7 +529,7 @@ def _add_tangential_step(
 ) -> tuple[FloatArray, FloatArray, bool]:
     """Return the sum of normal and tangential step (d,), and what presses as of `solve_programme`, (m + d,).
 
-    The third result is `Composite.definite`. Everything is in units in which the trust region is a cube; `slope` is
+    The third result is whether H was definite. Everything is in units in which the trust region is a cube; `slope` is
     that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
     """
     # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.

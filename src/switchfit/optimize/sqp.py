@@ -31,16 +31,8 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import (
-    ARMIJO,
-    EIGENVALUE_FLOOR,
-    EPS,
-    EXTRA_ITERATIONS,
-    NEGLIGIBLE_STEP,
-    NOISE,
-    FloatArray,
-    is_negligible,
-)
+from switchfit.optimize import algebra
+from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.direction import Direction, find_direction, measure_in_box
 from switchfit.optimize.line_search import (
     correct,
@@ -78,11 +70,11 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     all the same if a step from there is negligible.
     """
     problem, point = oracle.problem, state.point
-    theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
+    theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), algebra.NEGLIGIBLE_STEP)
     if np.array_equal(theta, point.theta):
         return state
     closed = oracle.point(Trial.at(problem, theta), state.scale)
-    if closed is None or closed.cost > point.cost + NOISE * state.cost_scale or closed.violation > MET:
+    if closed is None or closed.cost > point.cost + algebra.NOISE * state.cost_scale or closed.violation > MET:
         return state
     after = state.advance(Accepted(closed, 1.0), problem.tolerance)
     if closed.optimality <= max(problem.tolerance, point.optimality):
@@ -90,7 +82,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     if closed.idle is None:
         return state
     step = find_direction(problem, after).step
-    return after if is_negligible(step, np.maximum(state.scale, problem.size)) else state
+    return after if algebra.is_negligible(step, np.maximum(state.scale, problem.size)) else state
 
 
 def escape(oracle: Oracle, state: State) -> Accepted | None:
@@ -127,7 +119,7 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     length = min(length, float(np.min(slack[approaching] / -slope[approaching], initial=np.inf)))
     for _ in range(40):
         decrease = -0.5 * bending * length**2
-        if decrease <= NOISE * abs(point.cost) or length == 0.0:
+        if decrease <= algebra.NOISE * abs(point.cost) or length == 0.0:
             return None
         there = move(problem, point.theta, length * ray, state.scale)
         first = oracle.first(there)
@@ -135,7 +127,8 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
             # The ray is tangential to the equality constraints, which bend.
             moved = correct(oracle, there, first, state.scale)
             there, first = (there, first) if moved is None else (moved, oracle.first(moved))
-        if first is not None and measure_merit(first, state) < measure_merit(point.plus, state) - ARMIJO * decrease:
+        enough = measure_merit(point.plus, state) - algebra.ARMIJO * decrease
+        if first is not None and measure_merit(first, state) < enough:
             trial = oracle.complete(there, first, state.scale)
             if trial is not None:
                 return Accepted(trial, length)
@@ -190,7 +183,8 @@ def minimize(
     point = oracle.point(trial, np.abs(trial.theta))
     if point is not None and multipliers is None and 0 < len(problem.equalities) < start.size:
         # As many constraints as unknowns leave no direction in which curvature counts.
-        point = oracle.with_own_multipliers(point)
+        oracle.multipliers = point.forces
+        point = oracle.point(trial, np.abs(trial.theta))
     if point is None:
         return _nonfinite_start(oracle, trial.theta)
     return _iterate(oracle, State.at(point), callback)
@@ -258,9 +252,9 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
     if not state.point.is_stationary(problem.tolerance):
         return False
     # Without a Hessian the step says nothing about the distance to the minimum.
-    if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
+    if not problem.uses_hessian or state.settled >= algebra.EXTRA_ITERATIONS:
         return True
-    return bool(is_negligible(direction.step, state.scale))
+    return bool(algebra.is_negligible(direction.step, state.scale))
 
 
 def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
@@ -269,7 +263,7 @@ def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
     The region shrinks to that size beside a kink or a jump of J that is no breakpoint. Steps in it would be accepted,
     as J stays the same, and go on for ever.
     """
-    noise = NOISE * abs(state.point.cost)
+    noise = algebra.NOISE * abs(state.point.cost)
     if not problem.has_box or problem.equalities or direction.reduction > noise:
         return False
     # A step that ends inside the region is not held back by it.
@@ -289,7 +283,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian).dot(state.scale))))
     below_rounding = is_below_rounding(oracle, state, direction)
-    if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
+    if below_rounding and state.point.optimality <= 1e5 * algebra.EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     # Near a saddle slopes are below rounding, but negative curvature still gives a direction.
     escaped = escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
@@ -323,7 +317,7 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
         curvature = curvature_at(problem, state, state.point.active)
         if curvature.smallest < NEGATIVE_CURVATURE:
             return state._replace(status=Status.SADDLE)
-        if curvature.smallest <= EIGENVALUE_FLOOR:
+        if curvature.smallest <= algebra.EIGENVALUE_FLOOR:
             return state._replace(status=Status.SINGULAR)
         if state.point.idle is not None or curvature.idle is not None:
             return state._replace(status=Status.COLLAPSED)
@@ -332,14 +326,8 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
 
 def _record(oracle: Oracle, state: State) -> IterationRecord:
     point = state.point
-    return IterationRecord(
-        iteration=state.iteration,
-        cost=point.cost,
-        optimality=point.optimality,
-        step=state.step_length,
-        theta=point.theta.copy(),
-        evaluations=oracle.evaluations,
-    )
+    reached = point.cost, point.optimality, state.step_length, point.theta.copy()
+    return IterationRecord(state.iteration, *reached, oracle.evaluations)
 
 
 def _result(oracle: Oracle, state: State, status: Status, history: tuple[IterationRecord, ...]) -> Result:
@@ -383,16 +371,9 @@ def _list_equalities(oracle: Oracle, point: Point) -> tuple[tuple[str, float, fl
 
 def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:
     """Return a result without numbers."""
-    d = theta.size
-    return Result(
-        theta=theta,
-        cost=np.nan,
-        gradient=np.full(d, np.nan),
-        hessian=np.full((d, d), np.nan),
-        optimality=np.nan,
-        evaluations=oracle.evaluations,
-        status=Status.NONFINITE_START,
-        multipliers=np.zeros(len(oracle.problem.constraints.names)),
-        curvature=Curvature(np.zeros((d, 0)), lambda: Spectrum(np.zeros(0), np.zeros(d))),
-        tolerance=oracle.problem.tolerance,
-    )
+    d, problem = theta.size, oracle.problem
+    nothing, no_multipliers = np.full((d, d), np.nan), np.zeros(len(problem.constraints.names))
+    no_directions = Curvature(np.zeros((d, 0)), lambda: Spectrum(np.zeros(0), np.zeros(d)))
+    of_point = theta, np.nan, nothing[0], nothing, np.nan
+    status = Status.NONFINITE_START
+    return Result(*of_point, oracle.evaluations, status, no_multipliers, no_directions, problem.tolerance)

@@ -224,15 +224,14 @@ FIRST_PENALTY = 10.0
 falls at first at their cost, and modes collapse on the way: of 30 starts of the pendulum 11 end right, not 16."""
 
 
-NO_SCALE: FloatArray = np.zeros(0)
-
-
 class State(NamedTuple):
     """The best point so far, and figures of the iterations before.
 
     Attributes
     ----------
     point : Point
+    scale : array, shape (d,)
+        Largest ``|theta_i|`` seen.
     iteration : int
     step_length : float
         Of the last iteration.
@@ -240,8 +239,6 @@ class State(NamedTuple):
         Steepest descent: B = I / metric, the first step length tried: 1, or twice the last one if that was above ½.
     settled : int
         Number of iterations since the optimality fell below the tolerance.
-    scale : array, shape (d,)
-        Largest ``|theta_i|`` seen.
     cost_scale, gradient_scale : float
         Largest ``|J|`` and largest derivative seen.
     lowest_cost : float
@@ -262,11 +259,11 @@ class State(NamedTuple):
     """
 
     point: Point
+    scale: FloatArray
     iteration: int = 0
     step_length: float = 0.0
     metric: float = 1.0
     settled: int = 0
-    scale: FloatArray = NO_SCALE
     cost_scale: float = 0.0
     gradient_scale: float = 0.0
     lowest_cost: float = np.inf
@@ -314,16 +311,6 @@ class State(NamedTuple):
         )
 
     @property
-    def flatness(self) -> FloatArray:
-        """Curvature of each unknown that is rounding: (d,)."""
-        return np.asarray(algebra.flatness(self.scale, self.cost_scale))
-
-    @property
-    def floor(self) -> FloatArray:
-        """Curvature of each unknown below which the quadratic programme takes it for zero: (d,)."""
-        return np.asarray(algebra.curvature_floor(self.scale, self.cost_scale, self.point.largest_slopes))
-
-    @property
     def genuine_kinks(self) -> BoolArray:
         """Coordinates on a breakpoint at which the derivative jumps upwards by more than rounding: (d,)."""
         point = self.point
@@ -353,10 +340,11 @@ def curvature_at(problem: Problem, state: State, rows: IntArray) -> Curvature:
 
 def _curvature_on(problem: Problem, state: State, rows: IntArray) -> Curvature:
     point, constraints = state.point, problem.constraints
-    hessian, flat = point.derivatives(point.reported_sides)[1], state.flatness
+    hessian = point.derivatives(point.reported_sides)[1]
+    flat = algebra.flatness(state.scale, state.cost_scale)  # curvature that is rounding
     held = state.genuine_kinks | ~constraints.movable
     held = held if point.idle is None else held | point.idle
-    normals = np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])
+    normals = np.vstack([constraints.normals[rows], point.equalities(point.reported_sides).jacobian])
     found = hessian.curvature(normals, held, flat)
     if problem.idle is not None and problem.rows_hold(point.active):
         bounds = point.active[point.active >= constraints.b.size]
