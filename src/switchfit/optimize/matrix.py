@@ -82,9 +82,9 @@ class Curvature:
 
     @property
     def smallest(self) -> float:
-        """Smallest scaled eigenvalue; infinite on no directions, NaN where there is no Hessian."""
+        """Smallest scaled eigenvalue; NaN on no directions, and where there is no Hessian."""
         values = self.spectrum.eigenvalues
-        return float(values[0]) if values.size else np.inf
+        return float(values[0]) if values.size else np.nan
 
 
 class SymmetricMatrix:
@@ -311,12 +311,8 @@ class ArrowLayout:
 
     def slots(self, e: int, places: IntArray) -> IntArray:
         """Return the index of unknowns of run e in its own (k) and the shared (s) ones, one after the other."""
-        slot = np.full(self.size, -1, dtype=np.intp)
-        k = self.own.shape[1]
-        here = self.own[e][self.own[e] < self.size]
-        slot[here] = np.arange(len(here))
-        slot[self.shared] = k + np.arange(len(self.shared))
-        return slot[places]
+        order = np.concatenate([self.own[e], self.shared])
+        return np.array([np.flatnonzero(order == place)[0] for place in places], dtype=np.intp)
 
     def split(self, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the own (R, k), zero where padded, and shared (s,) entries of a vector (d,)."""

@@ -5,14 +5,14 @@ smooth except where a coordinate passes one of its breakpoints: there its deriva
 passes a sample time is such a coordinate.) These constraints are linear, so every iterate satisfies them, and the line
 search compares J alone. There may also be nonlinear equality constraints c(theta) = 0, which are met at the end.
 
-One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next state:
+One iteration, `_step`, maps a state at a point (`state`) to the next state:
 
-1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `matrix` or `arrow`), or with
-   equality constraints a step composed of the solutions of two (`composite`);
-2. *line search* (`line_search`): the full step first, even across breakpoints, then inside the present smooth piece;
-   by default in a trust region that shrinks (`direction`); with equality constraints it compares a merit function;
-   every trial is made feasible (`problem`);
-3. *kinks* (`point`): coordinates that sit on a breakpoint are held, or released to one side.
+1. *direction* (`step`): a convex quadratic programme (`qp`, with the Hessians of `matrix`), or with equality
+   constraints a step composed of the solutions of two;
+2. *line search* (`step`): the full step first, even across breakpoints, then inside the present smooth piece; by
+   default in a trust region that shrinks; with equality constraints it compares a merit function; every trial is made
+   feasible (`problem`);
+3. *kinks* (`state`): coordinates that sit on a breakpoint are held, or released to one side.
 
 At a stationary point the curvature distinguishes a minimum from a saddle, which is left along negative curvature
 (`escape`). If no step decreases J, `explain_failure` finds the reason.
@@ -33,27 +33,31 @@ from numpy.typing import ArrayLike
 
 from switchfit.optimize import algebra
 from switchfit.optimize.algebra import FloatArray
-from switchfit.optimize.direction import Direction, find_direction, measure_in_box
-from switchfit.optimize.line_search import (
-    correct,
-    explain_failure,
-    is_below_rounding,
-    is_stuck,
-    measure_merit,
-    search,
-)
 from switchfit.optimize.matrix import Curvature, Spectrum
-from switchfit.optimize.point import MET, Oracle, Point
 from switchfit.optimize.problem import Problem, Trial, feasible_start, move, snap_to_rows
 from switchfit.optimize.state import (
+    MET,
     Accepted,
     Callback,
     IterationRecord,
+    Oracle,
+    Point,
     Result,
     State,
     Status,
     curvature_at,
     idle_coordinates,
+)
+from switchfit.optimize.step import (
+    Direction,
+    correct,
+    explain_failure,
+    find_direction,
+    is_below_rounding,
+    is_stuck,
+    measure_in_box,
+    measure_merit,
+    search,
 )
 from switchfit.optimize.threads import one_thread
 

@@ -4,7 +4,7 @@ It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinar
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
 in the way, coordinates held at a kink or released to one side, and Armijo backtracking with the same constants. What
 is rare it leaves alone: the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway
-it stops. It has no trust region (`switchfit.optimize.direction`): where the Hessian is indefinite, its steps may go
+it stops. It has no trust region (`switchfit.optimize.step`): where the Hessian is indefinite, its steps may go
 further than those of `minimize`, into the basin of another minimum. `Outcome.settled` is True only for a regular
 minimum: no constraint is active, the Hessian of the coordinates that no kink holds is positive definite, and the next
 step is negligible. Everything else is to be finished by `minimize`, from `Outcome.theta` on.
@@ -203,7 +203,7 @@ class Point(NamedTuple):
     def sides(self) -> Array:
         """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,).
 
-        Chosen as `switchfit.optimize.point.steepest_descent` does where no constraint is active.
+        Chosen as `switchfit.optimize.state.steepest_descent` does where no constraint is active.
         """
         return jnp.where(self.kink, algebra.choose_sides(self.left.gradient, self.right.gradient, jnp), 1)
 
@@ -339,7 +339,7 @@ def _refuse(state: State, trial: Point, task: Task) -> State:
     """Shorten the step; where it still crosses a few breakpoints, look for one inside the present smooth piece."""
     point = state.point
     trials, refused = state.trials + 1, state.refused + 1
-    # The fractions of `line_search._backtrack`: halves, then quarters.
+    # The fractions of `step.search`: halves, then quarters.
     length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
     # Once the step crosses few breakpoints, the programme is solved again with the present piece for bounds: there J is
     # smooth, and short enough steps have to decrease it. `undirected` asks for that step.

@@ -1,50 +1,248 @@
-"""How far to go along a direction, with equality constraints too, and why a search found nothing lower.
+"""The step of an iteration: its direction, how far to go along it, and why a search found nothing lower.
+
+The direction is the solution of a convex quadratic programme. Its matrix is the exact Hessian, made positive definite
+only in the subspace where it has to be (Newton), its blocks, Gauss-Newton's matrix, or a multiple of the identity
+(steepest descent). It starts from the sides of the steepest descent, so that its step descends wherever the optimality
+is positive.
+
+The trust region: a box around the point, in which the quadratic model of the cost is trusted. Far from the solution the
+Hessian is often indefinite. Where eigenvalues are replaced by their absolute values, a line search along the step goes
+far in directions in which the model says nothing. Inside a trust region the Hessian is shifted instead, in the metric
+of the region, until it is positive definite ([1]_, section 4.3), and no unknown moves further than a radius times its
+`reach`. The radius follows from how well the model predicted the last step ([1]_, algorithm 4.1). The region is a box,
+for then it adds nothing but bounds to the quadratic programme. As long as the Hessian is positive definite and its
+steps succeed, there is no box.
 
 If the full step fails and crosses breakpoints, the programme is solved again inside the present smooth piece, where J
 is smooth and backtracking must succeed.
 
-The merit function of equality constraints, ``J + mu ‖c‖₂``, and the search for a step that decreases it.
-
-The penalty mu is raised to where the model of the merit function decreases by a part of what the penalty itself makes
-of the step ([3]_, (18.36)); it never falls. A step that fails because the constraints bend is corrected: the
-*second-order correction* is the shortest step that meets the constraints as they are at its end ([3]_, section 15.6).
-Without it the merit function refuses full steps near the solution (Maratos). If that fails too, the trust region
-shrinks.
+The merit function of equality constraints is ``J + mu ‖c‖₂``. The penalty mu is raised to where the model of the merit
+function decreases by a part of what the penalty itself makes of the step ([1]_, (18.36)); it never falls. A step that
+fails because the constraints bend is corrected: the *second-order correction* is the shortest step that meets the
+constraints as they are at its end ([1]_, section 15.6). Without it the merit function refuses full steps near the
+solution (Maratos). If that fails too, the trust region shrinks.
 
 References
 ----------
-.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapter 3.
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 3, 4, 15 and 18.
 .. [2] W. W. Hager, H. Zhang, A new conjugate gradient method with guaranteed descent and an efficient line search,
    SIAM J. Optim. 16 (2005) 170-192 (line searches below the rounding error of the cost).
-.. [3] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
-.. [4] J. J. More, S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011) 1292-1314.
-.. [5] R. M. Chamberlain, M. J. D. Powell, C. Lemarechal, H. C. Pedersen, The watchdog technique for forcing convergence
+.. [3] J. J. More, S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011) 1292-1314.
+.. [4] R. M. Chamberlain, M. J. D. Powell, C. Lemarechal, H. C. Pedersen, The watchdog technique for forcing convergence
    in algorithms for constrained optimization, Math. Program. Study 16 (1982) 1-17.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import FloatArray, IntArray
-from switchfit.optimize.direction import (
-    FIRST_CONSTRAINED_RADIUS,
-    MAX_BACKTRACKS,
-    Direction,
-    find_direction,
-    measure_in_box,
-    next_radius,
-    shrink_region,
-)
-from switchfit.optimize.point import MET, Oracle, Point, Sample
-from switchfit.optimize.problem import Trial, move
-from switchfit.optimize.qp import Room, find_normal_step
-from switchfit.optimize.state import Accepted, Finding, State
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
+from switchfit.optimize.matrix import Dense, Hessian
+from switchfit.optimize.problem import Problem, Trial, move
+from switchfit.optimize.qp import NONE, Equalities, Room, find_normal_step, is_definite, solve_composite
+from switchfit.optimize.state import MET, Accepted, Finding, Oracle, Point, Sample, State
 from switchfit.optimize.threads import one_thread
+
+FIRST_RADIUS = 1.0
+"""Radius of the first trust region."""
+
+FIRST_CONSTRAINED_RADIUS = 5.0
+"""The same where there are equality constraints, with which there always is one. The bed of poor starts is indifferent
+to it between 5 and 40."""
+
+Piece = tuple[FloatArray, FloatArray]
+"""Bounds of the smooth piece around a point: (d,), (d,)."""
+
+HALF = 0.5
+"""Part of the violation of equality constraints that a step may leave while coordinates are held at kinks."""
+
+
+NO_MULTIPLIERS: FloatArray = np.zeros(0)
+
+
+class Direction(NamedTuple):
+    """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd).
+
+    `regular`: no constraint is active, no coordinate is held or at a kink, and H is positive definite. `radius` is that
+    of the trust region that it was found in. With equality constraints, `multipliers` are theirs, (k,), and `left` is
+    what their linearization leaves of their violation.
+    """
+
+    step: FloatArray
+    slope: float
+    reduction: float
+    regular: bool
+    radius: float = np.inf
+    descends: bool = False
+    multipliers: FloatArray = NO_MULTIPLIERS
+    left: float = 0.0
+
+
+def find_direction(problem: Problem, state: State, piece: Piece | None = None) -> Direction:
+    """Return the step of the quadratic programme, with coordinates on a kink held or confined to the downhill side.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+    piece : pair of arrays, shape (d,), optional
+        Bounds to keep to, narrower than those of the problem.
+    """
+    point, sides = state.point, state.point.downhill
+    found = _solve_on_sides(problem, state, sides, piece)
+    if point.kink is None or found.left <= max(HALF * point.violation, MET):
+        return found
+    # The equality constraints cannot be met while these coordinates are held, or kept to one side: they are released to
+    # where the normal step takes them.
+    room, _ = _room(problem, state, np.where(point.kink, 0, sides), piece)
+    normal = find_normal_step(point.equalities(sides), room, problem.reach, np.inf)
+    return _solve_on_sides(problem, state, np.where(point.kink, np.where(normal > 0.0, 1, -1), sides), piece)
+
+
+def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> Direction:
+    """Solve the quadratic programme with kinks held or confined as `sides` say.
+
+    Its matrix B is H made positive definite where it is not, inside the room and the trust region.
+    """
+    constraints, point, d = problem.constraints, state.point, problem.constraints.size
+    gradient, hessian = point.derivatives(sides)
+    room, free = _room(problem, state, sides, piece)
+    if problem.equalities:
+        return _solve_constrained(problem, state, sides, room, free)
+    # After a failed line search each unknown is taken by itself.
+    labels = np.arange(d, dtype=float) if state.careful else problem.labels
+    # Curvature of each unknown that counts as none.
+    floor = algebra.curvature_floor(state.scale, state.cost_scale, point.largest_slopes)
+    matrix, descends = hessian, _descends(problem, hessian, free)
+    if descends:
+        matrix, floor = Dense(np.eye(d) / state.metric), np.zeros(d)
+    elif labels is not None:
+        matrix = hessian.mask(labels)
+    # Expected to be active: those with a multiplier at this point.
+    pressed = constraints.normals[point.multipliers > 0.0 if point.active.size else slice(0)]
+    kept, part, own, reach = matrix, NONE, gradient, problem.reach
+    if free is not None:
+        if not free.any():
+            return Direction(np.zeros(d), 0.0, 0.0, False, state.radius, descends)
+        # What is held is left out, or decoupled.
+        kept, part = matrix.keep(free)
+        own, pressed, floor = (gradient * free)[part], (pressed * free)[:, part], (floor * free)[part]
+        room, reach = room.of(part, free), reach[part]
+    convex: Hessian
+    factor: Any
+    convex, factor = kept.convexify(pressed, floor, reach if problem.has_box else None)
+    definite, radius = convex is kept, state.radius
+    if problem.has_box and radius == np.inf and not definite:
+        radius = FIRST_RADIUS
+    if radius < np.inf:
+        room = room.narrow(radius * reach)
+    step, _ = convex.solve(own, factor, room)
+    curvature = float(step.dot(convex.dot(step)))
+    if free is not None:
+        moved, step = step, np.zeros(d)
+        step[part] = moved
+    slope = float(gradient.dot(step))
+    regular = definite and matrix is hessian and free is None and point.is_interior
+    return Direction(step, slope, -(slope + 0.5 * curvature), regular, radius, descends)
+
+
+def _solve_constrained(
+    problem: Problem, state: State, sides: IntArray, room: Room, free: BoolArray | None
+) -> Direction:
+    """Do the work of `_solve_on_sides` where there are equality constraints."""
+    equalities, (gradient, hessian) = state.point.equalities(sides), state.point.derivatives(sides)
+    radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
+    full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
+    part = np.arange(gradient.size) if free is None else np.flatnonzero(free)
+    own = Equalities(equalities.values, equalities.jacobian[:, part])
+    step, (block, reach) = np.zeros(gradient.size), (full[np.ix_(part, part)], problem.reach[part])
+    step[part], multipliers, definite = solve_composite(gradient[part], block, own, room.of(part), reach, radius)
+    slope = float(gradient.dot(step))
+    reduction = -(slope + 0.5 * float(step.dot(full.dot(step))))
+    regular = definite and free is None and state.point.is_interior and not state.careful
+    return Direction(step, slope, reduction, regular, radius, False, multipliers, equalities.predict(step))
+
+
+def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> tuple[Room, BoolArray | None]:
+    """Return where the step may go, inside the constraints and the piece and to the given sides of kinks.
+
+    The second result are the unknowns that may move at all, (d,) of bool; None if all may.
+    """
+    point, constraints = state.point, problem.constraints
+    room = Room.around(constraints, point.slack)
+    lower, upper = room.bounds
+    # Rows that hold up to rounding hold exactly in the programme.
+    if point.active.size:
+        room.lower[point.active[point.active < constraints.b.size]] = 0.0
+    if piece is not None:
+        lower[:] = np.minimum(piece[0] - point.theta, 0.0)
+        upper[:] = np.maximum(piece[1] - point.theta, 0.0)
+    if point.kink is None and point.idle is None and constraints.all_movable:
+        return room, None
+    free = constraints.movable if point.idle is None else constraints.movable & ~point.idle
+    if point.kink is not None:
+        lower[point.kink & (sides > 0)] = 0.0
+        upper[point.kink & (sides < 0)] = 0.0
+        free = ~(point.kink & (sides == 0)) & free
+    return room, None if free.all() else free
+
+
+def _descends(problem: Problem, hessian: Hessian, free: BoolArray | None) -> bool:
+    """Return whether the step is one of steepest descent."""
+    if problem.hessian != "descent-first":
+        return not problem.uses_hessian
+    kept = (hessian if free is None else hessian.keep(free)[0]).dense()
+    return kept.size > 0 and not is_definite(kept)
+
+
+#: Factors by which the radius falls after a step that the model misjudged, and grows after one that it judged well.
+SHRINK, GROW = 0.25, 2.0
+#: The first of them where there are equality constraints.
+CONSTRAINED_SHRINK = 0.5
+#: Ratios of the actual to the predicted reduction below and above which it does so.
+POOR, GOOD = 0.25, 0.75
+MAX_BACKTRACKS = 60
+
+
+def measure_in_box(problem: Problem, step: FloatArray) -> float:
+    """Return the radius of the smallest box that holds a step (d,)."""
+    return algebra.largest(np.abs(step) / problem.reach)
+
+
+def _shrink(problem: Problem) -> float:
+    return CONSTRAINED_SHRINK if problem.equalities else SHRINK
+
+
+def next_radius(problem: Problem, direction: Direction, decrease: float, predicted: float, noise: float) -> float:
+    """Return the radius that follows an accepted step, from the actual and the predicted decrease and their error."""
+    radius = direction.radius
+    if predicted <= noise or not problem.has_region:
+        return radius
+    ratio = decrease / predicted
+    if ratio < POOR:
+        return min(radius, _shrink(problem) * measure_in_box(problem, direction.step))
+    grows = ratio > GOOD and radius < math.inf and measure_in_box(problem, direction.step) > 0.9 * radius
+    return GROW * radius if grows else radius
+
+
+def shrink_region(
+    problem: Problem, state: State, direction: Direction, piece: Piece | None
+) -> tuple[Direction, Piece | None]:
+    """Return the direction after one that failed: in a smaller trust region, and the smooth piece that it keeps to.
+
+    A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
+    """
+    theta, radius = state.point.theta, direction.radius
+    if piece is None and 0 < problem.breakpoints.count_crossed(theta, direction.step) < algebra.MANY_BREAKPOINTS:
+        piece = problem.breakpoints.piece(theta, problem.constraints)
+    else:
+        radius = _shrink(problem) * measure_in_box(problem, direction.step)
+    return find_direction(problem, state._replace(radius=radius), piece), piece
+
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
 MAX_HALVINGS = 200
@@ -62,20 +260,22 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
         return _search_in_region(oracle, state, direction)
     if direction.descends:
         return _descend(oracle, state, direction)
-    alpha = 1.0
-    crossed = problem.breakpoints.count_crossed(theta, direction.step)
-    # Across breakpoints the slope at theta says little: a larger part of the decrease is asked for, until few are
-    # crossed.
-    while crossed > 0:
-        accepted = _attempt(oracle, state, direction, alpha, algebra.ARMIJO_ACROSS)
+    alpha, crossing, k = 1.0, problem.breakpoints.count_crossed(theta, direction.step) > 0, 0
+    while k < MAX_BACKTRACKS and not _is_hopeless(state, direction, k, alpha):
+        # Across breakpoints the slope at theta says little: a larger part of the decrease is asked for, until few are
+        # crossed.
+        accepted = _attempt(oracle, state, direction, alpha, algebra.ARMIJO_ACROSS if crossing else algebra.ARMIJO)
         if accepted is not None:
             return accepted
-        alpha *= 0.5
-        crossed = problem.breakpoints.count_crossed(theta, alpha * direction.step)
-        if crossed < algebra.MANY_BREAKPOINTS:
-            direction = find_direction(problem, state, problem.breakpoints.piece(theta, problem.constraints))
-            break
-    return _backtrack(oracle, state, direction)
+        if crossing:
+            alpha *= 0.5
+            if problem.breakpoints.count_crossed(theta, alpha * direction.step) < algebra.MANY_BREAKPOINTS:
+                direction = find_direction(problem, state, problem.breakpoints.piece(theta, problem.constraints))
+                alpha, crossing = 1.0, False
+        else:
+            # Armijo's rule ([1]_, algorithm 3.1).
+            alpha, k = alpha * (0.5 if k < 5 else 0.25), k + 1
+    return None
 
 
 def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -93,7 +293,7 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
         length = measure_in_box(problem, direction.step)
         if accepted is not None:
             return accepted._replace(step_length=length / measure_in_box(problem, whole) if k else 1.0)
-        if length < SMALLEST_RADIUS if constrained else _is_hopeless(state, direction, k):
+        if length < SMALLEST_RADIUS if constrained else _is_hopeless(state, direction, k + 1):
             return None
         direction, piece = shrink_region(problem, state, direction, piece)
     return None
@@ -101,11 +301,11 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
 
 def _is_hopeless(state: State, direction: Direction, k: int, alpha: float = 1.0) -> bool:
     """Return whether the slope promises a decrease that J cannot show, after k steps that failed."""
-    return k > 5 and alpha * -direction.slope < 0.01 * algebra.NOISE * abs(state.point.cost)
+    return k > 6 and alpha * -direction.slope < 0.01 * algebra.NOISE * abs(state.point.cost)
 
 
 def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Take one more step from where a step has failed: in a curved valley it leads back to the valley's floor ([5]_).
+    """Take one more step from where a step has failed: in a curved valley it leads back to the valley's floor ([4]_).
 
     The point of the failed step is evaluated once more, for the line search keeps none that it refuses.
     """
@@ -122,19 +322,6 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     return None if end is None else end._replace(radius=direction.radius)
 
 
-def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Backtrack from the full step by Armijo's rule ([1]_, algorithm 3.1)."""
-    alpha = 1.0
-    for k in range(MAX_BACKTRACKS):
-        accepted = _attempt(oracle, state, direction, alpha, algebra.ARMIJO)
-        if accepted is not None:
-            return accepted
-        alpha *= 0.5 if k < 5 else 0.25
-        if _is_hopeless(state, direction, k, alpha):
-            break
-    return None
-
-
 def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
     """Halve the step of the steepest descent until Armijo's rule holds ([1]_, algorithm 3.1), inside the constraints.
 
@@ -145,7 +332,7 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
     alpha, longer = 1.0, direction
     for k in range(MAX_HALVINGS):
         accepted = _attempt(oracle, state, direction, 1.0, algebra.ARMIJO_DESCENT)
-        if accepted is not None or _is_hopeless(state, direction, k):
+        if accepted is not None or _is_hopeless(state, direction, k + 1):
             break
         alpha *= 0.5
         longer, direction = direction, find_direction(problem, state._replace(metric=alpha * state.metric))
@@ -217,7 +404,7 @@ def _residual(state: State, point: Point) -> float:
     return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
 
 
-#: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [3]_, (18.36).
+#: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [1]_, (18.36).
 SHARE = 0.1
 #: Factor by which the penalty is raised beyond what is needed, so that the next step does not raise it again.
 RAISED = 1.1
@@ -230,7 +417,7 @@ FALL = 0.9
 
 
 def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
-    """Return the penalty for which a step of the model decreases the merit function by enough ([3]_, (18.36))."""
+    """Return the penalty for which a step of the model decreases the merit function by enough ([1]_, (18.36))."""
     # mu >= rise / ((1 - rho) (||c|| - ||c + A d||)): a composite step need not meet the linearization, so that its gain
     # stands where [1] has ||c||.
     gain = point.violation - direction.left
@@ -283,7 +470,7 @@ def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> boo
 def _measure_noise(oracle: Oracle, state: State, step: FloatArray) -> float:
     """Return the standard deviation of the error of J along a step (d,); infinite if unknown.
 
-    Differences of the fourth order of a smooth J at equal distances vanish, those of its error do not ([4]_). A jump or
+    Differences of the fourth order of a smooth J at equal distances vanish, those of its error do not ([3]_). A jump or
     a kink makes them large too; it is on one side of the point, so that the smaller of both sides counts.
     """
     found = []
@@ -335,10 +522,6 @@ class _Line(NamedTuple):
             return _Place(fraction, theta, np.inf, np.inf, self.step)
         cost, gradient = sample.lagrangian(point.forces)
         return _Place(fraction, theta, cost, float(gradient @ self.step), gradient)
-
-    def rises(self, place: _Place) -> bool:
-        """Return whether J is larger than at the begin, or rises."""
-        return place.cost > self.begin.cost + self.noise or place.slope >= 0.0
 
     def jumps(self, low: _Place, high: _Place) -> bool:
         """Return whether J rises between two places by more than its slopes explain."""
@@ -405,7 +588,8 @@ def _locate_rise(line: _Line) -> tuple[_Place, _Place]:
         if high.cost < np.inf and not line.jumps(low, high) and not line.bends(low, high):
             break
         middle = line.see(0.5 * (low.fraction + high.fraction))
-        low, high = (low, middle) if line.rises(middle) else (middle, high)
+        rises = middle.cost > line.begin.cost + line.noise or middle.slope >= 0.0
+        low, high = (low, middle) if rises else (middle, high)
     return low, high
 
 
@@ -432,8 +616,9 @@ def _contradict_slope(line: _Line) -> float | None:
     begin, values, errors, farther = line.begin, [], [], []
     # J is smooth, if it is what it is said to be, up to the next breakpoint or bound.
     low, high = line.oracle.problem.breakpoints.piece(begin.theta, line.oracle.problem.constraints)
-    ends = np.where(line.step > 0.0, high, low) - begin.theta
-    smooth = np.min(ends / line.step, where=ends * line.step > 0.0, initial=1.0)
+    moving = np.flatnonzero(line.step)
+    parts = (np.where(line.step > 0.0, high, low) - begin.theta)[moving] / line.step[moving]
+    smooth = np.min(parts, where=parts > 0.0, initial=1.0)
     for length in LENGTHS * smooth:
         half, full = line.see(0.5 * length), line.see(length)
         if max(half.cost, full.cost) < np.inf:
