@@ -31,29 +31,21 @@ from numpy.typing import ArrayLike
 
 from switchfit.optimize import algebra
 from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
-from switchfit.optimize.qp import (
-    CholeskyFactor,
-    Room,
-    add_to_diagonal,
-    is_definite,
-    newton_step,
-    shift_to_positive,
-    solve_programme,
-)
+from switchfit.optimize.qp import CholeskyFactor, Room, has_curvature, newton_step, shift_to_positive, solve_programme
 
 
 class Spectrum(NamedTuple):
-    """Eigenvalues of a Hessian on the free directions.
+    """The lowest end of the spectrum of a Hessian on the free directions.
 
     Attributes
     ----------
-    eigenvalues : array, shape (k,)
-        Ascending, of the diagonally scaled Hessian; of an arrow the smallest alone. NaN where there is no Hessian.
+    smallest : float
+        Smallest eigenvalue of the diagonally scaled Hessian; NaN without free directions, or without a Hessian.
     lowest : array, shape (d,)
-        The direction of the smallest scaled eigenvalue, of unit length in theta.
+        Its direction, of unit length in theta.
     """
 
-    eigenvalues: FloatArray
+    smallest: float
     lowest: FloatArray
 
 
@@ -77,14 +69,8 @@ class Curvature:
 
     @cached_property
     def spectrum(self) -> Spectrum:
-        """Eigenvalues and the lowest direction."""
+        """Smallest eigenvalue and its direction."""
         return self.find_spectrum()
-
-    @property
-    def smallest(self) -> float:
-        """Smallest scaled eigenvalue; NaN on no directions, and where there is no Hessian."""
-        values = self.spectrum.eigenvalues
-        return float(values[0]) if values.size else np.nan
 
 
 class SymmetricMatrix:
@@ -244,13 +230,13 @@ class Dense(SymmetricMatrix):
             # A positive definite matrix needs no more than Jacobi's scaling.
             scaling = np.sqrt(square)
             scaled = self.array / (scaling[:, None] * scaling)
-            factor = CholeskyFactor.of_scaled(scaled, scaling) if _has_curvature(scaled) else None
+            factor = CholeskyFactor.of_scaled(scaled, scaling) if has_curvature(scaled) else None
             if factor is not None:
                 return self, factor
         if reach is None:
             scaling = diagonal_scaling(self, floor)
             scaled, make_definite = self.scale(scaling).array, make_absolute
-            if _has_curvature(scaled):
+            if has_curvature(scaled):
                 return self, CholeskyFactor.of(self.array)
         else:
             # In the metric of the region all unknowns that move by their reach are alike: a multiple of the identity is
@@ -502,7 +488,7 @@ class Arrow(SymmetricMatrix):
             if lowest is None or left_out.all():
                 return Dense(self.dense()).curvature(normals, held, flat).spectrum
             lowest = lowest / scaling
-            return Spectrum(np.array([smallest]), lowest / np.linalg.norm(lowest))
+            return Spectrum(smallest, lowest / np.linalg.norm(lowest))
 
         return Curvature(np.eye(len(held))[:, ~left_out], find_spectrum)
 
@@ -600,16 +586,16 @@ def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals:
     """Return the eigenvalues of a matrix (d, d) in the null space of normals (k, f) of the free unknowns (f,)."""
     lowest = np.zeros(len(array))
     if not algebra.is_finite(array):
-        return Spectrum(np.array([np.nan]), lowest)
+        return Spectrum(np.nan, lowest)
     block = array[np.ix_(free, free)]
     scaling = diagonal_scaling(Dense(block), flat[free])
     # With theta = D^-1 y the normals are N D^-1, and their null space is another one than that of N.
     null = null_space(normals / scaling)
     if null.size == 0:
-        return Spectrum(np.zeros(0), lowest)
+        return Spectrum(np.nan, lowest)
     values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
     lowest[free] = null @ vectors[:, 0] / scaling
-    return Spectrum(values, lowest / algebra.norm(lowest))
+    return Spectrum(float(values[0]), lowest / algebra.norm(lowest))
 
 
 def null_space(normals: FloatArray) -> FloatArray:
@@ -618,11 +604,6 @@ def null_space(normals: FloatArray) -> FloatArray:
         return np.eye(normals.shape[1])
     _, sizes, right = np.linalg.svd(algebra.unit_rows(normals)[0])
     return np.asarray(right[np.count_nonzero(sizes > 1e-11) :].T)
-
-
-def _has_curvature(scaled: FloatArray) -> bool:
-    """Return whether all eigenvalues of a scaled matrix are above `EIGENVALUE_FLOOR`."""
-    return is_definite(add_to_diagonal(scaled, -algebra.EIGENVALUE_FLOOR))
 
 
 def _convex_on_face(
@@ -634,7 +615,7 @@ def _convex_on_face(
     # H + sigma N'N is H on the face, and positive definite for a large sigma if and only if H is there ([1]_, 17.4).
     for stiffness in STIFFENINGS if len(normals) else ():
         stiff = scaled + stiffness * across
-        if _has_curvature(stiff):
+        if has_curvature(stiff):
             return stiff
     return make_definite(scaled)
 

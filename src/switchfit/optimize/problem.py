@@ -99,14 +99,9 @@ class Problem:
         return float(self.size.max())
 
     @property
-    def has_box(self) -> bool:
-        """Whether steps stay inside a trust region where the Hessian is indefinite or predicts badly."""
-        return self.hessian == "auto"
-
-    @property
     def has_region(self) -> bool:
         """Whether steps are searched for in a trust region, in which equality constraints always are."""
-        return self.has_box or bool(self.equalities)
+        return self.hessian == "auto" or bool(self.equalities)
 
     @property
     def uses_hessian(self) -> bool:
@@ -153,7 +148,10 @@ class Breakpoints:
         values, starts, steps, sizes = moved.tolist(), theta.tolist(), step.tolist(), size.tolist()
         for i, points in self.of_coordinates:
             x, by = values[i], steps[i]
-            mark = _nearest(points, x)
+            above = bisect_left(points, x)
+            if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
+                above -= 1
+            mark = points[above]
             reach = max(abs(starts[i]), abs(by), abs(x)) if by != 0.0 else 0.0
             if abs(mark - x) <= 8 * EPS * max(reach, sizes[i]):
                 moved[i] = mark
@@ -179,13 +177,6 @@ class Breakpoints:
             if above < len(points):
                 high[i] = min(high[i], points[above])
         return low, high
-
-
-def _nearest(points: list[float], x: float) -> float:
-    above = bisect_left(points, x)
-    if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
-        above -= 1
-    return points[above]
 
 
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
@@ -286,18 +277,14 @@ def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: BoolArray
     Projections onto one violated row after the other, an ulp to its inside. What they cannot remove where many rows
     meet at a vertex is left: it is of the size of rounding too.
     """
-    best, least = theta, constraints.violation(theta)
     repaired = theta.copy()
     for _ in range(6):
-        if least <= 0.0:
-            break
         for normal, bound in zip(constraints.A, constraints.b, strict=True):
             inside = np.where(pinned, 0.0, normal)
             violation, projected = project_on_row(repaired, normal, bound, inside)
             if violation > 0.0:
                 repaired = projected
         repaired = np.clip(repaired, constraints.lower, constraints.upper)
-        remaining = constraints.violation(repaired)
-        if remaining < least:
-            best, least = repaired.copy(), remaining
-    return best
+        if constraints.violation(repaired) <= 0.0:
+            break
+    return min(repaired, theta, key=constraints.violation)

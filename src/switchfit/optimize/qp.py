@@ -81,11 +81,6 @@ class LinearConstraints:
         return np.asarray(self.lower < self.upper)
 
     @cached_property
-    def all_movable(self) -> bool:
-        """Whether no unknown is held by its bounds."""
-        return bool(self.movable.all())
-
-    @cached_property
     def normals(self) -> FloatArray:
         """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
         identity = np.eye(self.size)
@@ -391,6 +386,11 @@ def add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
     changed = matrix.copy()
     changed.reshape(-1)[:: len(matrix) + 1] += amount
     return changed
+
+
+def has_curvature(scaled: FloatArray) -> bool:
+    """Return whether all eigenvalues of a scaled matrix are above `algebra.EIGENVALUE_FLOOR`."""
+    return is_definite(add_to_diagonal(scaled, -algebra.EIGENVALUE_FLOOR))
 
 
 RAISED = 2.0

@@ -31,34 +31,11 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize import algebra
+from switchfit.optimize import algebra, step
 from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.problem import Problem, Trial, feasible_start, move, snap_to_rows
-from switchfit.optimize.state import (
-    MET,
-    Accepted,
-    Callback,
-    IterationRecord,
-    Oracle,
-    Point,
-    Result,
-    State,
-    Status,
-    curvature_at,
-    idle_coordinates,
-)
-from switchfit.optimize.step import (
-    Direction,
-    correct,
-    explain_failure,
-    find_direction,
-    is_below_rounding,
-    is_stuck,
-    measure_in_box,
-    measure_merit,
-    search,
-)
+from switchfit.optimize.state import MET, Accepted, Callback, IterationRecord, Oracle, Point, Result, State, Status
 from switchfit.optimize.threads import one_thread
 
 #: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
@@ -85,8 +62,8 @@ def close_gaps(oracle: Oracle, state: State) -> State:
         return after
     if closed.idle is None:
         return state
-    step = find_direction(problem, after).step
-    return after if algebra.is_negligible(step, np.maximum(state.scale, problem.size)) else state
+    ahead = step.find_direction(problem, after).step
+    return after if algebra.is_negligible(ahead, np.maximum(state.scale, problem.size)) else state
 
 
 def escape(oracle: Oracle, state: State) -> Accepted | None:
@@ -96,8 +73,8 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
     active = state.point.active
     # A constraint without force may be left along negative curvature: only pressing ones confine the ray at first.
     for rows in (pressing,) if np.array_equal(pressing, active) else (pressing, active):
-        curvature = curvature_at(problem, state, rows)
-        if not curvature.smallest < NEGATIVE_CURVATURE:
+        curvature = state.curvature_at(problem, rows)
+        if not curvature.spectrum.smallest < NEGATIVE_CURVATURE:
             continue
         for ray in (curvature.spectrum.lowest, -curvature.spectrum.lowest):
             accepted = _descend_along(oracle, state, ray)
@@ -129,10 +106,10 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
         first = oracle.first(there)
         if first is not None and problem.equalities:
             # The ray is tangential to the equality constraints, which bend.
-            moved = correct(oracle, there, first, state.scale)
+            moved = step.correct(oracle, there, first, state.scale)
             there, first = (there, first) if moved is None else (moved, oracle.first(moved))
-        enough = measure_merit(point.plus, state) - algebra.ARMIJO * decrease
-        if first is not None and measure_merit(first, state) < enough:
+        enough = step.measure_merit(point.plus, state) - algebra.ARMIJO * decrease
+        if first is not None and step.measure_merit(first, state) < enough:
             trial = oracle.complete(there, first, state.scale)
             if trial is not None:
                 return Accepted(trial, length)
@@ -210,20 +187,20 @@ def _iterate(oracle: Oracle, state: State, callback: Callback | None) -> Result:
     return _result(oracle, state, state.status or Status.INTERRUPTED, tuple(history))
 
 
-def _find_unbounded(problem: Problem, state: State) -> Direction:
+def _find_unbounded(problem: Problem, state: State) -> step.Direction:
     """Return the step of the quadratic programme outside any trust region."""
-    return find_direction(problem, state._replace(radius=np.inf))
+    return step.find_direction(problem, state._replace(radius=np.inf))
 
 
 def _step(oracle: Oracle, state: State) -> State:
     """Do one iteration: return the next state, or the same point with a status."""
     problem = oracle.problem
-    direction = find_direction(problem, state)
+    direction = step.find_direction(problem, state)
     if _is_settled(problem, state, direction):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
         return state._replace(status=Status.MAX_ITERATIONS)
-    if problem.equalities and is_stuck(oracle, state):
+    if problem.equalities and step.is_stuck(oracle, state):
         return state._replace(status=Status.INFEASIBLE)
     # Before the line search: it would accept steps that change J by rounding alone.
     if _is_held_back(problem, state, direction):
@@ -232,7 +209,7 @@ def _step(oracle: Oracle, state: State) -> State:
     accuracy = 0.0 if problem.accuracy is None else problem.accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
-    accepted = search(oracle, state, direction)
+    accepted = step.search(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
     following = state.advance(accepted, problem.tolerance)
@@ -251,7 +228,7 @@ def _measure_anew(oracle: Oracle, state: State) -> State:
     )
 
 
-def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
+def _is_settled(problem: Problem, state: State, direction: step.Direction) -> bool:
     """Return whether the optimality is below the tolerance and the next step negligible, for J may be badly scaled."""
     if not state.point.is_stationary(problem.tolerance):
         return False
@@ -261,22 +238,22 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
     return bool(algebra.is_negligible(direction.step, state.scale))
 
 
-def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
+def _is_held_back(problem: Problem, state: State, direction: step.Direction) -> bool:
     """Return whether J can only fall by rounding in a trust region, and the quadratic model promises more outside.
 
     The region shrinks to that size beside a kink or a jump of J that is no breakpoint. Steps in it would be accepted,
     as J stays the same, and go on for ever.
     """
     noise = algebra.NOISE * abs(state.point.cost)
-    if not problem.has_box or problem.equalities or direction.reduction > noise:
+    if problem.hessian != "auto" or problem.equalities or direction.reduction > noise:
         return False
     # A step that ends inside the region is not held back by it.
-    if measure_in_box(problem, direction.step) < 0.9 * state.radius:
+    if step.measure_in_box(problem, direction.step) < 0.9 * state.radius:
         return False
     return _find_unbounded(problem, state).reduction > 10 * noise
 
 
-def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
+def _handle_stall(oracle: Oracle, state: State, direction: step.Direction) -> State:
     """Distinguish convergence and the limit of precision from failure after a line search that found no step."""
     if state.point.is_stationary(oracle.problem.tolerance):
         return _finish(oracle, state, direction, Status.CONVERGED)
@@ -286,7 +263,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian).dot(state.scale))))
-    below_rounding = is_below_rounding(oracle, state, direction)
+    below_rounding = step.is_below_rounding(oracle, state, direction)
     if below_rounding and state.point.optimality <= 1e5 * algebra.EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     # Near a saddle slopes are below rounding, but negative curvature still gives a direction.
@@ -301,11 +278,11 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
         if point is not None:
             fresh = State.at(point)
             return fresh._replace(iteration=state.iteration, restarts=state.restarts + 1, careful=True)
-    explain = cache(partial(explain_failure, oracle, state, direction))
+    explain = cache(partial(step.explain_failure, oracle, state, direction))
     return state._replace(status=Status.LINE_SEARCH_FAILED, explain=explain)
 
 
-def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
+def _finish(oracle: Oracle, state: State, direction: step.Direction, status: Status) -> State:
     """Leave a saddle at a KKT point if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or state.point.plus.hessian.finite:
@@ -318,10 +295,10 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
             return state.advance(accepted, problem.tolerance)
-        curvature = curvature_at(problem, state, state.point.active)
-        if curvature.smallest < NEGATIVE_CURVATURE:
+        curvature = state.curvature_at(problem, state.point.active)
+        if curvature.spectrum.smallest < NEGATIVE_CURVATURE:
             return state._replace(status=Status.SADDLE)
-        if curvature.smallest <= algebra.EIGENVALUE_FLOOR:
+        if curvature.spectrum.smallest <= algebra.EIGENVALUE_FLOOR:
             return state._replace(status=Status.SINGULAR)
         if state.point.idle is not None or curvature.idle is not None:
             return state._replace(status=Status.COLLAPSED)
@@ -339,7 +316,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
     problem = oracle.problem
     point = state.point
     gradient, hessian = point.derivatives(point.reported_sides)
-    curvature = curvature_at(problem, state, point.active)
+    curvature = state.curvature_at(problem, point.active)
     held = () if point.kink is None else np.flatnonzero(state.genuine_kinks)
     equalities = _list_equalities(oracle, point)
     missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(max(len(equalities), 1))
@@ -359,7 +336,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         tolerance=problem.tolerance,
         history=history,
         violated=tuple(equalities[k][:2] for k in np.flatnonzero(missed) if point.violation > MET),
-        idle=idle_coordinates(problem, state),
+        idle=state.list_idle(problem),
         explain=state.explain,
         predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
         equalities=equalities,
@@ -377,7 +354,7 @@ def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:
     """Return a result without numbers."""
     d, problem = theta.size, oracle.problem
     nothing, no_multipliers = np.full((d, d), np.nan), np.zeros(len(problem.constraints.names))
-    no_directions = Curvature(np.zeros((d, 0)), lambda: Spectrum(np.zeros(0), np.zeros(d)))
+    no_directions = Curvature(np.zeros((d, 0)), lambda: Spectrum(np.nan, np.zeros(d)))
     of_point = theta, np.nan, nothing[0], nothing, np.nan
     status = Status.NONFINITE_START
     return Result(*of_point, oracle.evaluations, status, no_multipliers, no_directions, problem.tolerance)

@@ -304,7 +304,10 @@ class Oracle:
             c, A = np.asarray(value.constraints, dtype=float), np.asarray(value.jacobian, dtype=float)
             if not (algebra.is_finite(c) and algebra.is_finite(A)):
                 return None
-            equalities = self._scale(c, A)
+            if self.units is None:  # those of the first point
+                self.units = algebra.unit_rows(A * self.problem.reach)[1]
+                self.multipliers = self.multipliers * self.units
+            equalities = Equalities(c / self.units, A / self.units[:, None])
             violation = algebra.norm(equalities.values)
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
@@ -314,13 +317,6 @@ class Oracle:
         if self.problem.uses_hessian and not hessian.finite:
             return None
         return Sample(cost, gradient, hessian, equalities, violation)
-
-    def _scale(self, c: FloatArray, A: FloatArray) -> Equalities:
-        """Return equality constraints in their units, which those of the first point determine."""
-        if self.units is None:
-            self.units = algebra.unit_rows(A * self.problem.reach)[1]
-            self.multipliers = self.multipliers * self.units
-        return Equalities(c / self.units, A / self.units[:, None])
 
     def rescale(self, point: Point) -> bool:
         """Take new units where the gradient of a constraint has grown by far; return whether one has.
@@ -621,12 +617,7 @@ class Result:
     @property
     def smallest_eigenvalue(self) -> float:
         """Smallest eigenvalue of the diagonally scaled Hessian on the free directions; NaN if there are none."""
-        return self.curvature.smallest
-
-    @property
-    def flat_direction(self) -> FloatArray:
-        """Eigenvector, in theta and of unit length, that belongs to `smallest_eigenvalue`, shape (d,)."""
-        return self.curvature.spectrum.lowest
+        return self.curvature.spectrum.smallest
 
 
 FIRST_PENALTY = 10.0
@@ -729,6 +720,45 @@ class State(NamedTuple):
         jump = point.plus.gradient - point.minus.gradient
         return np.asarray(point.kink & (jump > algebra.SMALLEST_JUMP * self.gradient_scale))
 
+    def curvature_at(self, problem: Problem, rows: IntArray) -> Curvature:
+        """Return the curvature of J, unmodified, in the null space of the constraints at `rows` and off the kinks."""
+        known = self.point.curvatures
+        key = rows.tobytes()
+        if key not in known:
+            known[key] = self._curvature_on(problem, rows)
+        return known[key]
+
+    def _curvature_on(self, problem: Problem, rows: IntArray) -> Curvature:
+        point, constraints = self.point, problem.constraints
+        hessian = point.derivatives(point.reported_sides)[1]
+        flat = algebra.flatness(self.scale, self.cost_scale)  # curvature that is rounding
+        held = self.genuine_kinks | ~constraints.movable
+        held = held if point.idle is None else held | point.idle
+        normals = np.vstack([constraints.normals[rows], point.equalities(point.reported_sides).jacobian])
+        found = hessian.curvature(normals, held, flat)
+        if problem.idle is not None and problem.rows_hold(point.active):
+            bounds = point.active[point.active >= constraints.b.size]
+            # Bounds that hold nothing back.
+            loose = np.any(point.multipliers[bounds] <= 1e-10 * self.gradient_scale)
+            if found.spectrum.smallest <= algebra.EIGENVALUE_FLOOR or loose:
+                idle = problem.idle(point.theta.copy(), True) & ~held
+                if idle.any():
+                    found = replace(hessian.curvature(normals, held | idle, flat), idle=idle)
+        return found
+
+    def list_idle(self, problem: Problem) -> tuple[int, ...]:
+        """Return the coordinates on which J does not depend at the point, and those that rows tie to them."""
+        point = self.point
+        found = self.curvature_at(problem, point.active).idle
+        alone = set() if found is None else set(np.flatnonzero(found).tolist())
+        if point.idle is None:
+            return tuple(sorted(alone))
+        idle = set(np.flatnonzero(point.idle).tolist())
+        ties = [{i, j} for i, j, _ in problem.constraints.exact_rows(point.active) if j >= 0]
+        for _ in ties:
+            idle |= {k for tie in ties if tie & idle for k in tie}
+        return tuple(sorted(idle | alone))
+
 
 class Accepted(NamedTuple):
     """The point of an accepted step, the fraction of the proposed step that it took, the next radius and penalty."""
@@ -737,44 +767,3 @@ class Accepted(NamedTuple):
     step_length: float
     radius: float = np.inf
     penalty: float = 0.0
-
-
-def curvature_at(problem: Problem, state: State, rows: IntArray) -> Curvature:
-    """Return the curvature of J, unmodified, in the null space of the constraints at `rows` and off the kinks."""
-    known = state.point.curvatures
-    key = rows.tobytes()
-    if key not in known:
-        known[key] = _curvature_on(problem, state, rows)
-    return known[key]
-
-
-def _curvature_on(problem: Problem, state: State, rows: IntArray) -> Curvature:
-    point, constraints = state.point, problem.constraints
-    hessian = point.derivatives(point.reported_sides)[1]
-    flat = algebra.flatness(state.scale, state.cost_scale)  # curvature that is rounding
-    held = state.genuine_kinks | ~constraints.movable
-    held = held if point.idle is None else held | point.idle
-    normals = np.vstack([constraints.normals[rows], point.equalities(point.reported_sides).jacobian])
-    found = hessian.curvature(normals, held, flat)
-    if problem.idle is not None and problem.rows_hold(point.active):
-        bounds = point.active[point.active >= constraints.b.size]
-        loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # bounds that hold nothing back
-        if found.smallest <= algebra.EIGENVALUE_FLOOR or loose:
-            idle = problem.idle(point.theta.copy(), True) & ~held
-            if idle.any():
-                found = replace(hessian.curvature(normals, held | idle, flat), idle=idle)
-    return found
-
-
-def idle_coordinates(problem: Problem, state: State) -> tuple[int, ...]:
-    """Return the coordinates on which J does not depend at the state's point, and those that rows tie to them."""
-    point = state.point
-    found = curvature_at(problem, state, point.active).idle
-    alone = set() if found is None else set(np.flatnonzero(found).tolist())
-    if point.idle is None:
-        return tuple(sorted(alone))
-    idle = set(np.flatnonzero(point.idle).tolist())
-    ties = [{i, j} for i, j, _ in problem.constraints.exact_rows(point.active) if j >= 0]
-    for _ in ties:
-        idle |= {k for tie in ties if tie & idle for k in tie}
-    return tuple(sorted(idle | alone))

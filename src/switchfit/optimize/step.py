@@ -61,9 +61,6 @@ HALF = 0.5
 """Part of the violation of equality constraints that a step may leave while coordinates are held at kinks."""
 
 
-NO_MULTIPLIERS: FloatArray = np.zeros(0)
-
-
 class Direction(NamedTuple):
     """Step d (d,) of the quadratic programme with its slope gᵀd and its predicted reduction −(gᵀd + ½dᵀBd).
 
@@ -78,7 +75,7 @@ class Direction(NamedTuple):
     regular: bool
     radius: float = np.inf
     descends: bool = False
-    multipliers: FloatArray = NO_MULTIPLIERS
+    multipliers: FloatArray = np.zeros(0)
     left: float = 0.0
 
 
@@ -134,9 +131,9 @@ def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piec
         room, reach = room.of(part, free), reach[part]
     convex: Hessian
     factor: Any
-    convex, factor = kept.convexify(pressed, floor, reach if problem.has_box else None)
+    convex, factor = kept.convexify(pressed, floor, reach if problem.hessian == "auto" else None)
     definite, radius = convex is kept, state.radius
-    if problem.has_box and radius == np.inf and not definite:
+    if problem.hessian == "auto" and radius == np.inf and not definite:
         radius = FIRST_RADIUS
     if radius < np.inf:
         room = room.narrow(radius * reach)
@@ -181,7 +178,7 @@ def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) 
     if piece is not None:
         lower[:] = np.minimum(piece[0] - point.theta, 0.0)
         upper[:] = np.maximum(piece[1] - point.theta, 0.0)
-    if point.kink is None and point.idle is None and constraints.all_movable:
+    if point.kink is None and point.idle is None and constraints.movable.all():
         return room, None
     free = constraints.movable if point.idle is None else constraints.movable & ~point.idle
     if point.kink is not None:
@@ -227,21 +224,6 @@ def next_radius(problem: Problem, direction: Direction, decrease: float, predict
         return min(radius, _shrink(problem) * measure_in_box(problem, direction.step))
     grows = ratio > GOOD and radius < math.inf and measure_in_box(problem, direction.step) > 0.9 * radius
     return GROW * radius if grows else radius
-
-
-def shrink_region(
-    problem: Problem, state: State, direction: Direction, piece: Piece | None
-) -> tuple[Direction, Piece | None]:
-    """Return the direction after one that failed: in a smaller trust region, and the smooth piece that it keeps to.
-
-    A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
-    """
-    theta, radius = state.point.theta, direction.radius
-    if piece is None and 0 < problem.breakpoints.count_crossed(theta, direction.step) < algebra.MANY_BREAKPOINTS:
-        piece = problem.breakpoints.piece(theta, problem.constraints)
-    else:
-        radius = _shrink(problem) * measure_in_box(problem, direction.step)
-    return find_direction(problem, state._replace(radius=radius), piece), piece
 
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
@@ -295,7 +277,13 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
             return accepted._replace(step_length=length / measure_in_box(problem, whole) if k else 1.0)
         if length < SMALLEST_RADIUS if constrained else _is_hopeless(state, direction, k + 1):
             return None
-        direction, piece = shrink_region(problem, state, direction, piece)
+        radius = direction.radius
+        # A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
+        if piece is None and 0 < crossed < algebra.MANY_BREAKPOINTS:
+            piece = problem.breakpoints.piece(point.theta, problem.constraints)
+        else:
+            radius = _shrink(problem) * length
+        direction = find_direction(problem, state._replace(radius=radius), piece)
     return None
 
 
@@ -316,9 +304,8 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     radius = min(direction.radius, measure_in_box(problem, direction.step))
     second = find_direction(problem, state._replace(point=trial, radius=radius))
     back = move(problem, trial.theta, second.step, state.scale)
-    first = oracle.first(back)
     # None where it leads back to the point itself.
-    end = None if first is None else _judge(oracle, state, direction, back, first, 1.0, algebra.ARMIJO_ACROSS)
+    end = _judge(oracle, state, direction, back, oracle.first(back), 1.0, algebra.ARMIJO_ACROSS)
     return None if end is None else end._replace(radius=direction.radius)
 
 
@@ -356,7 +343,7 @@ def _attempt(
     oracle.multipliers = direction.multipliers
     there = move(problem, theta, direction.step if alpha == 1.0 else alpha * direction.step, state.scale)
     first = None if there.is_at(theta) else oracle.first(there)
-    found = None if first is None else _judge(oracle, state, direction, there, first, alpha, fraction)
+    found = _judge(oracle, state, direction, there, first, alpha, fraction)
     if first is None or found is not None or not correcting:
         return found
     moved = correct(oracle, there, first, state.scale)
@@ -364,8 +351,7 @@ def _attempt(
     length = measure_in_box(problem, there.theta - theta)
     if moved is None or not measure_in_box(problem, moved.theta - there.theta) < length:
         return None
-    first = oracle.first(moved)
-    return None if first is None else _judge(oracle, state, direction, moved, first, alpha, fraction)
+    return _judge(oracle, state, direction, moved, oracle.first(moved), alpha, fraction)
 
 
 def measure_merit(sample: Sample, state: State) -> float:
@@ -374,20 +360,22 @@ def measure_merit(sample: Sample, state: State) -> float:
 
 
 def _judge(
-    oracle: Oracle, state: State, direction: Direction, there: Trial, first: Sample, alpha: float, fraction: float
+    oracle: Oracle, state: State, direction: Direction, there: Trial, first: Sample | None, alpha: float, part: float
 ) -> Accepted | None:
-    """Return the point of a trial that decreases the merit function by a fraction of what is predicted.
+    """Return the point of a trial that decreases the merit function by a part of what is predicted.
 
     Where the predicted decrease is below the rounding error, comparing costs says nothing ([2]_): then the residuals of
     the optimality conditions have to fall, or a cost is below every earlier one.
     """
+    if first is None:
+        return None
     point, penalty, constrained = state.point, state.penalty, bool(oracle.problem.equalities)
     merit, before = measure_merit(first, state), measure_merit(point.plus, state)
     noise = algebra.NOISE * (abs(point.cost) + penalty * point.violation)
     # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
     reduction = direction.reduction + penalty * (point.violation - direction.left)
     predicted, lowest = (reduction, before) if constrained else (-alpha * direction.slope, state.lowest_cost)
-    if not algebra.cost_allows(merit, before, lowest, predicted, noise, fraction):
+    if not algebra.cost_allows(merit, before, lowest, predicted, noise, part):
         return None
     trial = oracle.complete(there, first, state.scale)
     if trial is None:

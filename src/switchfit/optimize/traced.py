@@ -253,11 +253,6 @@ class State(NamedTuple):
         point = Point(start, unknown, unknown, jnp.zeros(d, bool))
         return jax.tree.map(jnp.array, cls(point, unknown, jnp.zeros(d), jnp.abs(start)))
 
-    @property
-    def decrease(self) -> Array:
-        """The decrease of J that the slope predicts for the step that is to be judged."""
-        return -self.length * self.slope
-
 
 def minimize_traced(task: Task, start: Array) -> Outcome:
     """Minimize J subject to linear constraints from a feasible start (d,), inside a JAX program."""
@@ -275,17 +270,15 @@ def take_turn(state: State, task: Task) -> State:
     """Evaluate J once, at the point that is to be judged, and judge it."""
     point = state.point
     trial = _evaluate(state, task)
-    # The start is accepted whatever its J, as long as it is finite.
+    # Before the start J is infinite: the start is accepted whatever its J, as long as it is finite.
     first = jnp.isinf(point.cost)
-    noise = algebra.NOISE * jnp.abs(point.cost)
+    noise, decrease = algebra.NOISE * jnp.abs(point.cost), -state.length * state.slope
     # A step across a breakpoint has to achieve a larger part of the decrease: its slope is that of this side alone.
     fraction = jnp.where(state.inside | (trial.crossed == 0), algebra.ARMIJO, algebra.ARMIJO_ACROSS)
-    lower = algebra.cost_allows(trial.cost, point.cost, state.lowest, state.decrease, noise, fraction)
+    lower = algebra.cost_allows(trial.cost, point.cost, state.lowest, decrease, noise, fraction)
     # A point that rounding put back where the step began is no progress.
-    lower = jnp.isfinite(trial.cost) & (first | (lower & jnp.any(trial.theta != point.theta)))
-    better = first | algebra.optimality_allows(
-        trial.optimality, point.optimality, trial.cost, state.lowest, state.decrease, noise
-    )
+    lower = lower & jnp.isfinite(trial.cost) & (first | jnp.any(trial.theta != point.theta))
+    better = algebra.optimality_allows(trial.optimality, point.optimality, trial.cost, state.lowest, decrease, noise)
     # At a kink the optimality needs both one-sided derivatives: the next turn evaluates the same point on its left.
     incomplete = jnp.any(trial.kink) & ~state.halfway
 
@@ -345,7 +338,7 @@ def _refuse(state: State, trial: Point, task: Task) -> State:
     # smooth, and short enough steps have to decrease it. `undirected` asks for that step.
     few = task.breakpoints.count_crossed(point.theta, point.theta + length * state.step) < algebra.MANY_BREAKPOINTS
     inside = ~state.inside & (trial.crossed > 0) & few
-    below_noise = (state.decrease <= algebra.NOISE * jnp.abs(point.cost)) & ~inside
+    below_noise = (-state.length * state.slope <= algebra.NOISE * jnp.abs(point.cost)) & ~inside
     hopeless = below_noise | (trials >= MAX_TRIALS)
     crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
     # What is left of the predicted decrease cannot be seen in J any more, or too much has been tried.
