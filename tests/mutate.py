@@ -198,7 +198,9 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "a violation that does not change ends it": swap(
             STEP, "return equalities.predict(normal) > FALL * point.violation", "return False"
         ),
-        "constraints are measured anew": swap(STATE, "grown = lengths > GROWN", "grown = lengths < 0.0"),
+        "constraints are measured anew": swap(
+            STATE, "np.where(lengths > GROWN, lengths, 1.0)", "np.ones(len(lengths))"
+        ),
         "a violation that stays the same for a while is no end": swap(
             STEP, "return equalities.predict(normal) > FALL * point.violation", "return True"
         ),

@@ -29,9 +29,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize import algebra
+from switchfit.optimize import algebra, qp
 from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
-from switchfit.optimize.qp import CholeskyFactor, Room, has_curvature, newton_step, shift_to_positive, solve_programme
+from switchfit.optimize.qp import CholeskyFactor, Room
 
 
 class Spectrum(NamedTuple):
@@ -230,25 +230,25 @@ class Dense(SymmetricMatrix):
             # A positive definite matrix needs no more than Jacobi's scaling.
             scaling = np.sqrt(square)
             scaled = self.array / (scaling[:, None] * scaling)
-            factor = CholeskyFactor.of_scaled(scaled, scaling) if has_curvature(scaled) else None
+            factor = CholeskyFactor.of_scaled(scaled, scaling) if qp.has_curvature(scaled) else None
             if factor is not None:
                 return self, factor
         if reach is None:
             scaling = diagonal_scaling(self, floor)
             scaled, make_definite = self.scale(scaling).array, make_absolute
-            if has_curvature(scaled):
+            if qp.has_curvature(scaled):
                 return self, CholeskyFactor.of(self.array)
         else:
             # In the metric of the region all unknowns that move by their reach are alike: a multiple of the identity is
             # added there.
             scaling = 1.0 / reach
-            scaled, make_definite = self.scale(scaling).array, lambda matrix: shift_to_positive(matrix)[0]
+            scaled, make_definite = self.scale(scaling).array, lambda matrix: qp.shift_to_positive(matrix)[0]
         convex = Dense(_convex_on_face(scaled, normals / scaling, make_definite)).scale(1.0 / scaling)
         return convex, CholeskyFactor.of(convex.array)
 
     def solve(self, gradient: FloatArray, factor: CholeskyFactor, room: Room) -> tuple[FloatArray, FloatArray]:
         """Minimize ``gᵀd + ½ dᵀBd`` inside a room, B being this matrix; result as of `solve_programme`."""
-        return solve_programme(gradient, self.array, factor, room)
+        return qp.solve_programme(gradient, self.array, factor, room)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
@@ -440,7 +440,7 @@ class Arrow(SymmetricMatrix):
         The programme is solved with the constraints that the step before has violated, until it violates no other:
         since it is strictly convex, that is the solution with all of them.
         """
-        step = newton = newton_step(gradient, self, factor)
+        step = newton = qp.newton_step(gradient, self, factor)
         pull, size = np.zeros(len(room.lower)), np.sqrt((room.normals**2).sum(1))
         working = np.zeros(0, dtype=np.intp)
         # Thousands of rows for many runs, few of which matter: the working set only grows, so that the loop ends.
@@ -457,14 +457,10 @@ class Arrow(SymmetricMatrix):
             # The step is a combination of Newton's and of B⁻¹ C', C being the working set: as many unknowns as that
             # has.
             spanning = np.array([newton, *(factor.solve(row) for row in rows)]) * factor.scaling
-            own = np.linalg.qr(spanning.T)[0].T / factor.scaling
-            reduced = np.array([self.dot(direction) for direction in own]) @ own.T
-            wide = np.full(len(own), np.inf)
-            lower, upper = np.append(room.lower[working], -wide), np.append(room.upper[working], wide)
-            inside = Room(np.concatenate([rows @ own.T, np.eye(len(own))]), lower, upper)
-            found, forces = solve_programme(own @ gradient, reduced, CholeskyFactor.of(reduced), inside)
-            pull[working] = forces[: working.size]
-            step = found @ own
+            span = np.linalg.qr(spanning.T)[0] / factor.scaling[:, None]
+            reduced = np.array([self.dot(direction) for direction in span.T]) @ span
+            within = room.lower[working], room.upper[working]
+            step, pull[working] = qp.solve_in_span(gradient, reduced, span, rows, *within)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the curvature in the null space of normals (k, d), as `Dense.curvature`.
@@ -615,7 +611,7 @@ def _convex_on_face(
     # H + sigma N'N is H on the face, and positive definite for a large sigma if and only if H is there ([1]_, 17.4).
     for stiffness in STIFFENINGS if len(normals) else ():
         stiff = scaled + stiffness * across
-        if has_curvature(stiff):
+        if qp.has_curvature(stiff):
             return stiff
     return make_definite(scaled)
 

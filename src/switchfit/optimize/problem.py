@@ -93,11 +93,6 @@ class Problem:
         """Size of the terms of each row of the constraints, to which rounding errors are relative: (m,)."""
         return np.asarray(self.constraints.sizes[0] @ self.size)
 
-    @cached_property
-    def largest_size(self) -> float:
-        """The largest typical size of a coordinate."""
-        return float(self.size.max())
-
     @property
     def has_region(self) -> bool:
         """Whether steps are searched for in a trust region, in which equality constraints always are."""
@@ -229,7 +224,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
     slack = constraints.slack(moved)
     # The usual case: no constraint within reach of the step, and nothing to be done bit by bit.
-    if constraints.are_far(slack, largest(scale + np.abs(step)) + problem.largest_size):
+    if constraints.are_far(slack, largest(scale + np.abs(step)) + largest(problem.size)):
         return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))

@@ -70,11 +70,6 @@ class LinearConstraints:
     upper: FloatArray
     names: tuple[object, ...]
 
-    @property
-    def size(self) -> int:
-        """Number of unknowns, d."""
-        return self.lower.size
-
     @cached_property
     def movable(self) -> BoolArray:
         """Which unknowns their bounds leave any room, shape (d,)."""
@@ -83,13 +78,8 @@ class LinearConstraints:
     @cached_property
     def normals(self) -> FloatArray:
         """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
-        identity = np.eye(self.size)
+        identity = np.eye(self.lower.size)
         return np.vstack([self.A, identity, -identity])
-
-    @cached_property
-    def open(self) -> FloatArray:
-        """Upper bounds of the rows, which have none: (m,)."""
-        return np.full(self.b.size, np.inf)
 
     def exact_rows(self, index: IntArray) -> list[tuple[int, int, float]]:
         """Of the given rows of A those that can hold with equality in floating point.
@@ -216,7 +206,7 @@ def nearest_feasible(constraints: LinearConstraints, theta: FloatArray, size: Fl
     # In units of the sizes, and of the largest violation: min ||s||^2 subject to lower <= N s <= upper.
     rows, lengths = algebra.unit_rows(constraints.A * size)
     lower = np.concatenate([(constraints.lower - theta) / size, (constraints.b - constraints.A @ theta) / lengths])
-    upper = np.concatenate([(constraints.upper - theta) / size, constraints.open])
+    upper = np.concatenate([(constraints.upper - theta) / size, np.full(len(rows), np.inf)])
     violation = max(algebra.largest(lower), -algebra.smallest(upper))
     normals = np.concatenate([np.eye(theta.size), rows])
     found = find_least_distance(np.zeros(theta.size), normals, lower / violation, upper / violation)
@@ -244,7 +234,7 @@ class Room(NamedTuple):
         """Return the room around a feasible point with the given slack (m + 2 d,)."""
         m, d = constraints.A.shape
         slack = np.maximum(slack, 0.0)
-        upper = np.concatenate([constraints.open, slack[m + d :]])
+        upper = np.concatenate([np.full(m, np.inf), slack[m + d :]])
         return cls(constraints.normals[: m + d], -slack[: m + d], upper)
 
     @property
@@ -330,6 +320,20 @@ def solve_programme(
             e, pull = e + refined[0], np.where(active, pull + refined[1], 0.0)
     pull = length * pull / lengths
     return room.move_inside(room.press(length * factor.unwhiten(e), pull)), pull
+
+
+def solve_in_span(
+    gradient: FloatArray, matrix: FloatArray, span: FloatArray, rows: FloatArray, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Minimize the programme of the steps ``d = S w`` with the matrix ``Sᵀ B S`` and ``lower <= rows d <= upper``.
+
+    The result is that of `solve_programme`: the step (d,), and what the rows exert.
+    """
+    wide = np.full(len(matrix), np.inf)
+    normals = np.concatenate([rows.dot(span), np.eye(wide.size)])
+    inside = Room(normals, np.append(lower, -wide), np.append(upper, wide))
+    found, pull = solve_programme(span.T.dot(gradient), matrix, CholeskyFactor.of(matrix), inside)
+    return span.dot(found), pull[: len(rows)]
 
 
 class CholeskyFactor(NamedTuple):
@@ -508,9 +512,14 @@ def solve_composite(
     step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
     pull, definite, force = np.zeros(len(room.lower)), True, slope + bending.dot(step)
     if rows.null.size:
+        # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
         least = FLAT * algebra.largest(np.abs(slope)) + TINY
+        matrix, definite = shift_to_positive(rows.null.T.dot(bending).dot(rows.null), least)
         cube = room.narrow(np.full(d, radius))
-        step, pull, definite = _add_tangential_step(force, bending, rows.null, least, step, cube)
+        products = cube.normals.dot(step)
+        lower, upper = np.minimum(cube.lower - products, 0.0), np.maximum(cube.upper - products, 0.0)
+        tangential, pull = solve_in_span(force, matrix, rows.null, cube.normals, lower, upper)
+        step = cube.press(step + tangential, pull)
         force = slope + bending.dot(step)
     # What the inequalities exert is taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the
     # least-squares sense.
@@ -522,26 +531,6 @@ def _scale_room(room: Room, reach: FloatArray) -> Room:
     """Return a room in units of `reach` (d,)."""
     unit = np.concatenate([np.ones(len(room.normals) - reach.size), reach])
     return Room(room.normals * (reach / unit[:, None]), room.lower / unit, room.upper / unit)
-
-
-def _add_tangential_step(
-    slope: FloatArray, bending: FloatArray, null: FloatArray, least: float, normal: FloatArray, cube: Room
-) -> tuple[FloatArray, FloatArray, bool]:
-    """Return the sum of normal and tangential step (d,), and what presses as of `solve_programme`, (m + d,).
-
-    The third result is whether H was definite. Everything is in units in which the trust region is a cube; `slope` is
-    that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
-    """
-    # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
-    (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
-    # What bounds v + Z w bounds w by rows alone.
-    products, free = cube.normals.dot(normal), np.full(slope.size, np.inf)
-    lower = np.concatenate([np.minimum(cube.lower - products, 0.0), -free])
-    upper = np.concatenate([np.maximum(cube.upper - products, 0.0), free])
-    inside = Room(np.concatenate([cube.normals.dot(null), np.eye(slope.size)]), lower, upper)
-    found, pull = solve_programme(slope, matrix, CholeskyFactor.of(matrix), inside)
-    pull = pull[: -slope.size]
-    return cube.press(normal + null.dot(found), pull), pull, definite
 
 
 def find_normal_step(equalities: Equalities, room: Room, reach: FloatArray, radius: float) -> FloatArray:

@@ -222,10 +222,8 @@ def _measure_anew(oracle: Oracle, state: State) -> State:
     point = oracle.point(Trial.at(oracle.problem, theta), state.scale)
     if point is None:
         return state
-    fresh = State.at(point)
-    return state._replace(
-        point=point, penalty=fresh.penalty, steady_violation=fresh.steady_violation, stagnant=fresh.stagnant
-    )
+    penalty = State.at(point).penalty
+    return state._replace(point=point, penalty=penalty, steady_violation=point.violation, stagnant=0)
 
 
 def _is_settled(problem: Problem, state: State, direction: step.Direction) -> bool:
@@ -317,7 +315,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
     point = state.point
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = state.curvature_at(problem, point.active)
-    held = () if point.kink is None else np.flatnonzero(state.genuine_kinks)
+    held = np.flatnonzero(state.genuine_kinks)
     equalities = _list_equalities(oracle, point)
     missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(max(len(equalities), 1))
     return Result(

@@ -285,7 +285,7 @@ class Oracle:
         first = np.zeros(len(problem.equalities)) if multipliers is None else multipliers
         self.multipliers: FloatArray = np.asarray(first, dtype=float)
         self.units: FloatArray | None = None
-        d = problem.constraints.size
+        d = len(problem.size)
         self._no_side: IntArray = np.zeros(d, dtype=int)
         self._no_multipliers = np.zeros(len(problem.constraints.names))
         self._no_equalities = Equalities(np.zeros(0), np.zeros((0, d)))
@@ -328,12 +328,9 @@ class Oracle:
             return False
         rows = point.plus.equalities.jacobian * self.problem.reach
         lengths = np.sqrt((rows * rows).sum(1))
-        grown = lengths > GROWN
-        if not np.count_nonzero(grown):
-            return False
-        self.units = np.where(grown, self.units * lengths, self.units)
-        self.multipliers = np.where(grown, self.multipliers * lengths, self.multipliers)
-        return True
+        grown = np.where(lengths > GROWN, lengths, 1.0)
+        self.units, self.multipliers = self.units * grown, self.multipliers * grown
+        return bool((grown > 1.0).any())
 
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""

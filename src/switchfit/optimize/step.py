@@ -105,7 +105,7 @@ def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piec
 
     Its matrix B is H made positive definite where it is not, inside the room and the trust region.
     """
-    constraints, point, d = problem.constraints, state.point, problem.constraints.size
+    constraints, point, d = problem.constraints, state.point, len(problem.size)
     gradient, hessian = point.derivatives(sides)
     room, free = _room(problem, state, sides, piece)
     if problem.equalities:

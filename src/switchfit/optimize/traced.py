@@ -360,10 +360,8 @@ def _find_step(state: State, task: Task) -> State:
     step, slope = _direction(state, task.constraints, task.breakpoints)
     negligible = algebra.is_negligible(step, state.scale, jnp)
     # A step inside the piece follows a refusal: the point is the old one, which has been judged already.
-    fresh = ~state.inside
-    stationary = (
-        fresh & (state.point.optimality <= task.tolerance) & (negligible | (state.below >= algebra.EXTRA_ITERATIONS))
-    )
+    fresh, low = ~state.inside, state.point.optimality <= task.tolerance
+    stationary = fresh & low & (negligible | (state.below >= algebra.EXTRA_ITERATIONS))
     done = stationary | (fresh & (state.iterations >= task.max_iterations))
     return state._replace(step=step, slope=slope, undirected=jnp.zeros((), bool), stationary=stationary, done=done)
 
