@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -87,11 +86,6 @@ class Problem:
     reach: FloatArray
     equalities: tuple[str, ...]
     accuracy: Callable[[], float] | None
-
-    @cached_property
-    def row_size(self) -> FloatArray:
-        """Size of the terms of each row of the constraints, to which rounding errors are relative: (m,)."""
-        return np.asarray(self.constraints.sizes[0] @ self.size)
 
     @property
     def has_region(self) -> bool:
@@ -230,7 +224,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
     near = 8 * EPS * np.maximum((step != 0.0) * reach, problem.size)
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
-    if (constraints.A @ moved - constraints.b > 16 * EPS * problem.row_size).all():
+    if (constraints.A @ moved - constraints.b > 16 * EPS * (constraints.sizes[0] @ problem.size)).all():
         return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True
@@ -245,7 +239,7 @@ def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: 
     """
     constraints = problem.constraints
     slack = constraints.A @ theta - constraints.b
-    close = np.abs(slack) <= reach * problem.row_size
+    close = np.abs(slack) <= reach * (constraints.sizes[0] @ problem.size)
     if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()

@@ -470,8 +470,7 @@ def _compute_scaling(hessian: Array, floor: Array) -> Array:
         return jnp.max(size / jnp.outer(scaling, scaling), axis=1)
 
     def go_on(state: tuple[Array, Array, Array]) -> Array:
-        rounds, _, largest = state
-        return (rounds < algebra.EQUILIBRATIONS) & jnp.any(largest > algebra.EQUILIBRATED)
+        return (state[0] < algebra.EQUILIBRATIONS) & jnp.any(state[2] > algebra.EQUILIBRATED)
 
     # Rounds as in `diagonal_scaling`; a positive definite matrix needs none of them.
     start = algebra.jacobi_scaling(jnp.maximum(jnp.diagonal(size), floor), jnp.max(size, axis=1), jnp)
