@@ -18,17 +18,11 @@ SHARED = [9, 10]
 
 def arrow_of(full):
     """The arrow that holds a full matrix of its shape."""
-    k = LAYOUT.own.shape[1]
-    extended = np.zeros((12, 12))
-    extended[:11, :11] = full
-    parts = []
-    for e, own in enumerate(LAYOUT.own):
-        place = np.concatenate([own, LAYOUT.shared])
-        part = extended[np.ix_(place, place)]
-        if e:
-            part[k:, k:] = 0.0  # shared with shared counts once
-        parts.append(part)
-    return Arrow.of_runs(LAYOUT, parts)
+    extended = np.pad(full, (0, 1))
+    own, shared = LAYOUT.own, LAYOUT.shared
+    padding = (own == 11)[:, :, None] * np.eye(own.shape[1])
+    blocks, borders = extended[own[:, :, None], own[:, None, :]] + padding, extended[own[:, :, None], shared]
+    return Arrow(LAYOUT, blocks, borders, full[np.ix_(shared, shared)])
 
 
 def random_matrix(rng, lowest=None):

@@ -141,8 +141,6 @@ def _choices(sides: IntArray, concave: BoolArray, normals: FloatArray) -> Iterat
 GROWN = 100.0
 #: Equality constraints below this value, in their units, count as met.
 MET = 1e-8
-#: Jumps of a derivative larger than this part of the largest derivative are not integration errors.
-LARGE_JUMP = 1e-6
 
 
 class Sample(NamedTuple):
@@ -226,11 +224,10 @@ class Point:
         """Whether no constraint is active and no coordinate at a kink."""
         return self.active.size == 0 and self.kink is None
 
-    @property
-    def jumps(self) -> bool:
-        """Whether a derivative jumps upwards at a breakpoint here, by more than an integrator's error explains."""
-        jump = self.plus.gradient - self.minus.gradient
-        return self.kink is not None and bool((jump[self.kink] > LARGE_JUMP * self.largest_derivative).any())
+    def find_jumps(self, least: float) -> BoolArray:
+        """Return which derivatives jump upwards at a breakpoint here by more than this: (d,)."""
+        kink = np.zeros(self.theta.size, dtype=bool) if self.kink is None else self.kink
+        return np.asarray(kink & (self.plus.gradient - self.minus.gradient > least))
 
     @property
     def largest_derivative(self) -> float:
@@ -711,11 +708,7 @@ class State(NamedTuple):
     @property
     def genuine_kinks(self) -> BoolArray:
         """Coordinates on a breakpoint at which the derivative jumps upwards by more than rounding: (d,)."""
-        point = self.point
-        if point.kink is None:
-            return np.zeros(point.theta.size, dtype=bool)
-        jump = point.plus.gradient - point.minus.gradient
-        return np.asarray(point.kink & (jump > algebra.SMALLEST_JUMP * self.gradient_scale))
+        return self.point.find_jumps(algebra.SMALLEST_JUMP * self.gradient_scale)
 
     def curvature_at(self, problem: Problem, rows: IntArray) -> Curvature:
         """Return the curvature of J, unmodified, in the null space of the constraints at `rows` and off the kinks."""

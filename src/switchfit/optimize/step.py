@@ -230,6 +230,8 @@ def next_radius(problem: Problem, direction: Direction, decrease: float, predict
 MAX_HALVINGS = 200
 #: Iterations after which a step that fails in a trust region is followed by one more before the region shrinks.
 PATIENCE = 15
+#: Jumps of a derivative larger than this part of the largest derivative are not integration errors.
+LARGE_JUMP = 1e-6
 
 
 def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -329,8 +331,10 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
         length = 1.0 if accepted is None else 2.0 * alpha
         nearer = find_direction(problem, state._replace(metric=length * state.metric), piece)
         stop = _attempt(oracle, state, nearer, 1.0, algebra.ARMIJO_ACROSS)
-        if stop is not None and (accepted is None or stop.point.jumps):
-            return Accepted(stop.point, alpha)
+        if stop is not None:
+            jumps = stop.point.find_jumps(LARGE_JUMP * stop.point.largest_derivative)
+            if accepted is None or jumps.any():
+                return Accepted(stop.point, alpha)
     return None if accepted is None else Accepted(accepted.point, alpha)
 
 

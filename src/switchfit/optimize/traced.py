@@ -260,8 +260,7 @@ def minimize_traced(task: Task, start: Array) -> Outcome:
     # One J a turn, then one step where the point was accepted: fits that run in lockstep never wait for a line search.
     def turn(state: State) -> State:
         after = take_turn(state, task)
-        find_step = partial(_find_step, task=task)
-        return lax.cond(after.undirected & ~after.done, find_step, lambda state: state, after)
+        return lax.cond(after.undirected & ~after.done, partial(_find_step, task=task), lambda state: state, after)
 
     return build_outcome(lax.while_loop(lambda state: ~state.done, turn, State.at(start)), task.constraints)
 
