@@ -40,7 +40,8 @@ class Spectrum(NamedTuple):
     Attributes
     ----------
     smallest : float
-        Smallest eigenvalue of the diagonally scaled Hessian; NaN without free directions, or without a Hessian.
+        Smallest eigenvalue of the diagonally scaled Hessian; NaN without free directions, or without a Hessian. Of an
+        arrow, infinite where all are above `algebra.EIGENVALUE_FLOOR`: how large they are is not needed then.
     lowest : array, shape (d,)
         Its direction, of unit length in theta.
     """
@@ -465,8 +466,8 @@ class Arrow(SymmetricMatrix):
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the curvature in the null space of normals (k, d), as `Dense.curvature`.
 
-        The smallest eigenvalue alone, where each normal is that of a bound and it is positive. All other cases are rare
-        enough to be left to the algebra of full matrices.
+        Block by block where each normal is that of a bound, to see that all eigenvalues are positive. All other cases
+        are rare enough to be left to the algebra of full matrices.
         """
         # A normal with one entry is that of a bound: its null space is made of coordinates, and the arrow keeps its
         # shape there.
@@ -477,14 +478,12 @@ class Arrow(SymmetricMatrix):
         left_out[places] = True
 
         def find_spectrum() -> Spectrum:
-            # Scaled as in `dense`: eigenvalues have no unit, and the direction is taken back to theta.
+            # Scaled as in full: eigenvalues have no unit.
             kept = self.held(~left_out)
-            scaling = diagonal_scaling(kept, flat)
-            smallest, lowest = _smallest_eigenvalue(kept.scale(scaling), ~left_out)
-            if lowest is None or left_out.all():
+            scaled = kept.scale(diagonal_scaling(kept, flat))
+            if left_out.all() or ArrowFactor.of(scaled.plus_diagonal(-algebra.EIGENVALUE_FLOOR)) is None:
                 return Dense(self.dense()).curvature(normals, held, flat).spectrum
-            lowest = lowest / scaling
-            return Spectrum(smallest, lowest / np.linalg.norm(lowest))
+            return Spectrum(np.inf, np.zeros(len(held)))
 
         return Curvature(np.eye(len(held))[:, ~left_out], find_spectrum)
 
@@ -559,23 +558,6 @@ def _replace_eigenvalues(scaled: Arrow) -> Arrow:
         complement = Dense.of(scaled.corner - tie, len(tie))
         corner = complement.convexify(np.zeros((0, len(tie))))[0].array + tie
     return Arrow(scaled.layout, blocks, scaled.borders, 0.5 * (corner + corner.T))
-
-
-def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatArray | None]:
-    """Return the smallest eigenvalue on the free coordinates, and its vector; None if it is not positive."""
-    factor = ArrowFactor.of(matrix)
-    if factor is None:
-        return np.nan, None
-    # Inverse iteration from a fixed random start. Held unknowns are decoupled: where they start at zero, they stay
-    # there.
-    vector = np.where(free, np.random.default_rng(0).normal(size=free.size), 0.0)
-    value = np.inf
-    for _ in range(1000):
-        vector = np.where(free, factor.solve(vector / algebra.norm(vector)), 0.0)
-        before, value = value, 1.0 / algebra.norm(vector)
-        if abs(value - before) <= 1e-8 * value:
-            break
-    return value, vector / algebra.norm(vector)
 
 
 def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals: FloatArray) -> Spectrum:
