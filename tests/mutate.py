@@ -21,8 +21,7 @@ SOURCE = ROOT / "src" / "switchfit"
 PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
 MODEL, PROPAGATION = "discretization/model.py", "discretization/propagation.py"
 STRUCTURE, CORNERS, EVALUATOR = "problem/structure.py", "problem/corners.py", "fit/evaluator.py"
-ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
-DIRECTION, POINT, QP, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "qp", "state"))
+ALGEBRA, QP, STATE, STEP = (f"optimize/{name}.py" for name in ("algebra", "qp", "state", "step"))
 PROGRAMS, COURSE, SPLIT = "engine/jax.py", "engine/branches.py", "engine/choice.py"
 HYPOTHESES = "engine/native/hypotheses.py"
 KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
@@ -184,27 +183,29 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
     },
     "equalities": {
-        "second-order correction": swap(MERIT, "if found is not None or not first:", "if True:"),
+        "second-order correction": swap(STEP, "or not correcting:", "or True:"),
         "the penalty is raised": swap(
-            MERIT, "return penalty if penalty >= needed else RAISED * needed", "return penalty"
+            STEP, "return penalty if penalty >= needed else RAISED * needed", "return penalty"
         ),
         "a violation that does not change ends it": swap(
-            MERIT, "return equalities.predict(normal) > FALL * point.violation", "return False"
+            STEP, "return equalities.predict(normal) > FALL * point.violation", "return False"
         ),
-        "constraints are measured anew": swap(POINT, "grown = lengths > GROWN", "grown = lengths < 0.0"),
+        "constraints are measured anew": swap(
+            STATE, "np.where(lengths > GROWN, lengths, 1.0)", "np.ones(len(lengths))"
+        ),
         "a violation that stays the same for a while is no end": swap(
-            MERIT, "return equalities.predict(normal) > FALL * point.violation", "return True"
+            STEP, "return equalities.predict(normal) > FALL * point.violation", "return True"
         ),
-        "the constraints in the Hessian of the Lagrangian": swap(POINT, "self.multipliers / units)", "0.0 * units)"),
-        "bounds of the normal step": swap(COMPOSITE, "if cube.holds(shortest):", "if True:"),
-        "dependent rows": swap(COMPOSITE, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),
+        "the constraints in the Hessian of the Lagrangian": swap(STATE, "self.multipliers / units)", "0.0 * units)"),
+        "bounds of the normal step": swap(QP, "if cube.holds(shortest):", "if True:"),
+        "dependent rows": swap(QP, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),
         "curvature along the constraints alone": swap(
             STATE,
-            "np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])",
-            "constraints.rows(rows)",
+            "np.vstack([constraints.normals[rows], point.equalities(point.reported_sides).jacobian])",
+            "constraints.normals[rows]",
         ),
         "kinks that keep constraints from being met": swap(
-            DIRECTION, "if point.kink is None or found.left <= max(HALF * point.violation, MET):", "if True:"
+            STEP, "if point.kink is None or found.left <= max(HALF * point.violation, MET):", "if True:"
         ),
     },
     "final time": {

@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -25,7 +26,7 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize.qp import nearest_feasible
-from switchfit.optimize.traced import Breakpoints, Constraints, minimize_traced, nonnegative_minimum
+from switchfit.optimize.traced import Breakpoints, Constraints, Task, minimize_traced, nonnegative_minimum
 from switchfit.problem.functions import use_float64
 from switchfit.strategy.starts import draw_starts
 
@@ -103,10 +104,10 @@ def test_the_traced_optimiser_ends_where_the_other_one_does(name):
     constraints = linear(A, b, low, high)
     expected = minimize(as_point(lambda theta, side: map(np.asarray, valley(theta))), start, constraints=constraints)
     with use_float64():
-        outcome = jax.jit(minimize_traced, static_argnums=0)(
-            lambda theta, side: tuple(map(jnp.asarray, valley(theta))), start, Constraints(A, b, low, high),
-            Breakpoints((), jnp.zeros((0, 1))), tolerance=1e-9, max_iterations=200,
-        )  # fmt: skip
+        none = Breakpoints(np.zeros(0, int), jnp.zeros((0, 1)))
+        evaluate = lambda theta, side: tuple(map(jnp.asarray, valley(theta)))  # noqa: E731
+        task = Task(evaluate, Constraints(*map(jnp.array, (A, b, low, high))), none, 1e-9, 200)
+        outcome = jax.jit(partial(minimize_traced, task))(start)
     assert bool(outcome.settled) is settled
     assert float(outcome.optimality) <= 1e-9
     np.testing.assert_allclose(outcome.theta, expected.theta, rtol=0, atol=1e-9)
@@ -126,14 +127,10 @@ def kinked(theta, side, H, centre, weights, xp):
 @jax.jit
 def fitted_with_kinks(start, H, centre, weights):
     """The traced optimiser on `kinked`, its first two coordinates in order."""
-    return minimize_traced(
-        lambda theta, side: kinked(theta, side, H, centre, weights, jnp),
-        start,
-        Constraints(jnp.array([[-1.0, 1.0, 0.0]]), jnp.zeros(1), jnp.zeros(3), jnp.full(3, 10.0)),
-        Breakpoints((0, 1, 2), jnp.asarray(np.tile(KNOTS, (3, 1)))),
-        tolerance=1e-9,
-        max_iterations=200,
-    )
+    evaluate = partial(kinked, H=H, centre=centre, weights=weights, xp=jnp)
+    constraints = Constraints(jnp.array([[-1.0, 1.0, 0.0]]), jnp.zeros(1), jnp.zeros(3), jnp.full(3, 10.0))
+    breakpoints = Breakpoints(np.arange(3), jnp.asarray(np.tile(KNOTS, (3, 1))))
+    return minimize_traced(Task(evaluate, constraints, breakpoints, 1e-9, 200), start)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4])

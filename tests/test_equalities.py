@@ -1,6 +1,6 @@
 """Equality constraints in the SQP: published and closed answers, SciPy, and what each term of the method is for."""
 
-from dataclasses import dataclass
+from collections import namedtuple
 from functools import cache
 
 import jax
@@ -11,20 +11,10 @@ import scipy.optimize
 from optimizer import box, free, minimize, rows
 
 from switchfit.optimize import Status
-from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
-from switchfit.optimize.qp import Room
+from switchfit.optimize.qp import Equalities, Room, find_normal_step, solve_composite
 from switchfit.problem.functions import use_float64
 
-
-@dataclass
-class Here:
-    """One evaluation."""
-
-    cost: float
-    gradient: np.ndarray
-    hessian: np.ndarray
-    constraints: np.ndarray
-    jacobian: np.ndarray
+Here = namedtuple("Here", "cost gradient hessian constraints jacobian")
 
 
 @cache
@@ -354,20 +344,12 @@ def test_composite_steps_satisfy_the_conditions_of_their_programmes(seed):
     offsets = -rng.uniform(0.0, 1.0, size=2 * d) * (rng.random(2 * d) > 0.2)
     reach, radius = 10 ** rng.uniform(-1, 1, size=d), 10 ** rng.uniform(-1, 1)
     room = Room(np.eye(d), offsets[:d], -offsets[d:])
-    found = solve_composite(g, H, Equalities(c, A), room, reach, radius)
-    step = found.step
+    step, _, _ = solve_composite(g, H, Equalities(c, A), room, reach, radius)
     assert np.all(np.abs(step) <= radius * reach * (1 + 1e-9))
     assert np.all(N @ step >= offsets - 1e-9)
     normal = find_normal_step(Equalities(c, A), room, reach, 0.95 * radius)
-    best = scipy.optimize.lsq_linear(
-        A,
-        -c,
-        (
-            np.maximum(offsets[:d], -0.95 * radius * reach) - 1e-300,
-            np.minimum(-offsets[d:], 0.95 * radius * reach) + 1e-300,
-        ),
-        method="bvls",
-    )
+    low, high = np.maximum(offsets[:d], -0.95 * radius * reach), np.minimum(-offsets[d:], 0.95 * radius * reach)
+    best = scipy.optimize.lsq_linear(A, -c, (low - 1e-300, high + 1e-300), method="bvls")
     assert np.linalg.norm(c + A @ normal) == pytest.approx(np.sqrt(2 * best.cost), rel=1e-6, abs=1e-9)
     np.testing.assert_allclose(A @ step, A @ normal, atol=1e-8 * (1 + np.abs(c).max()))
     # Inside the null space the model, made convex, is not lower at the normal step.
@@ -384,11 +366,8 @@ def test_a_normal_step_stays_where_the_inequalities_allow(seed):
         jacobian = rng.normal(size=(2, 4)) * 10.0 ** rng.uniform(-4, 1, (2, 1))
         slack = 10.0 ** rng.uniform(-12, 0, 3)
         slack[rng.integers(3)] = 0.0
-        reach, lower, upper = (
-            10.0 ** rng.uniform(-2, 1, 4),
-            -(10.0 ** rng.uniform(-6, 1, 4)),
-            10.0 ** rng.uniform(-6, 1, 4),
-        )
+        reach = 10.0 ** rng.uniform(-2, 1, 4)
+        lower, upper = -(10.0 ** rng.uniform(-6, 1, 4)), 10.0 ** rng.uniform(-6, 1, 4)
         order = np.diff(np.eye(4), axis=0)
         room = Room(np.vstack([order, np.eye(4)]), np.append(-slack, lower), np.append(np.full(3, np.inf), upper))
         step = find_normal_step(Equalities(rng.normal(size=2), jacobian), room, reach, 1.0)

@@ -10,7 +10,7 @@ from derivatives import differentiate
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import _to_variables
-from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.matrix import Arrow
 from switchfit.problem.unknowns import Variables
 from switchfit.strategy.starts import draw_starts
 

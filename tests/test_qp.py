@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from optimizer import solve_qp
 
 from switchfit.optimize import qp
-from switchfit.optimize.matrix import Dense, diagonal_scaling, null_space, shift_to_positive
-from switchfit.optimize.point import kkt_residual
-from switchfit.optimize.qp import CholeskyFactor, Room, solve_programme
+from switchfit.optimize.matrix import Dense, diagonal_scaling, null_space
+from switchfit.optimize.qp import CholeskyFactor, Room, shift_to_positive, solve_programme
+from switchfit.optimize.state import kkt_residual
 
 SEEDS = st.integers(0, 2**32 - 1)
 

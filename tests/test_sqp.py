@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from optimizer import box, free, minimize, rows
 
 from switchfit.optimize import Status
-from switchfit.optimize.point import kkt_residual
+from switchfit.optimize.state import kkt_residual
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -369,7 +369,7 @@ def test_flat_direction_is_singular_and_named():
     result = minimize(smooth(function), [1e-3, 1e3, 1.0], constraints=free(3))
     assert result.status is Status.SINGULAR
     assert abs(result.smallest_eigenvalue) < 1e-12
-    np.testing.assert_allclose(np.abs(result.flat_direction), [0.0, 1.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(np.abs(result.curvature.spectrum.lowest), [0.0, 1.0, 0.0], atol=1e-5)
 
 
 def test_infinite_and_undefined_regions_are_backed_away_from():

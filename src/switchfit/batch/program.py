@@ -43,7 +43,7 @@ from switchfit.fit.result import Fit, Kink, Termination, inverse_on, termination
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Result, Status
 from switchfit.optimize.problem import HessianKind
-from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, minimize_traced
+from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, Task, minimize_traced
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.parameter import PriorTerms
@@ -521,7 +521,7 @@ def _minimize_fits(
             return J, *variables.derivatives_inward(theta, g, H, jnp)
 
         breakpoints = _list_breakpoints(layout, replace_leaves(inputs.arguments, layout.varying, own))
-        found = minimize_traced(evaluate, start, constraints, breakpoints, **limits._asdict())
+        found = minimize_traced(Task(evaluate, constraints, breakpoints, *limits), start)
         theta = inputs.find_theta(found.theta)
         left = variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
         gradient, hessian = variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
@@ -569,10 +569,10 @@ def _list_breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Break
         if place >= 0
     }
     if not nodes:
-        return Breakpoints((), jnp.zeros((0, 1)))
+        return Breakpoints(np.zeros(0, np.intp), jnp.zeros((0, 1)))
     longest = max(len(a) for a in nodes.values())
     padded = [jnp.pad(a, (0, longest - len(a)), constant_values=jnp.inf) for a in nodes.values()]
-    return Breakpoints(tuple(nodes), jnp.stack(padded))
+    return Breakpoints(np.array(list(nodes)), jnp.stack(padded))
 
 
 _NO_PROGRAM = (

@@ -216,7 +216,7 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
     cleaned = np.where(noise | noise[:, None], 0.0, hessian)
     held = null_space(np.hstack([result.free_basis, np.eye(d)[:, noise]]).T).T
     curvature = Dense(cleaned).curvature(held, np.zeros(d, dtype=bool), np.zeros(d))
-    if not hessian[noise].any() or curvature.smallest < NEGATIVE_CURVATURE:
+    if not hessian[noise].any() or curvature.spectrum.smallest < NEGATIVE_CURVATURE:
         return result
     kinks = tuple(kink for kink in result.kinks if not noise[kink[0]])
     return replace(result, status=Status.SINGULAR, hessian=cleaned, curvature=curvature, kinks=kinks)

@@ -23,7 +23,7 @@ from switchfit.engine.adaptive import refine_if_unstable, refine_mesh_of_run
 from switchfit.engine.choice import SplitEngine, engine_of, summarize
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.protocol import Engine, Evaluation, Matrix, Run, Simulation, runs_of
-from switchfit.optimize.arrow import Arrow, ArrowLayout
+from switchfit.optimize.matrix import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint

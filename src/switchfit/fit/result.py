@@ -140,7 +140,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
     smallest: float = np.nan
     flat: tuple[tuple[str, float], ...] = ()
     if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status needs them
-        smallest, flat = result.smallest_eigenvalue, _list_largest(result.flat_direction, names)
+        smallest, flat = result.smallest_eigenvalue, _list_largest(result.curvature.spectrum.lowest, names)
     return Termination(
         status=result.status,
         cost=result.cost,

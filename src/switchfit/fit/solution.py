@@ -25,7 +25,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.faults import list_changes, refuse_hidden_switches
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
 from switchfit.optimize.algebra import EPS
-from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.matrix import Arrow
 from switchfit.optimize.problem import Breakpoints, HessianKind
 from switchfit.optimize.problem import Problem as Minimization
 from switchfit.optimize.state import Finding

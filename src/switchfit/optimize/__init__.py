@@ -5,11 +5,4 @@ from switchfit.optimize.qp import LinearConstraints
 from switchfit.optimize.sqp import minimize
 from switchfit.optimize.state import IterationRecord, Result, Status
 
-__all__ = [
-    "HessianKind",
-    "IterationRecord",
-    "LinearConstraints",
-    "Result",
-    "Status",
-    "minimize",
-]
+__all__ = ["HessianKind", "IterationRecord", "LinearConstraints", "Result", "Status", "minimize"]

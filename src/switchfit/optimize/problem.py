@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -88,35 +87,10 @@ class Problem:
     equalities: tuple[str, ...]
     accuracy: Callable[[], float] | None
 
-    @cached_property
-    def row_size(self) -> FloatArray:
-        """Size of the terms of each row of the constraints, to which rounding errors are relative: (m,)."""
-        return np.asarray(self.constraints.sizes[0] @ self.size)
-
-    @cached_property
-    def row_rounding(self) -> FloatArray:
-        """Rounding error of the rows: (m,)."""
-        return np.asarray(16 * EPS * self.row_size)
-
-    @cached_property
-    def largest_size(self) -> float:
-        """The largest typical size of a coordinate."""
-        return float(self.size.max())
-
-    @cached_property
-    def rounding(self) -> FloatArray:
-        """Rounding error of each coordinate at its typical size: (d,)."""
-        return np.asarray(8 * EPS * self.size)
-
-    @property
-    def has_box(self) -> bool:
-        """Whether steps stay inside a trust region where the Hessian is indefinite or predicts badly."""
-        return self.hessian == "auto"
-
     @property
     def has_region(self) -> bool:
         """Whether steps are searched for in a trust region, in which equality constraints always are."""
-        return self.has_box or bool(self.equalities)
+        return self.hessian == "auto" or bool(self.equalities)
 
     @property
     def uses_hessian(self) -> bool:
@@ -163,7 +137,10 @@ class Breakpoints:
         values, starts, steps, sizes = moved.tolist(), theta.tolist(), step.tolist(), size.tolist()
         for i, points in self.of_coordinates:
             x, by = values[i], steps[i]
-            mark = _nearest(points, x)
+            above = bisect_left(points, x)
+            if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
+                above -= 1
+            mark = points[above]
             reach = max(abs(starts[i]), abs(by), abs(x)) if by != 0.0 else 0.0
             if abs(mark - x) <= 8 * EPS * max(reach, sizes[i]):
                 moved[i] = mark
@@ -190,24 +167,6 @@ class Breakpoints:
                 high[i] = min(high[i], points[above])
         return low, high
 
-    def next_on(self, theta: FloatArray, step: FloatArray) -> float:
-        """Return the fraction of a step (d,) up to the first breakpoint that a coordinate meets, or infinity."""
-        fractions = [_next(points, float(theta[i]), float(step[i])) for i, points in self.of_coordinates]
-        return min(fractions, default=np.inf)
-
-
-def _nearest(points: list[float], x: float) -> float:
-    above = bisect_left(points, x)
-    if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
-        above -= 1
-    return points[above]
-
-
-def _next(points: list[float], x: float, step: float) -> float:
-    """Return the fraction of a step of one coordinate up to the next breakpoint; infinite if it meets none."""
-    k = bisect_right(points, x) if step > 0.0 else bisect_left(points, x) - 1
-    return (points[k] - x) / step if step != 0.0 and 0 <= k < len(points) else np.inf
-
 
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
     """Return the start theta (d,) with violations of the size of rounding removed; ValueError for larger ones."""
@@ -217,10 +176,8 @@ def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
         return start
     slack = constraints.slack(theta)
     if (slack < 0.0).any():
-        bounds = np.abs(np.concatenate([constraints.lower, constraints.upper]))
-        A, b = constraints.sizes
-        rows = b + A @ np.maximum(np.abs(theta), problem.size)
-        size = np.concatenate([rows, np.where(np.isfinite(bounds), bounds, 0.0)])
+        (A, b), size = constraints.sizes, np.maximum(np.abs(theta), problem.size)
+        size = np.concatenate([b + A @ size, size, size])
         violated = np.flatnonzero(slack < -1e-12 * (size + np.finfo(float).tiny))
         if violated.size:
             worst = [f"{constraints.names[i]} (by {-slack[i]:.3g})" for i in violated[:5]]
@@ -261,13 +218,13 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
     slack = constraints.slack(moved)
     # The usual case: no constraint within reach of the step, and nothing to be done bit by bit.
-    if constraints.are_far(slack, largest(scale + np.abs(step)) + problem.largest_size):
+    if constraints.are_far(slack, largest(scale + np.abs(step)) + largest(problem.size)):
         return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
-    near = np.maximum((8 * EPS) * ((step != 0.0) * reach), problem.rounding)
+    near = 8 * EPS * np.maximum((step != 0.0) * reach, problem.size)
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
-    if (constraints.A @ moved - constraints.b > problem.row_rounding).all():
+    if (constraints.A @ moved - constraints.b > 16 * EPS * (constraints.sizes[0] @ problem.size)).all():
         return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True
@@ -282,7 +239,7 @@ def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: 
     """
     constraints = problem.constraints
     slack = constraints.A @ theta - constraints.b
-    close = np.abs(slack) <= reach * problem.row_size
+    close = np.abs(slack) <= reach * (constraints.sizes[0] @ problem.size)
     if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()
@@ -309,18 +266,14 @@ def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: BoolArray
     Projections onto one violated row after the other, an ulp to its inside. What they cannot remove where many rows
     meet at a vertex is left: it is of the size of rounding too.
     """
-    best, least = theta, constraints.violation(theta)
     repaired = theta.copy()
     for _ in range(6):
-        if least <= 0.0:
-            break
         for normal, bound in zip(constraints.A, constraints.b, strict=True):
             inside = np.where(pinned, 0.0, normal)
             violation, projected = project_on_row(repaired, normal, bound, inside)
             if violation > 0.0:
                 repaired = projected
         repaired = np.clip(repaired, constraints.lower, constraints.upper)
-        remaining = constraints.violation(repaired)
-        if remaining < least:
-            best, least = repaired.copy(), remaining
-    return best
+        if constraints.violation(repaired) <= 0.0:
+            break
+    return min(repaired, theta, key=constraints.violation)

@@ -1,4 +1,4 @@
-"""Linear inequalities and bounds, and strictly convex quadratic programmes.
+"""Linear inequalities and bounds, strictly convex quadratic programmes, and steps with equality constraints.
 
 Every quadratic programme here is strictly convex with a feasible zero step,
 
@@ -11,10 +11,25 @@ root of the diagonal) and e = Lᵀ D d, it becomes a least-distance problem,
 
 in which nothing has a scale any more, and which a dual active-set method ([1]_, daqp) solves.
 
+With equality constraints c(theta) = 0 a step leads towards them and along them. The programme
+
+    minimize  gᵀd + ½ dᵀHd   subject to   c + A d = 0,   N d >= offsets,   |d_i| <= radius reach_i
+
+need not have a feasible point: the linearizations may contradict one another, the inequalities or the trust region. The
+composite step of Byrd and Omojokun ([1]_, section 18.5, algorithm 18.4) asks of c + A d what can be had:
+
+1. the *normal step* v minimizes ‖c + A v‖₂ within a part of the trust region and the inequalities;
+2. the *tangential step* t minimizes the model within ``A t = 0``, the rest of the trust region and the inequalities.
+
+With an orthonormal basis Z of the null space of A the second is a programme in w, t = Z w, of which w = 0 is a feasible
+point, as `solve_programme` needs it; only ZᵀHZ has to be positive definite, and is shifted where it is not. Both are
+solved in units of `reach`.
+
 References
 ----------
 .. [1] D. Arnström, A. Bemporad, D. Axehill, A dual active-set solver for embedded quadratic programming using recursive
    LDLᵀ updates, IEEE Trans. Autom. Control 67 (2022) 4362-4369.
+.. [2] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
 """
 
 from __future__ import annotations
@@ -27,7 +42,7 @@ import daqp
 import numpy as np
 
 from switchfit.optimize import algebra, lapack
-from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, largest, norm, smallest
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 
 NONE = np.zeros(0, dtype=np.intp)
 """No places."""
@@ -55,31 +70,16 @@ class LinearConstraints:
     upper: FloatArray
     names: tuple[object, ...]
 
-    @property
-    def size(self) -> int:
-        """Number of unknowns, d."""
-        return self.lower.size
-
     @cached_property
     def movable(self) -> BoolArray:
         """Which unknowns their bounds leave any room, shape (d,)."""
         return np.asarray(self.lower < self.upper)
 
     @cached_property
-    def all_movable(self) -> bool:
-        """Whether no unknown is held by its bounds."""
-        return bool(self.movable.all())
-
-    @cached_property
     def normals(self) -> FloatArray:
         """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
-        identity = np.eye(self.size)
+        identity = np.eye(self.lower.size)
         return np.vstack([self.A, identity, -identity])
-
-    @cached_property
-    def open(self) -> FloatArray:
-        """Upper bounds of the rows, which have none: (m,)."""
-        return np.full(self.b.size, np.inf)
 
     def exact_rows(self, index: IntArray) -> list[tuple[int, int, float]]:
         """Of the given rows of A those that can hold with equality in floating point.
@@ -100,10 +100,6 @@ class LinearConstraints:
             elif places.size == 2 and bound == 0.0 and row[places].sum() == 0.0:
                 found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
         return found
-
-    def rows(self, index: IntArray) -> FloatArray:
-        """Return the normals at the given places, shape (k, d)."""
-        return self.normals[index]
 
     def slack(self, theta: FloatArray) -> FloatArray:
         """Return how far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
@@ -135,7 +131,7 @@ class LinearConstraints:
             Of the largest unknown; rounding is a part of it.
         """
         A, b = self._largest_sizes
-        return smallest(slack) > 32 * EPS * (b + max(A, 1.0) * size)
+        return algebra.smallest(slack) > 32 * algebra.EPS * (b + max(A, 1.0) * size)
 
     def active(self, slack: FloatArray, size: FloatArray) -> IntArray:
         """Return the places, ascending, of the constraints that hold with equality up to rounding.
@@ -210,8 +206,8 @@ def nearest_feasible(constraints: LinearConstraints, theta: FloatArray, size: Fl
     # In units of the sizes, and of the largest violation: min ||s||^2 subject to lower <= N s <= upper.
     rows, lengths = algebra.unit_rows(constraints.A * size)
     lower = np.concatenate([(constraints.lower - theta) / size, (constraints.b - constraints.A @ theta) / lengths])
-    upper = np.concatenate([(constraints.upper - theta) / size, constraints.open])
-    violation = max(largest(lower), -smallest(upper))
+    upper = np.concatenate([(constraints.upper - theta) / size, np.full(len(rows), np.inf)])
+    violation = max(algebra.largest(lower), -algebra.smallest(upper))
     normals = np.concatenate([np.eye(theta.size), rows])
     found = find_least_distance(np.zeros(theta.size), normals, lower / violation, upper / violation)
     if found is None:
@@ -238,7 +234,7 @@ class Room(NamedTuple):
         """Return the room around a feasible point with the given slack (m + 2 d,)."""
         m, d = constraints.A.shape
         slack = np.maximum(slack, 0.0)
-        upper = np.concatenate([constraints.open, slack[m + d :]])
+        upper = np.concatenate([np.full(m, np.inf), slack[m + d :]])
         return cls(constraints.normals[: m + d], -slack[: m + d], upper)
 
     @property
@@ -274,8 +270,8 @@ class Room(NamedTuple):
 
     def move_inside(self, step: FloatArray) -> FloatArray:
         """Return the step (d,) inside that is nearest to one: itself, unless it leaves by more than `OUTSIDE`."""
-        products, size = self.normals.dot(step), largest(np.abs(step))
-        if max(largest(self.lower - products), largest(products - self.upper)) <= OUTSIDE * size:
+        products, size = self.normals.dot(step), algebra.largest(np.abs(step))
+        if max(algebra.largest(self.lower - products), algebra.largest(products - self.upper)) <= OUTSIDE * size:
             return step
         rows, lengths = algebra.unit_rows(self.normals)
         low, high = (self.lower - products) / (size * lengths), (self.upper - products) / (size * lengths)
@@ -305,14 +301,14 @@ def solve_programme(
         return newton, np.zeros(len(room.lower))
     # In white variables, d = length D⁻¹ L⁻ᵀ e, nothing has a scale any more.
     target = factor.whiten(gradient)
-    length = norm(target)
+    length = algebra.norm(target)
     rows, lengths = algebra.unit_rows(factor.whiten(room.normals))
     lower, upper = room.lower / (length * lengths), room.upper / (length * lengths)
     found = find_least_distance(target / length, rows, lower, upper)
     if found is None:  # the zero step is feasible; a search along it ends at once
         return np.zeros(gradient.size), np.zeros(lower.size)
     e, pull = found
-    if norm(e) < SHORT:
+    if algebra.norm(e) < SHORT:
         # One step of refinement, with a residual that is computed with B itself: the same programme for the error, with
         # what is active now.
         active = pull != 0.0
@@ -324,6 +320,20 @@ def solve_programme(
             e, pull = e + refined[0], np.where(active, pull + refined[1], 0.0)
     pull = length * pull / lengths
     return room.move_inside(room.press(length * factor.unwhiten(e), pull)), pull
+
+
+def solve_in_span(
+    gradient: FloatArray, matrix: FloatArray, span: FloatArray, rows: FloatArray, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Minimize the programme of the steps ``d = S w`` with the matrix ``Sᵀ B S`` and ``lower <= rows d <= upper``.
+
+    The result is that of `solve_programme`: the step (d,), and what the rows exert.
+    """
+    wide = np.full(len(matrix), np.inf)
+    normals = np.concatenate([rows.dot(span), np.eye(wide.size)])
+    inside = Room(normals, np.append(lower, -wide), np.append(upper, wide))
+    found, pull = solve_programme(span.T.dot(gradient), matrix, CholeskyFactor.of(matrix), inside)
+    return span.dot(found), pull[: len(rows)]
 
 
 class CholeskyFactor(NamedTuple):
@@ -344,7 +354,7 @@ class CholeskyFactor(NamedTuple):
     def of(cls, matrix: FloatArray) -> CholeskyFactor:
         """Return the factorization of a matrix (d, d); ValueError if it is not positive definite."""
         variances = matrix.diagonal()
-        if smallest(variances) > 0.0:
+        if algebra.smallest(variances) > 0.0:
             diagonal = np.sqrt(variances)
             found = cls.of_scaled(matrix / (diagonal[:, None] * diagonal), diagonal)
             if found is not None:
@@ -373,3 +383,170 @@ class CholeskyFactor(NamedTuple):
 def is_definite(matrix: FloatArray) -> bool:
     """Return whether a symmetric matrix (d, d) has a Cholesky factorization."""
     return not lapack.dpotrf(matrix, lower=1)[1]
+
+
+def add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
+    """Return the matrix with an amount added to each entry of its diagonal."""
+    changed = matrix.copy()
+    changed.reshape(-1)[:: len(matrix) + 1] += amount
+    return changed
+
+
+def has_curvature(scaled: FloatArray) -> bool:
+    """Return whether all eigenvalues of a scaled matrix are above `algebra.EIGENVALUE_FLOOR`."""
+    return is_definite(add_to_diagonal(scaled, -algebra.EIGENVALUE_FLOOR))
+
+
+RAISED = 2.0
+"""Multiple of the smallest eigenvalue by which an indefinite matrix is shifted inside a trust region."""
+
+
+def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
+    """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`, and whether it was."""
+    symmetric = 0.5 * (matrix + matrix.T)
+    if not matrix.size:
+        return symmetric, True
+    values = lapack.dsyev(symmetric, compute_v=0)[0]
+    lowest, highest = float(values[0]), float(values[-1])
+    margin = max(algebra.EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
+    if lowest > margin:
+        return symmetric, True
+    margin = margin or algebra.EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
+    return add_to_diagonal(symmetric, margin - RAISED * min(lowest, 0.0)), False
+
+
+NORMAL_PART = 0.95
+"""Part of the trust region in which the normal step has to stay; the rest is left for the tangential step."""
+
+DEPENDENT = 1e-10
+"""Rows of a Jacobian are dependent where a singular value is below this part of the largest one."""
+
+FLAT = 1e-8
+"""Curvature that counts as none, as a part of the largest slope: where J is linear, the trust region ends the step."""
+
+TINY = float(np.finfo(float).tiny)
+
+RIDGE = 1e-12
+"""Part of the mean curvature of ½‖c + A v‖² that is added to all directions, to make the shortest of all v the
+solution."""
+
+
+class Equalities(NamedTuple):
+    """Equality constraints at a point: values c, (k,), and Jacobian A, (k, d)."""
+
+    values: FloatArray
+    jacobian: FloatArray
+
+    def predict(self, step: FloatArray) -> float:
+        """Return ‖c + A d‖₂ for a step d (d,)."""
+        return algebra.norm(self.values + self.jacobian.dot(step))
+
+
+class Rows(NamedTuple):
+    """The singular value decomposition A = U S Vᵀ of a Jacobian A (k, d), which may have dependent rows.
+
+    Attributes
+    ----------
+    left, sizes, right : arrays, shape (k, r), (r,), (d, r)
+        U, the diagonal of S, and V, for the r singular values that count.
+    null : array, shape (d, d - r)
+        Orthonormal basis of the null space of A.
+    """
+
+    left: FloatArray
+    sizes: FloatArray
+    right: FloatArray
+    null: FloatArray
+
+    @classmethod
+    def of(cls, jacobian: FloatArray) -> Rows:
+        """Decompose a Jacobian (k, d), k > 0."""
+        left, sizes, right = np.linalg.svd(jacobian)
+        rank = np.count_nonzero(sizes > DEPENDENT * sizes[0])
+        return cls(left[:, :rank], sizes[:rank], right[:rank].T, right[rank:].T)
+
+    def solve(self, values: FloatArray) -> FloatArray:
+        """Return the shortest v (d,) that minimizes ‖values + A v‖₂."""
+        return -np.asarray(self.right.dot(self.left.T.dot(values) / self.sizes))
+
+    def multipliers(self, force: FloatArray) -> FloatArray:
+        """Return the lam (k,) that minimizes ‖force + Aᵀ lam‖₂ ([2]_, section 18.3), the shortest of them."""
+        return -np.asarray(self.left.dot(self.right.T.dot(force) / self.sizes))
+
+
+def solve_composite(
+    gradient: FloatArray, hessian: FloatArray, equalities: Equalities, room: Room, reach: FloatArray, radius: float
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Find the composite step.
+
+    Parameters
+    ----------
+    gradient : array, shape (d,)
+        Of J.
+    hessian : array, shape (d, d)
+        Of the Lagrangian ``J + lam . c``.
+    equalities : Equalities
+    room : Room
+        The inequalities.
+    reach : array, shape (d,)
+    radius : float
+        No unknown moves by more than ``radius * reach``.
+
+    Returns
+    -------
+    step : array, shape (d,)
+    multipliers : array, shape (k,)
+        Of the equality constraints: ``g + H d + Aᵀ lam`` is what the inequalities exert, as nearly as that can be had.
+    definite : bool
+        Whether H was positive definite as it is along the constraints.
+    """
+    d = gradient.size
+    if not d:
+        return gradient, np.zeros(len(equalities.values)), True
+    # Units of `reach`: the trust region is the cube |d_i| <= radius, and unlike unknowns have comparable lengths.
+    slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
+    scaled, room = Equalities(equalities.values, equalities.jacobian * reach), _scale_room(room, reach)
+    rows = Rows.of(scaled.jacobian)
+    # v, within NORMAL_PART of the region; then t in the null space of A, from the slope g + H v of the model at its
+    # end.
+    step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
+    pull, definite, force = np.zeros(len(room.lower)), True, slope + bending.dot(step)
+    if rows.null.size:
+        # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
+        least = FLAT * algebra.largest(np.abs(slope)) + TINY
+        matrix, definite = shift_to_positive(rows.null.T.dot(bending).dot(rows.null), least)
+        cube = room.narrow(np.full(d, radius))
+        products = cube.normals.dot(step)
+        lower, upper = np.minimum(cube.lower - products, 0.0), np.maximum(cube.upper - products, 0.0)
+        tangential, pull = solve_in_span(force, matrix, rows.null, cube.normals, lower, upper)
+        step = cube.press(step + tangential, pull)
+        force = slope + bending.dot(step)
+    # What the inequalities exert is taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the
+    # least-squares sense.
+    multipliers = rows.multipliers(force - room.normals.T.dot(pull))
+    return step * reach, multipliers, definite
+
+
+def _scale_room(room: Room, reach: FloatArray) -> Room:
+    """Return a room in units of `reach` (d,)."""
+    unit = np.concatenate([np.ones(len(room.normals) - reach.size), reach])
+    return Room(room.normals * (reach / unit[:, None]), room.lower / unit, room.upper / unit)
+
+
+def find_normal_step(equalities: Equalities, room: Room, reach: FloatArray, radius: float) -> FloatArray:
+    """Return the v (d,) that minimizes ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
+    scaled = Equalities(equalities.values, equalities.jacobian * reach)
+    return _find_normal_step(scaled, Rows.of(scaled.jacobian), _scale_room(room, reach), radius) * reach
+
+
+def _find_normal_step(equalities: Equalities, rows: Rows, room: Room, radius: float) -> FloatArray:
+    """Return the v of `find_normal_step` in units in which the trust region is a cube."""
+    shortest, d = rows.solve(equalities.values), equalities.jacobian.shape[1]
+    cube = room.narrow(np.full(d, radius))
+    if cube.holds(shortest):
+        return shortest
+    # The minimum of ||c + A v||^2 / 2 in the region: A'A is singular wherever constraints are fewer than unknowns.
+    A = equalities.jacobian
+    matrix = A.T.dot(A)
+    matrix.reshape(-1)[:: d + 1] += RIDGE * max(float(matrix.trace()) / d, TINY)
+    return solve_programme(A.T.dot(equalities.values), matrix, CholeskyFactor.of(matrix), cube)[0]

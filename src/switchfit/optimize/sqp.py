@@ -5,14 +5,14 @@ smooth except where a coordinate passes one of its breakpoints: there its deriva
 passes a sample time is such a coordinate.) These constraints are linear, so every iterate satisfies them, and the line
 search compares J alone. There may also be nonlinear equality constraints c(theta) = 0, which are met at the end.
 
-One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next state:
+One iteration, `_step`, maps a state at a point (`state`) to the next state:
 
-1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `matrix` or `arrow`), or with
-   equality constraints a step composed of the solutions of two (`composite`);
-2. *line search* (`line_search`): the full step first, even across breakpoints, then inside the present smooth piece;
-   by default in a trust region that shrinks (`direction`); with equality constraints it compares a merit function;
-   every trial is made feasible (`problem`);
-3. *kinks* (`point`): coordinates that sit on a breakpoint are held, or released to one side.
+1. *direction* (`step`): a convex quadratic programme (`qp`, with the Hessians of `matrix`), or with equality
+   constraints a step composed of the solutions of two;
+2. *line search* (`step`): the full step first, even across breakpoints, then inside the present smooth piece; by
+   default in a trust region that shrinks; with equality constraints it compares a merit function; every trial is made
+   feasible (`problem`);
+3. *kinks* (`state`): coordinates that sit on a breakpoint are held, or released to one side.
 
 At a stationary point the curvature distinguishes a minimum from a saddle, which is left along negative curvature
 (`escape`). If no step decreases J, `explain_failure` finds the reason.
@@ -31,31 +31,11 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import (
-    ARMIJO,
-    EIGENVALUE_FLOOR,
-    EPS,
-    EXTRA_ITERATIONS,
-    NEGLIGIBLE_STEP,
-    NOISE,
-    FloatArray,
-    is_negligible,
-)
-from switchfit.optimize.direction import Direction, find_direction, measure_in_box
-from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search
+from switchfit.optimize import algebra, step
+from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.matrix import Curvature, Spectrum
-from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import Problem, Trial, feasible_start, move, snap_to_rows
-from switchfit.optimize.state import (
-    Accepted,
-    Callback,
-    IterationRecord,
-    Result,
-    State,
-    Status,
-    curvature_at,
-    idle_coordinates,
-)
+from switchfit.optimize.state import MET, Accepted, Callback, IterationRecord, Oracle, Point, Result, State, Status
 from switchfit.optimize.threads import one_thread
 
 #: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
@@ -71,19 +51,19 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     all the same if a step from there is negligible.
     """
     problem, point = oracle.problem, state.point
-    theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
+    theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), algebra.NEGLIGIBLE_STEP)
     if np.array_equal(theta, point.theta):
         return state
     closed = oracle.point(Trial.at(problem, theta), state.scale)
-    if closed is None or closed.cost > point.cost + NOISE * state.cost_scale or closed.violation > MET:
+    if closed is None or closed.cost > point.cost + algebra.NOISE * state.cost_scale or closed.violation > MET:
         return state
     after = state.advance(Accepted(closed, 1.0), problem.tolerance)
     if closed.optimality <= max(problem.tolerance, point.optimality):
         return after
     if closed.idle is None:
         return state
-    step = find_direction(problem, after).step
-    return after if is_negligible(step, np.maximum(state.scale, problem.size)) else state
+    ahead = step.find_direction(problem, after).step
+    return after if algebra.is_negligible(ahead, np.maximum(state.scale, problem.size)) else state
 
 
 def escape(oracle: Oracle, state: State) -> Accepted | None:
@@ -93,8 +73,8 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
     active = state.point.active
     # A constraint without force may be left along negative curvature: only pressing ones confine the ray at first.
     for rows in (pressing,) if np.array_equal(pressing, active) else (pressing, active):
-        curvature = curvature_at(problem, state, rows)
-        if not curvature.smallest < NEGATIVE_CURVATURE:
+        curvature = state.curvature_at(problem, rows)
+        if not curvature.spectrum.smallest < NEGATIVE_CURVATURE:
             continue
         for ray in (curvature.spectrum.lowest, -curvature.spectrum.lowest):
             accepted = _descend_along(oracle, state, ray)
@@ -103,16 +83,11 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
     return None
 
 
-def _merit(sample: Sample, state: State) -> float:
-    """Return J, with the penalty of the equality constraints if there are any."""
-    return sample.cost + state.penalty * sample.violation
-
-
 def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | None:
     """Backtrack on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
     problem, point = oracle.problem, state.point
     _, hessian = point.derivatives(point.reported_sides)
-    bending = float(ray @ (hessian @ ray))
+    bending = float(ray @ (hessian.dot(ray)))
     sized = state.scale > 0.0
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
@@ -125,15 +100,16 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     length = min(length, float(np.min(slack[approaching] / -slope[approaching], initial=np.inf)))
     for _ in range(40):
         decrease = -0.5 * bending * length**2
-        if decrease <= NOISE * abs(point.cost) or length == 0.0:
+        if decrease <= algebra.NOISE * abs(point.cost) or length == 0.0:
             return None
         there = move(problem, point.theta, length * ray, state.scale)
         first = oracle.first(there)
         if first is not None and problem.equalities:
             # The ray is tangential to the equality constraints, which bend.
-            moved = correct(oracle, there, first, state.scale, np.inf)
+            moved = step.correct(oracle, there, first, state.scale)
             there, first = (there, first) if moved is None else (moved, oracle.first(moved))
-        if first is not None and _merit(first, state) < _merit(point.plus, state) - ARMIJO * decrease:
+        enough = step.measure_merit(point.plus, state) - algebra.ARMIJO * decrease
+        if first is not None and step.measure_merit(first, state) < enough:
             trial = oracle.complete(there, first, state.scale)
             if trial is not None:
                 return Accepted(trial, length)
@@ -188,7 +164,8 @@ def minimize(
     point = oracle.point(trial, np.abs(trial.theta))
     if point is not None and multipliers is None and 0 < len(problem.equalities) < start.size:
         # As many constraints as unknowns leave no direction in which curvature counts.
-        point = oracle.with_own_multipliers(point)
+        oracle.multipliers = point.forces
+        point = oracle.point(trial, np.abs(trial.theta))
     if point is None:
         return _nonfinite_start(oracle, trial.theta)
     return _iterate(oracle, State.at(point), callback)
@@ -210,20 +187,20 @@ def _iterate(oracle: Oracle, state: State, callback: Callback | None) -> Result:
     return _result(oracle, state, state.status or Status.INTERRUPTED, tuple(history))
 
 
-def _find_unbounded(problem: Problem, state: State) -> Direction:
+def _find_unbounded(problem: Problem, state: State) -> step.Direction:
     """Return the step of the quadratic programme outside any trust region."""
-    return find_direction(problem, state._replace(radius=np.inf))
+    return step.find_direction(problem, state._replace(radius=np.inf))
 
 
 def _step(oracle: Oracle, state: State) -> State:
     """Do one iteration: return the next state, or the same point with a status."""
     problem = oracle.problem
-    direction = find_direction(problem, state)
+    direction = step.find_direction(problem, state)
     if _is_settled(problem, state, direction):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
         return state._replace(status=Status.MAX_ITERATIONS)
-    if problem.equalities and is_stuck(oracle, state):
+    if problem.equalities and step.is_stuck(oracle, state):
         return state._replace(status=Status.INFEASIBLE)
     # Before the line search: it would accept steps that change J by rounding alone.
     if _is_held_back(problem, state, direction):
@@ -232,7 +209,7 @@ def _step(oracle: Oracle, state: State) -> State:
     accuracy = 0.0 if problem.accuracy is None else problem.accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
-    accepted = search(oracle, state, direction)
+    accepted = step.search(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
     following = state.advance(accepted, problem.tolerance)
@@ -245,38 +222,36 @@ def _measure_anew(oracle: Oracle, state: State) -> State:
     point = oracle.point(Trial.at(oracle.problem, theta), state.scale)
     if point is None:
         return state
-    fresh = State.at(point)
-    return state._replace(
-        point=point, penalty=fresh.penalty, steady_violation=fresh.steady_violation, stagnant=fresh.stagnant
-    )
+    penalty = State.at(point).penalty
+    return state._replace(point=point, penalty=penalty, steady_violation=point.violation, stagnant=0)
 
 
-def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
+def _is_settled(problem: Problem, state: State, direction: step.Direction) -> bool:
     """Return whether the optimality is below the tolerance and the next step negligible, for J may be badly scaled."""
     if not state.point.is_stationary(problem.tolerance):
         return False
     # Without a Hessian the step says nothing about the distance to the minimum.
-    if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
+    if not problem.uses_hessian or state.settled >= algebra.EXTRA_ITERATIONS:
         return True
-    return bool(is_negligible(direction.step, state.scale))
+    return bool(algebra.is_negligible(direction.step, state.scale))
 
 
-def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
+def _is_held_back(problem: Problem, state: State, direction: step.Direction) -> bool:
     """Return whether J can only fall by rounding in a trust region, and the quadratic model promises more outside.
 
     The region shrinks to that size beside a kink or a jump of J that is no breakpoint. Steps in it would be accepted,
     as J stays the same, and go on for ever.
     """
-    noise = NOISE * abs(state.point.cost)
-    if not problem.has_box or problem.equalities or direction.reduction > noise:
+    noise = algebra.NOISE * abs(state.point.cost)
+    if problem.hessian != "auto" or problem.equalities or direction.reduction > noise:
         return False
     # A step that ends inside the region is not held back by it.
-    if measure_in_box(problem, direction.step) < 0.9 * state.radius:
+    if step.measure_in_box(problem, direction.step) < 0.9 * state.radius:
         return False
     return _find_unbounded(problem, state).reduction > 10 * noise
 
 
-def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
+def _handle_stall(oracle: Oracle, state: State, direction: step.Direction) -> State:
     """Distinguish convergence and the limit of precision from failure after a line search that found no step."""
     if state.point.is_stationary(oracle.problem.tolerance):
         return _finish(oracle, state, direction, Status.CONVERGED)
@@ -285,9 +260,9 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     # The derivatives are rounded relative to their largest terms: those seen so far, and |H| |theta|.
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
-        floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
-    below_rounding = is_below_rounding(oracle, state, direction)
-    if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
+        floor = max(floor, float(np.max(abs(state.point.plus.hessian).dot(state.scale))))
+    below_rounding = step.is_below_rounding(oracle, state, direction)
+    if below_rounding and state.point.optimality <= 1e5 * algebra.EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     # Near a saddle slopes are below rounding, but negative curvature still gives a direction.
     escaped = escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
@@ -301,11 +276,11 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
         if point is not None:
             fresh = State.at(point)
             return fresh._replace(iteration=state.iteration, restarts=state.restarts + 1, careful=True)
-    explain = cache(partial(explain_failure, oracle, state, direction))
+    explain = cache(partial(step.explain_failure, oracle, state, direction))
     return state._replace(status=Status.LINE_SEARCH_FAILED, explain=explain)
 
 
-def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) -> State:
+def _finish(oracle: Oracle, state: State, direction: step.Direction, status: Status) -> State:
     """Leave a saddle at a KKT point if possible, otherwise classify the point by its free curvature."""
     problem = oracle.problem
     if problem.uses_hessian or state.point.plus.hessian.finite:
@@ -318,10 +293,10 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
             return state.advance(accepted, problem.tolerance)
-        curvature = curvature_at(problem, state, state.point.active)
-        if curvature.smallest < NEGATIVE_CURVATURE:
+        curvature = state.curvature_at(problem, state.point.active)
+        if curvature.spectrum.smallest < NEGATIVE_CURVATURE:
             return state._replace(status=Status.SADDLE)
-        if curvature.smallest <= EIGENVALUE_FLOOR:
+        if curvature.spectrum.smallest <= algebra.EIGENVALUE_FLOOR:
             return state._replace(status=Status.SINGULAR)
         if state.point.idle is not None or curvature.idle is not None:
             return state._replace(status=Status.COLLAPSED)
@@ -330,14 +305,8 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
 
 def _record(oracle: Oracle, state: State) -> IterationRecord:
     point = state.point
-    return IterationRecord(
-        iteration=state.iteration,
-        cost=point.cost,
-        optimality=point.optimality,
-        step=state.step_length,
-        theta=point.theta.copy(),
-        evaluations=oracle.evaluations,
-    )
+    reached = point.cost, point.optimality, state.step_length, point.theta.copy()
+    return IterationRecord(state.iteration, *reached, oracle.evaluations)
 
 
 def _result(oracle: Oracle, state: State, status: Status, history: tuple[IterationRecord, ...]) -> Result:
@@ -345,8 +314,10 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
     problem = oracle.problem
     point = state.point
     gradient, hessian = point.derivatives(point.reported_sides)
-    curvature = curvature_at(problem, state, point.active)
-    held = () if point.kink is None else np.flatnonzero(state.genuine_kinks)
+    curvature = state.curvature_at(problem, point.active)
+    held = np.flatnonzero(state.genuine_kinks)
+    equalities = _list_equalities(oracle, point)
+    missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(max(len(equalities), 1))
     return Result(
         theta=point.theta,
         cost=point.cost,
@@ -362,44 +333,26 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         curvature=curvature,
         tolerance=problem.tolerance,
         history=history,
-        violated=_list_violated(oracle, point),
-        idle=idle_coordinates(problem, state),
+        violated=tuple(equalities[k][:2] for k in np.flatnonzero(missed) if point.violation > MET),
+        idle=state.list_idle(problem),
         explain=state.explain,
         predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
-        equalities=_list_equalities(oracle, point),
+        equalities=equalities,
     )
-
-
-def _list_violated(oracle: Oracle, point: Point) -> tuple[tuple[str, float], ...]:
-    """Return the name and value of each equality constraint that is not met."""
-    if point.violation <= MET or point.plus.equalities is None:
-        return ()
-    missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(len(oracle.problem.equalities))
-    found = zip(_list_equalities(oracle, point), missed.tolist(), strict=True)
-    return tuple((name, value) for (name, value, _), violated in found if violated)
 
 
 def _list_equalities(oracle: Oracle, point: Point) -> tuple[tuple[str, float, float], ...]:
     """Return the name, value and multiplier of each equality constraint, in the caller's units."""
-    held = point.plus.equalities
-    if held is None or oracle.units is None:
-        return ()
-    values, multipliers = held.values * oracle.units, point.forces / oracle.units
+    units = 1.0 if oracle.units is None else oracle.units
+    values, multipliers = point.plus.equalities.values * units, point.forces / units
     return tuple(zip(oracle.problem.equalities, values.tolist(), multipliers.tolist(), strict=True))
 
 
 def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:
     """Return a result without numbers."""
-    d = theta.size
-    return Result(
-        theta=theta,
-        cost=np.nan,
-        gradient=np.full(d, np.nan),
-        hessian=np.full((d, d), np.nan),
-        optimality=np.nan,
-        evaluations=oracle.evaluations,
-        status=Status.NONFINITE_START,
-        multipliers=np.zeros(len(oracle.problem.constraints.names)),
-        curvature=Curvature(np.zeros((d, 0)), lambda: Spectrum(np.zeros(0), np.zeros(d))),
-        tolerance=oracle.problem.tolerance,
-    )
+    d, problem = theta.size, oracle.problem
+    nothing, no_multipliers = np.full((d, d), np.nan), np.zeros(len(problem.constraints.names))
+    no_directions = Curvature(np.zeros((d, 0)), lambda: Spectrum(np.nan, np.zeros(d)))
+    of_point = theta, np.nan, nothing[0], nothing, np.nan
+    status = Status.NONFINITE_START
+    return Result(*of_point, oracle.evaluations, status, no_multipliers, no_directions, problem.tolerance)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, wraps
 from importlib import import_module
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -24,11 +24,8 @@ MODULES = "numpy.linalg._umath_linalg", "scipy.linalg._flapack"
 """Extension modules that are linked with the BLAS of NumPy and of SciPy."""
 
 
-class Library(NamedTuple):
-    """Functions that read and set the number of threads of one BLAS."""
-
-    get: Callable[[], int]
-    set: Callable[[int], None]
+Library = tuple[Callable[[], int], Callable[[int], None]]
+"""Functions that read and set the number of threads of one BLAS."""
 
 
 @cache
@@ -45,47 +42,40 @@ def find_libraries() -> tuple[Library, ...]:
             for affixes in ("scipy_{}64_", "scipy_{}", "{}64_", "{}"):
                 get, put = (affixes.format(f"openblas_{verb}_num_threads") for verb in ("get", "set"))
                 if hasattr(module, put):
-                    found.append(Library(getattr(module, get), getattr(module, put)))
+                    found.append((getattr(module, get), getattr(module, put)))
                     break
     return tuple(found)
 
 
-class _Limit:
-    """Counts the threads inside the optimizer, and keeps the caller's settings while there are any."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._inside = 0
-        self._before: list[tuple[Library, int]] = []
-
-    def enter(self) -> None:
-        libraries = find_libraries()
-        with self._lock:
-            if self._inside == 0:
-                self._before = [(library, count) for library in libraries if (count := library.get()) != 1]
-                for library, _ in self._before:
-                    library.set(1)
-            self._inside += 1
-
-    def leave(self) -> None:
-        with self._lock:
-            self._inside -= 1
-            if self._inside == 0:
-                for library, count in self._before:
-                    library.set(count)
+_lock = threading.Lock()
+_inside = 0
+_before: list[tuple[Callable[[int], None], int]] = []
+"""How many threads are inside the optimizer, and the caller's settings while there are any."""
 
 
-_LIMIT = _Limit()
+def _count(change: int) -> None:
+    """Count a thread that enters, +1, or leaves, -1; set one thread before the first and restore after the last."""
+    global _inside
+    libraries = find_libraries()
+    with _lock:
+        if change > 0 and _inside == 0:
+            _before[:] = [(put, count) for get, put in libraries if (count := get()) != 1]
+            for put, _ in _before:
+                put(1)
+        _inside += change
+        if _inside == 0:
+            for put, count in _before:
+                put(count)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Use one thread for linear algebra until the end of the block; as a decorator, in each call of a function."""
-    _LIMIT.enter()
+    _count(+1)
     try:
         yield
     finally:
-        _LIMIT.leave()
+        _count(-1)
 
 
 def with_own_threads(function: Callable[P, R]) -> Callable[P, R]:
@@ -93,10 +83,10 @@ def with_own_threads(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        _LIMIT.leave()
+        _count(-1)
         try:
             return function(*args, **kwargs)
         finally:
-            _LIMIT.enter()
+            _count(+1)
 
     return call

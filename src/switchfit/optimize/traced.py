@@ -4,7 +4,7 @@ It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinar
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
 in the way, coordinates held at a kink or released to one side, and Armijo backtracking with the same constants. What
 is rare it leaves alone: the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway
-it stops. It has no trust region (`switchfit.optimize.direction`): where the Hessian is indefinite, its steps may go
+it stops. It has no trust region (`switchfit.optimize.step`): where the Hessian is indefinite, its steps may go
 further than those of `minimize`, into the basin of another minimum. `Outcome.settled` is True only for a regular
 minimum: no constraint is active, the Hessian of the coordinates that no kink holds is positive definite, and the next
 step is negligible. Everything else is to be finished by `minimize`, from `Outcome.theta` on.
@@ -27,25 +27,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from numpy.typing import NDArray
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import (
-    ARMIJO,
-    ARMIJO_ACROSS,
-    EIGENVALUE_FLOOR,
-    EPS,
-    EQUILIBRATED,
-    EQUILIBRATIONS,
-    EXTRA_ITERATIONS,
-    MANY_BREAKPOINTS,
-    NOISE,
-    SMALLEST_JUMP,
-)
-
-Array = jax.Array
+from switchfit.optimize.algebra import Array, IntArray
 
 MAX_TRIALS = 30
 """Fractions of a step that are tried."""
@@ -74,13 +59,9 @@ class Constraints(NamedTuple):
     upper: Array
     size: Array | float = 0.0
 
-    def slack(self, theta: Array) -> Array:
-        """Of rows, lower and upper bounds: (m + 2 d,)."""
-        return algebra.slack(self, theta, jnp)
-
     @property
     def normals(self) -> Array:
-        """Inward normals in the same order: (m + 2 d, d)."""
+        """Inward normals of rows, lower and upper bounds: (m + 2 d, d)."""
         identity = jnp.eye(self.lower.shape[0])
         return jnp.concatenate([self.A, identity, -identity])
 
@@ -90,28 +71,24 @@ class Breakpoints(NamedTuple):
 
     Attributes
     ----------
-    coordinates : tuple of int
-        Of theta, k of them.
+    coordinates : (k,) int
+        Places in theta.
     points : (k, n)
         Ascending; infinite, or the last one again, where a coordinate has fewer than others.
     """
 
-    coordinates: tuple[int, ...]
+    coordinates: IntArray
     points: Array
-
-    @property
-    def _places(self) -> NDArray[np.intp]:
-        return np.array(self.coordinates, dtype=np.intp)
 
     def rank(self, theta: Array) -> tuple[Array, Array]:
         """Return how many breakpoints lie below each of the coordinates, and how many below or on it: (k,), (k,)."""
-        x = theta[self._places, None]
+        x = theta[self.coordinates, None]
         return jnp.sum(self.points < x, axis=1), jnp.sum(self.points <= x, axis=1)
 
     def on_one(self, theta: Array) -> Array:
         """Return which coordinates sit exactly on a breakpoint: (d,) of bool."""
         below, up_to = self.rank(theta)
-        return jnp.zeros(theta.shape, bool).at[self._places].set(up_to > below)
+        return jnp.zeros(theta.shape, bool).at[self.coordinates].set(up_to > below)
 
     def count_crossed(self, theta: Array, to: Array) -> Array:
         """Return the largest number of breakpoints strictly between two points in one coordinate."""
@@ -121,28 +98,21 @@ class Breakpoints(NamedTuple):
 
     def piece(self, theta: Array, constraints: Constraints) -> tuple[Array, Array]:
         """Return the bounds (d,), (d,) narrowed to the next breakpoint on either side of theta."""
-        below, above = self._neighbors(theta)
-        return constraints.lower.at[self._places].max(below), constraints.upper.at[self._places].min(above)
+        where, x = self.coordinates, theta[self.coordinates, None]
+        below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
+        above = jnp.min(jnp.where(self.points > x, self.points, jnp.inf), axis=1, initial=jnp.inf)
+        return constraints.lower.at[where].max(below), constraints.upper.at[where].min(above)
 
     def snap(self, moved: Array, theta: Array, step: Array, size: Array) -> Array:
         """Return ``moved = theta + step``, exactly on the breakpoints that it reaches up to rounding: (d,)."""
-        where = self._places
-        x = moved[where]
-        below, above = self._neighbors(moved)
+        where, x = self.coordinates, moved[self.coordinates]
         # A sum of floats that should be a breakpoint misses it by an ulp or two, and would count as beside it for ever:
         # within 8 EPS of the largest number that was rounded on the way, it is put on it.
-        on = self.on_one(moved)[where]
-        mark = jnp.where(on, x, jnp.where(x - below <= above - x, below, above))
+        nearest = jnp.argmin(jnp.abs(self.points - x[:, None]), axis=1)
+        mark = self.points[jnp.arange(len(where)), nearest]
         reach = jnp.maximum(jnp.maximum(jnp.abs(theta), jnp.abs(step)), jnp.abs(moved))
-        near = jnp.abs(mark - x) <= 8 * EPS * jnp.maximum(jnp.where(step != 0.0, reach, 0.0), size)[where]
-        return moved.at[where].set(jnp.where(near, mark, x))
-
-    def _neighbors(self, theta: Array) -> tuple[Array, Array]:
-        """Return the last breakpoint below each coordinate and the first one above, infinite if there is none."""
-        x = theta[self._places, None]
-        below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
-        above = jnp.min(jnp.where(self.points > x, self.points, jnp.inf), axis=1, initial=jnp.inf)
-        return below, above
+        rounding = 8 * algebra.EPS * jnp.maximum(jnp.where(step != 0.0, reach, 0.0), size)
+        return moved.at[where].set(jnp.where(jnp.abs(mark - x) <= rounding[where], mark, x))
 
 
 class Outcome(NamedTuple):
@@ -193,7 +163,7 @@ class Sample(NamedTuple):
 
 
 class Task(NamedTuple):
-    """The arguments of `minimize_traced`, without the start."""
+    """What is minimized, and when that ends; `tolerance` and `max_iterations` as of `minimize`."""
 
     evaluate: TracedEvaluate
     constraints: Constraints
@@ -212,29 +182,36 @@ class Point(NamedTuple):
         The same, and those of one side alone, where no coordinate is at a kink or the left is still unknown.
     kink : (d,) bool
         Coordinates on a breakpoint with room on both sides.
-    optimality : ()
     crossed : () int
         Breakpoints strictly between it and the point that was accepted before.
-    finite : () bool
+    optimality : ()
     """
 
     theta: Array
     right: Sample
     left: Sample
     kink: Array
-    optimality: Array
-    crossed: Array
-    finite: Array
+    crossed: Array = 0
+    optimality: Array = jnp.inf
 
     @property
     def cost(self) -> Array:
-        """J, which is the same on both sides."""
+        """J, which is the same on both sides; infinite where J or a derivative is not finite."""
         return self.right.cost
 
     @property
     def sides(self) -> Array:
-        """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,)."""
-        return _sides(self.left.gradient, self.right.gradient, self.kink)
+        """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,).
+
+        Chosen as `switchfit.optimize.state.steepest_descent` does where no constraint is active.
+        """
+        return jnp.where(self.kink, algebra.choose_sides(self.left.gradient, self.right.gradient, jnp), 1)
+
+    @property
+    def gradient(self) -> Array:
+        """The derivative on the side to which each coordinate descends, 0 where a kink holds it: (d,)."""
+        sides = self.sides
+        return jnp.where(sides == 0, 0.0, jnp.where(sides > 0, self.right.gradient, self.left.gradient))
 
     @property
     def slopes(self) -> Array:
@@ -243,89 +220,69 @@ class Point(NamedTuple):
 
 
 class State(NamedTuple):
-    """The point that was accepted last, the step tried from it, and what has been seen."""
+    """The point that was accepted last, the step tried from it, and what has been seen.
+
+    By default what they are before the first evaluation, which is accepted whatever it gives, if it is finite.
+    """
 
     point: Point
-    iterations: Array
-    evaluations: Array
+    right_there: Sample  # what was found on the right of the point to be judged
     step: Array
-    slope: Array
-    length: Array  # fraction of the step that is to be judged next
-    trials: Array  # of this step, so far
-    refused: Array  # of all steps
-    inside: Array  # whether the step is one inside the present smooth piece
-    undirected: Array  # whether a step has to be found
-    halfway: Array  # whether the point to be judged has been evaluated on its right
-    right_there: Sample  # what was found
-    below: Array  # iterations since the optimality fell below the tolerance
     scale: Array  # largest |theta_i| seen
-    cost_scale: Array  # largest |J| seen
-    gradient_scale: Array  # largest one-sided derivative seen
-    lowest: Array
-    done: Array
-    stationary: Array  # the optimality is below the tolerance and the next step negligible
+    iterations: Array = 0
+    evaluations: Array = 0
+    slope: Array = 0.0
+    length: Array = 1.0  # fraction of the step that is to be judged next
+    trials: Array = 0  # of this step, so far
+    refused: Array = 0  # of all steps
+    inside: Array = False  # whether the step is one inside the present smooth piece
+    undirected: Array = False  # whether a step has to be found
+    halfway: Array = False  # whether the point to be judged has been evaluated on its right
+    below: Array = 0  # iterations since the optimality fell below the tolerance
+    cost_scale: Array = 0.0  # largest |J| seen
+    gradient_scale: Array = 0.0  # largest one-sided derivative seen
+    lowest: Array = jnp.inf
+    done: Array = False
+    stationary: Array = False  # the optimality is below the tolerance and the next step negligible
 
-    @property
-    def decrease(self) -> Array:
-        """The decrease of J that the slope predicts for the step that is to be judged."""
-        return -self.length * self.slope
+    @classmethod
+    def at(cls, start: Array) -> State:
+        """Return the state before the first evaluation."""
+        d = start.shape[0]
+        unknown = Sample(jnp.inf, jnp.full(d, jnp.nan), jnp.full((d, d), jnp.nan))
+        point = Point(start, unknown, unknown, jnp.zeros(d, bool))
+        return jax.tree.map(jnp.array, cls(point, unknown, jnp.zeros(d), jnp.abs(start)))
 
 
-def minimize_traced(
-    evaluate: TracedEvaluate,
-    start: Array,
-    constraints: Constraints,
-    breakpoints: Breakpoints,
-    *,
-    tolerance: Array | float,
-    max_iterations: Array | int,
-) -> Outcome:
-    """Minimize J subject to linear constraints from a feasible start, inside a JAX program.
-
-    Parameters
-    ----------
-    evaluate : callable
-        ``evaluate(theta, side)`` returns cost, gradient (d,) and Hessian (d, d).
-    start : (d,)
-    constraints : Constraints
-    breakpoints : Breakpoints
-    tolerance, max_iterations : as of `minimize`
-
-    Returns
-    -------
-    Outcome
-    """
-    task = Task(evaluate, constraints, breakpoints, tolerance, max_iterations)
+def minimize_traced(task: Task, start: Array) -> Outcome:
+    """Minimize J subject to linear constraints from a feasible start (d,), inside a JAX program."""
 
     # One J a turn, then one step where the point was accepted: fits that run in lockstep never wait for a line search.
     def turn(state: State) -> State:
         after = take_turn(state, task)
-        find_step = partial(_find_step, task=task)
-        return lax.cond(after.undirected & ~after.done, find_step, lambda state: state, after)
+        return lax.cond(after.undirected & ~after.done, partial(_find_step, task=task), lambda state: state, after)
 
-    return build_outcome(lax.while_loop(lambda state: ~state.done, turn, begin(start)), constraints)
+    return build_outcome(lax.while_loop(lambda state: ~state.done, turn, State.at(start)), task.constraints)
 
 
 def take_turn(state: State, task: Task) -> State:
     """Evaluate J once, at the point that is to be judged, and judge it."""
     point = state.point
     trial = _evaluate(state, task)
-    # `begin` has an infinite cost: the start is accepted whatever its J, as long as it is finite.
+    # Before the start J is infinite: the start is accepted whatever its J, as long as it is finite.
     first = jnp.isinf(point.cost)
-    noise = NOISE * jnp.abs(point.cost)
+    noise, decrease = algebra.NOISE * jnp.abs(point.cost), -state.length * state.slope
     # A step across a breakpoint has to achieve a larger part of the decrease: its slope is that of this side alone.
-    fraction = jnp.where(state.inside | (trial.crossed == 0), ARMIJO, ARMIJO_ACROSS)
-    lower = algebra.cost_allows(trial.cost, point.cost, state.lowest, state.decrease, noise, fraction)
+    fraction = jnp.where(state.inside | (trial.crossed == 0), algebra.ARMIJO, algebra.ARMIJO_ACROSS)
+    lower = algebra.cost_allows(trial.cost, point.cost, state.lowest, decrease, noise, fraction)
     # A point that rounding put back where the step began is no progress.
-    lower = trial.finite & (first | (lower & jnp.any(trial.theta != point.theta)))
-    better = first | algebra.optimality_allows(
-        trial.optimality, point.optimality, trial.cost, state.lowest, state.decrease, noise
-    )
+    lower = lower & jnp.isfinite(trial.cost) & (first | jnp.any(trial.theta != point.theta))
+    better = algebra.optimality_allows(trial.optimality, point.optimality, trial.cost, state.lowest, decrease, noise)
     # At a kink the optimality needs both one-sided derivatives: the next turn evaluates the same point on its left.
     incomplete = jnp.any(trial.kink) & ~state.halfway
 
     def go_left(state: State) -> State:
-        return state._replace(halfway=jnp.ones((), bool), right_there=trial.right)
+        return state._replace(halfway=jnp.asarray(True), right_there=trial.right)
 
     return lax.cond(
         lower & (incomplete | better),
@@ -342,20 +299,13 @@ def _evaluate(state: State, task: Task) -> Point:
     cost, gradient, hessian = task.evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
     # On the first visit both sides are the sample at hand; on the second this is the left, and the right is in the
     # state.
-    left = Sample(cost, gradient, 0.5 * (hessian + hessian.T))
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
+    left = Sample(jnp.where(finite, cost, jnp.inf), gradient, 0.5 * (hessian + hessian.T))
     right = jax.tree.map(lambda known, new: jnp.where(state.halfway, known, new), state.right_there, left)
     # On a bound there is one side only, which is no kink.
     kink = breakpoints.on_one(theta) & (theta > constraints.lower) & (theta < constraints.upper)
-    return Point(
-        theta=theta,
-        right=right,
-        left=left,
-        kink=kink,
-        optimality=_kkt_residual(constraints, theta, state.scale, _steepest(left.gradient, right.gradient, kink)),
-        crossed=breakpoints.count_crossed(state.point.theta, theta),
-        finite=finite,
-    )
+    trial = Point(theta, right, left, kink, breakpoints.count_crossed(state.point.theta, theta))
+    return trial._replace(optimality=_kkt_residual(constraints, theta, state.scale, trial.gradient))
 
 
 def _accept(state: State, trial: Point, tolerance: Array | float) -> State:
@@ -381,13 +331,13 @@ def _refuse(state: State, trial: Point, task: Task) -> State:
     """Shorten the step; where it still crosses a few breakpoints, look for one inside the present smooth piece."""
     point = state.point
     trials, refused = state.trials + 1, state.refused + 1
-    # The fractions of `line_search._backtrack`: halves, then quarters.
+    # The fractions of `step.search`: halves, then quarters.
     length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
     # Once the step crosses few breakpoints, the programme is solved again with the present piece for bounds: there J is
     # smooth, and short enough steps have to decrease it. `undirected` asks for that step.
-    few = task.breakpoints.count_crossed(point.theta, point.theta + length * state.step) < MANY_BREAKPOINTS
+    few = task.breakpoints.count_crossed(point.theta, point.theta + length * state.step) < algebra.MANY_BREAKPOINTS
     inside = ~state.inside & (trial.crossed > 0) & few
-    below_noise = (state.decrease <= NOISE * jnp.abs(point.cost)) & ~inside
+    below_noise = (-state.length * state.slope <= algebra.NOISE * jnp.abs(point.cost)) & ~inside
     hopeless = below_noise | (trials >= MAX_TRIALS)
     crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
     # What is left of the predicted decrease cannot be seen in J any more, or too much has been tried.
@@ -409,8 +359,8 @@ def _find_step(state: State, task: Task) -> State:
     step, slope = _direction(state, task.constraints, task.breakpoints)
     negligible = algebra.is_negligible(step, state.scale, jnp)
     # A step inside the piece follows a refusal: the point is the old one, which has been judged already.
-    fresh = ~state.inside
-    stationary = fresh & (state.point.optimality <= task.tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
+    fresh, low = ~state.inside, state.point.optimality <= task.tolerance
+    stationary = fresh & low & (negligible | (state.below >= algebra.EXTRA_ITERATIONS))
     done = stationary | (fresh & (state.iterations >= task.max_iterations))
     return state._replace(step=step, slope=slope, undirected=jnp.zeros((), bool), stationary=stationary, done=done)
 
@@ -421,65 +371,15 @@ def build_outcome(state: State, constraints: Constraints) -> Outcome:
     interior = ~jnp.any(_active(constraints, point.theta, state.scale))
     # A convex kink, g- < g+, may hold its coordinate; where the derivatives are equal the breakpoint is none of J.
     jump = point.right.gradient - point.left.gradient
-    held = point.kink & (jump > SMALLEST_JUMP * state.gradient_scale)
+    held = point.kink & (jump > algebra.SMALLEST_JUMP * state.gradient_scale)
     hessian = _without(held, point.right.hessian)
     scaling = _compute_scaling(hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
     # The second-order condition on what is free: positive eigenvalues of the scaled Hessian, held rows being those of
     # I.
     smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(hessian / jnp.outer(scaling, scaling)))[0]
-    settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
-    return Outcome(
-        point.theta,
-        point.cost,
-        point.right.gradient,
-        point.right.hessian,
-        point.optimality,
-        state.iterations,
-        state.evaluations,
-        settled,
-        point.left.gradient,
-        held,
-    )
-
-
-def begin(start: Array) -> State:
-    """Return the state before the first evaluation, which is accepted whatever it gives, if it is finite."""
-    d = start.shape[0]
-    infinite, zero = jnp.full((), jnp.inf), jnp.zeros(())
-    none, no = jnp.zeros((), int), jnp.zeros((), bool)
-    unknown = Sample(infinite, jnp.full(d, jnp.nan), jnp.full((d, d), jnp.nan))
-    return State(
-        point=Point(start, unknown, unknown, jnp.zeros(d, bool), infinite, none, no),
-        iterations=none,
-        evaluations=none,
-        step=jnp.zeros(d),
-        slope=zero,
-        length=jnp.ones(()),
-        trials=none,
-        refused=none,
-        inside=no,
-        undirected=no,
-        halfway=no,
-        right_there=unknown,
-        below=none,
-        scale=jnp.abs(start),
-        cost_scale=zero,
-        gradient_scale=zero,
-        lowest=infinite,
-        done=no,
-        stationary=no,
-    )
-
-
-def _sides(left: Array, right: Array, kink: Array) -> Array:
-    """Choose sides as `switchfit.optimize.point.steepest_descent` does where no constraint is active: (d,)."""
-    return jnp.where(kink, algebra.choose_sides(left, right, jnp), 1)
-
-
-def _steepest(left: Array, right: Array, kink: Array) -> Array:
-    """Return the derivative on the side to which each coordinate descends, 0 where a kink holds it: (d,)."""
-    sides = _sides(left, right, kink)
-    return jnp.where(sides == 0, 0.0, jnp.where(sides > 0, right, left))
+    settled = state.stationary & interior & (smallest > algebra.EIGENVALUE_FLOOR)
+    spent = state.iterations, state.evaluations
+    return Outcome(point.theta, *point.right, point.optimality, *spent, settled, point.left.gradient, held)
 
 
 def _without(held: Array, hessian: Array) -> Array:
@@ -491,7 +391,8 @@ def _without(held: Array, hessian: Array) -> Array:
 def _active(constraints: Constraints, theta: Array, scale: Array) -> Array:
     """Return which constraints hold with equality up to rounding: (m + 2 d,) bool."""
     size = jnp.maximum(jnp.maximum(scale, constraints.size), jnp.abs(theta))
-    return algebra.is_active(constraints.slack(theta), size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
+    slack = algebra.slack(constraints, theta, jnp)
+    return algebra.is_active(slack, size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
 
 
 def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient: Array) -> Array:
@@ -568,8 +469,7 @@ def _compute_scaling(hessian: Array, floor: Array) -> Array:
         return jnp.max(size / jnp.outer(scaling, scaling), axis=1)
 
     def go_on(state: tuple[Array, Array, Array]) -> Array:
-        rounds, _, largest = state
-        return (rounds < EQUILIBRATIONS) & jnp.any(largest > EQUILIBRATED)
+        return (state[0] < algebra.EQUILIBRATIONS) & jnp.any(state[2] > algebra.EQUILIBRATED)
 
     # Rounds as in `diagonal_scaling`; a positive definite matrix needs none of them.
     start = algebra.jacobi_scaling(jnp.maximum(jnp.diagonal(size), floor), jnp.max(size, axis=1), jnp)
@@ -581,10 +481,8 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     point, theta, sides = state.point, state.point.theta, state.point.sides
     # The Hessian of the piece that the sides lead into; entries between one coordinate on its left and another on its
     # right are those of no piece that was evaluated, and the mean stands for them.
-    held = sides == 0
-    pair = sides[:, None] + sides[None]
-    hessian = _without(held, algebra.mix_sides(point.right.hessian, point.left.hessian, pair, jnp))
-    gradient = jnp.where(held, 0.0, jnp.where(sides > 0, point.right.gradient, point.left.gradient))
+    pair, gradient = sides[:, None] + sides[None], point.gradient
+    hessian = _without(sides == 0, algebra.mix_sides(point.right.hessian, point.left.hessian, pair, jnp))
     # B = D S D, with S of unit diagonal, so that eigenvalues of S are compared with numbers that have no unit.
     narrowed = breakpoints.piece(theta, constraints)
     lower = jnp.where(state.inside, narrowed[0], constraints.lower)
@@ -595,7 +493,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     identity = jnp.eye(theta.shape[0])
     # Cholesky of S - floor I exists if and only if all eigenvalues are above the floor; JAX returns NaN where it does
     # not.
-    definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(scaled - EIGENVALUE_FLOOR * identity)))
+    definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(scaled - algebra.EIGENVALUE_FLOOR * identity)))
 
     # |S| = V |Lambda| V': a step that descends along negative curvature, as long as it would be along positive.
     def absolute() -> Array:
