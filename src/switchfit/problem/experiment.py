@@ -14,11 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
+from switchfit.problem.data import (
+    Data,
+    FloatArray,
+    Input,
+    Measurements,
+    PiecewisePolynomial,
+    ReferenceSignal,
+    count_from,
+)
 from switchfit.problem.dates import Given, choose_origin, has_dates, list_dates, read_date, read_dates
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, unit_suffix
-from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import (
     as_array,

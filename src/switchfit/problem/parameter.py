@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.dates import Dates, list_dates, read_date
-from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, require_deviation, set_fields, shorten
+from switchfit.problem.validation import as_array, as_choice, as_flag, as_name, require_deviation, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -108,9 +108,7 @@ Prior = Normal | LogNormal
 def _check(prior: Any, center: str, spread: str) -> None:
     kind = type(prior).__name__
     for name in (center, spread):
-        set_fields(prior, **{name: as_array(getattr(prior, name), f"{kind} {name}")})
-    if not np.all(np.isfinite(getattr(prior, center))):
-        raise ValueError(f"{kind} {center} must be finite; got {shorten(getattr(prior, center))}.")
+        set_fields(prior, **{name: as_array(getattr(prior, name), f"{kind} {name}", finite=name == center)})
     require_deviation(getattr(prior, spread), f"{kind} {spread}")
 
 
@@ -234,8 +232,8 @@ class Parameter:
 
     def __post_init__(self) -> None:
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
-        set_fields(self, unit=as_text(self.unit, "Parameter unit"), fixed=as_flag(self.fixed, "Parameter fixed"))
-        set_fields(self, scale=scale)
+        unit = as_name(self.unit, "Parameter unit", empty=True)
+        set_fields(self, unit=unit, fixed=as_flag(self.fixed, "Parameter fixed"), scale=scale)
         given = {name: read_date(getattr(self, name), f"Parameter {name}") for name in ("value", *BOUNDS)}
         if any(isinstance(each, Dates) for each in (*given.values(), getattr(self.prior, "mean", None))):
             set_fields(self, **given)  # an experiment makes numbers of them, and checks these
@@ -245,12 +243,10 @@ class Parameter:
 
     def _read_numbers(self, scale: str) -> dict[str, FloatArray]:
         """Return the value and the bounds, checked against one another."""
-        value = as_array(self.value, "Parameter value")
+        value = as_array(self.value, "Parameter value", finite=True)
         lower, upper = (self._bound(name, value.shape) for name in BOUNDS)
         if value.size == 0:
             raise ValueError("Parameter value must have one entry or more; got none.")
-        if not np.isfinite(value).all():
-            raise ValueError(f"Parameter value must be finite; got {shorten(value)}.")
         if not ((lower <= value).all() and (value <= upper).all()):
             bounds = f"[{shorten(self.lower)}, {shorten(self.upper)}]"
             if not (lower <= upper).all():

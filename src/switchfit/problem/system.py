@@ -149,11 +149,9 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
                 f"{wrong}."
             )
         return entries
-    state = as_array(value, name, form="an array of numbers, one for each state")
+    state = as_array(value, name, form="an array of numbers, one for each state", finite=True)
     if state.ndim != 1 or state.size == 0:
         raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
-    if not np.all(np.isfinite(state)):
-        raise ValueError(f"{name} must be finite; got {shorten(state)}.")
     state.flags.writeable = False
     return state
 
