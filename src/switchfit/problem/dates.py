@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -451,11 +451,8 @@ class Origin:
             return None
 
 
-class Given(NamedTuple):
-    """Dates among the arguments of an experiment, and what messages call them."""
-
-    what: str
-    dates: Dates
+Given = tuple[str, Dates]
+"""Dates among the arguments of an experiment, and what messages call them."""
 
 
 def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, time_zone: Any, t0: Any) -> Origin:
@@ -485,25 +482,26 @@ def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, ti
     asked = None if time_zone is None else as_name(time_zone, "time_zone", form)
     if asked is not None:
         find_zone(asked)
-    every = [*given, *([] if start is None else [Given("origin", start)])]
+    every = [*given, *([] if start is None else [("origin", start)])]
     if not every:
         raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date at which times are 0.")
-    bare, zoned = ([one for one in every if bool(one.dates.time_zone) is has] for has in (False, True))
+    bare, zoned = ([one for one in every if bool(one[1].time_zone) is has] for has in (False, True))
     if asked is None and bare and zoned:
+        (what, dates), (other, others) = zoned[0], bare[0]
         raise ValueError(
-            f"{zoned[0].what} has a time zone ({zoned[0].dates!r}), but {bare[0].what} has none ({bare[0].dates!r}). "
-            "Say where those were read, such as time_zone='Europe/Berlin', or write the zone into all dates."
+            f"{what} has a time zone ({dates!r}), but {other} has none ({others!r}). Say where those were read, such "
+            "as time_zone='Europe/Berlin', or write the zone into all dates."
         )
-    zones = {one.dates.time_zone for one in zoned}
+    zones = {dates.time_zone for _, dates in zoned}
     zone = asked if asked is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"
     start = t0 if start is None and isinstance(t0, Dates) else start
-    candidates = data if start is None else [Given("origin", start)]
+    candidates = data if start is None else [("origin", start)]
     if not candidates:
         raise ValueError(
-            f"{given[0].what} is a date, but not all times of the data are: give origin, the date at which times are 0."
+            f"{given[0][0]} is a date, but not all times of the data are: give origin, the date at which times are 0."
         )
-    dates = [one.dates.localize(zone, one.what) if zone else one.dates for one in candidates]
-    return make_origin(min(each.instants.min() for each in dates), zone)
+    located = [dates.localize(zone, what) if zone else dates for what, dates in candidates]
+    return make_origin(min(each.instants.min() for each in located), zone)
 
 
 def make_origin(instant: Any, zone: str) -> Origin:

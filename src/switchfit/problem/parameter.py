@@ -309,6 +309,15 @@ def unit_suffix(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
 
 
+def require_time_unit(parameter: Parameter, what: str, time_unit: str) -> None:
+    """Raise ValueError for a time with another unit than its experiment's."""
+    if parameter.unit not in ("", time_unit):
+        raise ValueError(
+            f"{what} has the unit {parameter.unit!r}, but time_unit of its experiment is {time_unit!r}, and times are "
+            "not converted. Give both in the same unit."
+        )
+
+
 def as_parameter(
     value: Any, what: str, form: str = "a number, an array or an sf.Parameter", *, fixed: bool = False
 ) -> Parameter:

@@ -315,24 +315,14 @@ def _build_ordering(
     experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, durations: float | Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
-    given = list(durations.values()) if isinstance(durations, Mapping) else [durations]
-    if not all(np.isfinite(value) and value >= 0 for value in given):
-        raise ValueError(f"min_duration must be zero or positive; got {durations}.")
-    longest = max(given, default=0.0)
     rows, bounds, constraints = [], [], []
-    labels = name_runs(experiments)
-    if longest > 0 and any(
-        tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times
-    ):
+    labels, units = name_runs(experiments), {experiment.time_unit for experiment in experiments}
+    is_log = any(tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times)
+    if (is_log or len(units) > 1) and (any(durations.values()) if isinstance(durations, Mapping) else durations):
         raise ValueError(
-            f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
-            f"them is then not linear in what is estimated; got {durations}. Leave out min_duration, or scale='log'."
-        )
-    if longest > 0 and len({experiment.time_unit for experiment in experiments}) > 1:
-        units = ", ".join(f"{name} in {run.time_unit}" for name, run in zip(labels, experiments, strict=True))
-        raise ValueError(
-            f"min_duration is one number for experiments whose times are in different units ({units}), and times are "
-            "not converted. Give all times in one unit, or leave it out and bound the transition times of each."
+            "min_duration must be 0 where transition times are on a logarithmic scale (the difference of two of them "
+            "is then not linear in what is estimated), or experiments have times in different units "
+            f"({join_names(sorted(units))}); got {durations}."
         )
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else labels[e]

@@ -200,12 +200,13 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False,
     try:
         is_double = type(value) is float or (type(value) is np.ndarray and value.dtype == np.float64)
         exact = value if is_double else _read_exactly(value, what, missing)
-        with np.errstate(all="ignore"):
-            array = np.array(exact, dtype=np.float64)
     except _WrongEntryError as wrong:
         entry, error, why = wrong.args
         inside = "" if entry is value else f", in which {shorten(entry)} is not a number"
         raise error(f"{what} must be {form}; got {shorten(value)}{inside}{why}.") from None
+    try:
+        with np.errstate(all="ignore"):
+            array = np.array(exact, dtype=np.float64)
     except (OverflowError, ValueError) as error:
         why = f"with a number {BEYOND}" if isinstance(error, OverflowError) else "whose rows differ in length or shape"
         raise ValueError(f"{what} must be {form}; got {shorten(value)}, {why}.") from None
@@ -239,6 +240,14 @@ def as_positive(value: Any, what: str) -> float:
     if not number > 0:
         raise ValueError(f"{what} must be positive; got {number}.")
     return as_finite(number, what)
+
+
+def as_not_negative(value: Any, what: str) -> float:
+    """Return `value` as a finite float that is 0 or more."""
+    number = as_finite(value, what)
+    if number < 0:
+        raise ValueError(f"{what} must be 0 or more; got {number}.")
+    return number
 
 
 def require_deviation(sd: FloatArray, what: str) -> None:
