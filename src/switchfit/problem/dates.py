@@ -117,10 +117,10 @@ def _read_date(value: Any, what: str, place: str = "") -> tuple[Any, str]:
             wanted = "numbers or dates" if place else "a number or a date"
             raise ValueError(f"{what} must be {wanted}; got {shorten(value)}{place}. Write dates as {EXAMPLES}.")
         return found
+    if value is None or str(value) in ("NaT", "<NA>", "nan"):
+        _refuse_missing(what, place)
     if isinstance(value, np.datetime64):
         return _as_instants(np.asarray(value), what)[()], ""
-    if value is None or value != value:  # NaT of pandas differs from itself
-        _refuse_missing(what, place)
     if isinstance(value, datetime.datetime):
         return _split(value)
     if isinstance(value, datetime.date):
@@ -249,24 +249,17 @@ def read_dates(value: Any, what: str) -> Dates | None:
         instant, zone = _read_date(value, what)
         return Dates(np.array(instant), zone)
     dtype = getattr(value, "dtype", None)
-    kind, is_polars = getattr(dtype, "kind", ""), is_of_library(value, "polars")
-    if kind == "M" or (is_polars and str(dtype).startswith("Date")):
-        return _read_column(value, what)
-    has_types = isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1)
-    has_dates = has_types and any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))
-    if has_dates or kind == "U" or (is_polars and str(dtype) == "String"):
-        return _read_entries(value.to_list() if is_polars else list(value), what)
+    tz = getattr(dtype, "tz", None) or getattr(dtype, "time_zone", None)  # of pandas, of polars
+    if tz or is_of_library(value, "polars"):
+        value = np.asarray(value, dtype="datetime64[us]" if tz else None)  # in UTC if it has a zone
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if kind == "M":
+        zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
+        return Dates(_as_instants(np.asarray(value), what), zone)
+    is_list = isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1)
+    if kind == "U" or (is_list and any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))):
+        return _read_entries(list(value), what)
     return None
-
-
-def _read_column(value: Any, what: str) -> Dates:
-    """Return an array or a column of datetime64 as dates."""
-    tz = getattr(value.dtype, "tz", None) or getattr(value.dtype, "time_zone", None)  # of pandas, of polars
-    if is_of_library(value, "polars"):
-        value = (value.dt.convert_time_zone("UTC") if tz else value).to_numpy()
-    array = np.asarray(value, dtype="datetime64[us]" if tz else None)  # in UTC if it has a zone
-    zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
-    return Dates(_as_instants(array, what), zone)
 
 
 def _read_entries(entries: list[Any], what: str) -> Dates:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,7 +232,7 @@ class Experiment:
         tf = span[1] if self.tf is None else _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
-            why = f"; {' and '.join(missing)} left out, and taken from the data" if missing else ""
+            why = f" ({' and '.join(missing)} from the data)" if missing else ""
             raise ValueError(
                 "An experiment needs a finite horizon with t0 < tf; got "
                 f"({show_time(self, t0)}, {show_time(self, last)}){why}."
@@ -535,12 +535,9 @@ def _check_map(given: Any) -> Mapping[str, str]:
 
 def _check_data(data: Any) -> tuple[Data, ...]:
     items = tuple(data) if isinstance(data, (list, tuple)) else (data,)
+    kinds = [f"sf.{kind.__name__}" for kind in get_args(Data)]
     for item in items:
-        if not isinstance(item, Data):
-            raise TypeError(
-                "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TransitionCost, sf.TerminalCost, "
-                f"sf.TerminalConstraint or a list of them; got {type(item).__name__}."
-            )
+        as_instance(item, "data", Data, f"{', '.join(kinds)} or a list of them")  # type: ignore[arg-type]
     if not items:
         raise ValueError("data is empty: an experiment needs at least one cost.")
     return items
@@ -564,8 +561,8 @@ def _find_span(data: tuple[Data, ...], missing: tuple[str, ...], t0: Any) -> tup
     if not spans:
         kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
         raise ValueError(
-            f"{' and '.join(missing)} left out, but nothing among the data ({kinds}) has times that say where the "
-            f"horizon begins and ends: give {' and '.join(missing)}."
+            f"without t0 or tf, the horizon is that of the data, but none of them ({kinds}) has times: give "
+            f"{' and '.join(missing)}."
         )
     return float(np.min(spans)), float(np.max(spans))
 
