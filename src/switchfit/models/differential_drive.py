@@ -122,10 +122,7 @@ def differential_drive(
     names = check_modes(modes, MODES)
     commanded = as_choice(speeds, "speeds", ("measured", "commanded")) == "commanded"
     if delay is not None and not commanded:
-        raise ValueError(
-            f"delay is that of commanded speeds; got speeds='measured' and delay={delay!r}. Measured speeds that are "
-            "late against the positions are a delay of the Measurements."
-        )
+        raise ValueError(f"delay is that of speeds='commanded', or else of the Measurements; got delay={delay!r}.")
     constants = check_constants(
         positive={"radius": radius, "track": track, "alpha_l": alpha_l, "alpha_r": alpha_r, "lag": lag},
         not_negative={"turn_slip": turn_slip, "delay": 0.0 if delay is None else delay},

@@ -31,6 +31,7 @@ from switchfit.problem.validation import (
     as_callable,
     as_choice,
     as_finite,
+    as_instance,
     as_labels,
     as_name,
     as_named_columns,
@@ -306,16 +307,12 @@ def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePo
     start, end = signal.knots[[0, -1]].tolist()
     step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
     if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
-        raise ValueError(
-            f"lowpass_hz must not need more than {MOST_FILTERED} points, ten per period; got {cutoff_hz:g} Hz from "
-            f"{start:g} to {end:g}. Samples show nothing above {0.5 / np.min(np.diff(signal.knots)):.3g} Hz."
-        )
+        raise ValueError(f"lowpass_hz must not need more than {MOST_FILTERED} points, ten a period; got {cutoff_hz:g}.")
     grid = np.linspace(start, end, max(int(np.ceil((end - start) / step)) + 1, 8))
     rate = (len(grid) - 1) / (end - start)
     if cutoff_hz < LOWEST_CUTOFF * rate:
         raise ValueError(
-            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} Hz or more for {rate:.6g} points per second, below which "
-            f"the filter's output is rounding error; got {cutoff_hz:g}."
+            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} or more, else all is rounding error; got {cutoff_hz:g}."
         )
     sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
     padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
@@ -486,11 +483,8 @@ class ReferenceSignal:
         return format_line(self, join_first(self.names or ()), format_count(self.signal.channels, "channel"))
 
     def __post_init__(self) -> None:
-        if not isinstance(self.signal, PiecewisePolynomial):
-            raise TypeError(
-                "ReferenceSignal is made from samples by sf.ReferenceSignal.from_samples(times, values, ...); "
-                f"got {type(self.signal).__name__}."
-            )
+        form = "made by sf.ReferenceSignal.from_samples(times, values, ...)"
+        as_instance(self.signal, "signal of a ReferenceSignal", PiecewisePolynomial, form)
         _check_channels(self, self.signal.channels, None, None)
         set_fields(self, weights=_build_weight_matrix(self.weights, self.signal.channels))
 
@@ -670,13 +664,11 @@ class Measurements:
         set_fields(self, loss=loss, loss_scale=scale)
         if self.loss != "linear" and self.sigma is None:
             raise ValueError(
-                f"loss={self.loss!r} measures residuals in units of sigma, which is left out: set sigma to a number, "
-                "or to the name of a parameter to estimate it."
+                f"loss={self.loss!r} measures residuals in units of sigma: give it, or the name of a parameter for it."
             )
         if self.loss == "cauchy" and self.sigma_names and scale <= 1:
             raise ValueError(
-                "loss='cauchy' with a sigma that is a parameter needs a loss_scale above 1, otherwise J falls without "
-                f"end as sigma vanishes; got {scale}."
+                f"loss='cauchy' with an estimated sigma needs a loss_scale above 1, or sigma vanishes; got {scale}."
             )
 
     @property

@@ -269,8 +269,7 @@ def _read_entries(entries: list[Any], what: str) -> Dates:
     if "" in zones and len(zones) > 1:
         bare, zoned = (next(e for e, (_, z) in zip(entries, pairs, strict=True) if bool(z) is k) for k in (False, True))
         raise ValueError(
-            f"{what} has dates with a time zone and dates without one: {shorten(zoned)} and {shorten(bare)}. Write the "
-            "zone into all of them, or into none."
+            f"{what} must all have a time zone, or none; got dates with one and without: {shorten([zoned, bare])}."
         )
     zone = zones.pop() if len(zones) == 1 else "UTC"
     return Dates(np.array([instant for instant, _ in pairs], dtype="datetime64[us]"), zone)
@@ -354,9 +353,7 @@ def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     micros = as_array(numbers, "numbers since 1970") * (1e6 * SECONDS[key])
     first, last = (day.astype("datetime64[us]").astype(np.int64) for day in (FIRST, LAST))
     if not ((micros >= first) & (micros <= last)).all():
-        raise ValueError(
-            f"numbers since 1970 in {key} must be finite, and lie in the years 1 to 9999; got {shorten(numbers)}."
-        )
+        raise ValueError(f"numbers since 1970 in {key} must lie in the years 1 to 9999; got {shorten(numbers)}.")
     return Dates(np.rint(micros).astype(np.int64).astype("datetime64[us]"), "UTC")
 
 
@@ -405,10 +402,7 @@ class Origin:
             For dates with a zone if the origin has none, and for times that clocks skip or show twice.
         """
         if dates.time_zone and not self.time_zone:
-            raise ValueError(
-                f"{what}: {dates!r} has a time zone, but the dates of the experiment have none. Leave it out, or give "
-                "the experiment a time_zone."
-            )
+            raise ValueError(f"{what}: {dates!r} has a time zone, but the dates of the experiment have none.")
         dates = dates.localize(self.time_zone, what) if self.time_zone else dates
         return np.asarray((dates.instants - self.instant) / LENGTHS[normalize_time_unit(time_unit)])
 
@@ -477,13 +471,13 @@ def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, ti
         find_zone(asked)
     every = [*given, *([] if start is None else [("origin", start)])]
     if not every:
-        raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date at which times are 0.")
+        raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date of time 0.")
     bare, zoned = ([one for one in every if bool(one[1].time_zone) is has] for has in (False, True))
     if asked is None and bare and zoned:
         (what, dates), (other, others) = zoned[0], bare[0]
         raise ValueError(
-            f"{what} has a time zone ({dates!r}), but {other} has none ({others!r}). Say where those were read, such "
-            "as time_zone='Europe/Berlin', or write the zone into all dates."
+            f"{what} has a time zone ({dates!r}), but {other} has none ({others!r}): give time_zone='Europe/Berlin', "
+            "or whatever it is, for those."
         )
     zones = {dates.time_zone for _, dates in zoned}
     zone = asked if asked is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"
@@ -491,7 +485,7 @@ def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, ti
     candidates = data if start is None else [("origin", start)]
     if not candidates:
         raise ValueError(
-            f"{given[0][0]} is a date, but not all times of the data are: give origin, the date at which times are 0."
+            f"{given[0][0]} is a date, but not all times of the data are: give origin, the date of time 0."
         )
     located = [dates.localize(zone, what) if zone else dates for what, dates in candidates]
     return make_origin(min(each.instants.min() for each in located), zone)

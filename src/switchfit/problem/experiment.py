@@ -247,10 +247,7 @@ class Experiment:
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
         if len(given) != len(sequence) - 1:
-            raise ValueError(
-                f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
-                f"got {len(given)}, needed {len(sequence) - 1}."
-            )
+            raise ValueError(f"transition_times must be one fewer than the {len(sequence)} modes; got {len(given)}.")
         times = tuple(as_parameter(tau, "a transition time") for tau in given)
         if self.inputs is not None:
             as_instance(self.inputs, "inputs", Input, "an sf.Input")
@@ -394,7 +391,7 @@ class Experiment:
             require_time_unit(tau, what, self.time_unit)
         if len({tau.scale for tau in self._own_times if not tau.fixed}) > 1:
             raise ValueError(
-                "the transition times of an experiment that are estimated, and a free tf, must be on one scale; got "
+                "transition times that are estimated, and a free tf, must be on one scale; got "
                 f"{shorten([tau.scale for tau in self._own_times])}. Give scale='log' to all of them, or to none."
             )
         knots = self.ends_of_modes(self.initial_times)
@@ -560,10 +557,7 @@ def _find_span(data: tuple[Data, ...], missing: tuple[str, ...], t0: Any) -> tup
         spans = [as_number(t0, "t0") + np.array([0.0, 1.0])]
     if not spans:
         kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
-        raise ValueError(
-            f"without t0 or tf, the horizon is that of the data, but none of them ({kinds}) has times: give "
-            f"{' and '.join(missing)}."
-        )
+        raise ValueError(f"{' and '.join(missing)} must be given, as nothing among the data ({kinds}) has times.")
     return float(np.min(spans)), float(np.max(spans))
 
 
@@ -581,7 +575,6 @@ def _check_final_time(given: Any) -> float | Parameter:
         return float(given.value)
     if not np.isfinite(given.upper):
         raise ValueError(
-            "A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0): the latest time to which the "
-            f"model may be integrated; got the upper bound {given.upper}."
+            f"A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0); got {given.upper}."
         )
     return given

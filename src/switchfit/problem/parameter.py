@@ -270,10 +270,7 @@ class Parameter:
         try:
             return np.broadcast_to(bound, shape).copy()
         except ValueError:
-            raise ValueError(
-                f"Parameter needs numbers that fit its value, of shape {shape}; got {name} {shorten(bound)} of shape "
-                f"{bound.shape}."
-            ) from None
+            raise ValueError(f"Parameter {name} must fit the value, of shape {shape}; got {shorten(bound)}.") from None
 
     def _check_prior(self) -> None:
         if self.prior is None:
@@ -283,14 +280,11 @@ class Parameter:
         try:
             PriorTerms.of(self.prior, self.shape)
         except ValueError as error:
-            raise ValueError(
-                f"Parameter prior does not fit a value of shape {self.shape}: "
-                f"{', '.join(f'{name} has shape {np.shape(number)}' for name, number in vars(self.prior).items())}."
-            ) from error
+            raise ValueError(f"Parameter prior must fit the value, of shape {self.shape}; got {self.prior}.") from error
         if isinstance(self.prior, LogNormal) and not (self.positive or self.fixed):
             raise ValueError(
-                "Parameter with a LogNormal prior must stay positive: give it a lower bound above 0, or scale='log'; "
-                f"got the lower bound {shorten(self.lower)}."
+                "Parameter with a LogNormal prior needs a lower bound above 0, or scale='log'; got the lower bound "
+                f"{shorten(self.lower)}."
             )
 
     @property

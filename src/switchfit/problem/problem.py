@@ -61,9 +61,7 @@ def check_sequences(system: HybridSystem, experiments: tuple[Experiment, ...], m
     if max_transitions is not None:
         longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
         if max_transitions < longest:
-            raise ValueError(
-                f"max_transitions is {max_transitions}, but a mode_sequence has {longest} transitions and jumps."
-            )
+            raise ValueError(f"max_transitions is {max_transitions}; there are {longest} transitions and jumps.")
 
 
 def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
@@ -73,8 +71,7 @@ def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
     for here, target in run.parameter_map.items():
         if target not in parameters:
             raise ValueError(
-                f"parameter_map gives the model's {shorten(here)} as the unknown parameter {shorten(target)}; the "
-                f"problem has {join_names(parameters)}."
+                f"parameter_map has {shorten(here)} -> {shorten(target)}, but the problem has {join_names(parameters)}."
             )
 
     def find_scalar(what: str, name: str) -> Parameter:
@@ -291,11 +288,9 @@ class Problem:
         >>> problem.with_sequences([("off", "on", "off")], [(1.0, 3.0)]).theta_names
         ('tau_1', 'tau_2', 'k')
         """
-        if not len(sequences) == len(transition_times) == len(self.experiments):
-            raise ValueError(
-                f"with_sequences needs a sequence and its times for each of {len(self.experiments)} experiments; got "
-                f"{len(sequences)} sequences and {len(transition_times)} arrays of times."
-            )
+        counts = [len(each) for each in (self.experiments, sequences, transition_times)]
+        if len(set(counts)) > 1:
+            raise ValueError(f"each experiment needs a sequence and its times; got {counts} of them.")
         given = zip(self.experiments, sequences, transition_times, strict=True)
         experiments = tuple(
             replace(run, mode_sequence=tuple(modes), transition_times=tuple(np.asarray(times, dtype=float).tolist()))
@@ -328,8 +323,8 @@ class Problem:
             changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
             if changed:
                 raise ValueError(
-                    f"{', '.join(changed)} does something else in this process, or now, than when the problem was "
-                    "built, as what it reads has changed: build the problem anew before it is sent to other processes."
+                    f"{', '.join(changed)} does something else in this process than when the problem was built: what "
+                    "it reads has changed. Build the problem anew before it is sent to other processes."
                 )
 
     @property
@@ -728,9 +723,7 @@ def require_samples(problem: Problem) -> None:
     names = name_runs(problem.experiments)
     for name, run in zip(names, problem.experiments, strict=True):
         if not all(len(item.times) for item in run.measurements):
-            raise ValueError(
-                f"the Measurements of {name} have no samples: give times and values (sf.OnlineEstimator needs none)."
-            )
+            raise ValueError(f"the Measurements of {name} have no samples; only sf.OnlineEstimator needs none.")
 
 
 def require_unknowns(problem: Problem) -> None:

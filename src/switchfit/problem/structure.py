@@ -369,8 +369,7 @@ def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channel
         return trace(item.observe, ((), (n,), None), (channels,), "observe", "h(t, x, p)")
     if channels != n:
         raise ValueError(
-            f"Without observe the whole state is compared: its {n} entries need as many channels of data; got "
-            f"{channels}. Give observe=h(t, x, p) -> ({channels},)."
+            f"Without observe=h(t, x, p) -> ({channels},) the whole state is compared, {n} entries; got {channels} channels."
         )
     return None
 
@@ -379,9 +378,7 @@ def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int)
     """Return the function psi(x, p) of a terminal constraint, which returns a number or (m,)."""
     psi = trace(item.psi, ((n,), None), None, "TerminalConstraint", "psi(x, p)")
     if len(psi.shape) > 1:
-        raise ValueError(
-            f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape {psi.shape}."
-        )
+        raise ValueError(f"TerminalConstraint: psi(x, p) must return a number or (m,) of them; got {psi.shape}.")
     return psi
 
 

@@ -320,8 +320,7 @@ def _build_ordering(
     is_log = any(tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times)
     if (is_log or len(units) > 1) and (any(durations.values()) if isinstance(durations, Mapping) else durations):
         raise ValueError(
-            "min_duration must be 0 where transition times are on a logarithmic scale (the difference of two of them "
-            "is then not linear in what is estimated), or experiments have times in different units "
+            "min_duration must be 0 where transition times are on a logarithmic scale, or in different units "
             f"({join_names(sorted(units))}); got {durations}."
         )
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):

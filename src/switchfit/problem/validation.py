@@ -254,9 +254,7 @@ def require_deviation(sd: FloatArray, what: str) -> None:
     """Raise ValueError unless standard deviations are positive and finite, and so are their inverse squares."""
     with np.errstate(all="ignore"):
         if not np.all((sd > 0) & np.isfinite(sd) & np.isfinite(sd**-2.0)):
-            raise ValueError(
-                f"{what} must be positive and finite, and so must 1 / sd**2; got a smallest value of {sd.min()}."
-            )
+            raise ValueError(f"{what} must be positive and finite, and so must its inverse square; got {sd.min()}.")
 
 
 def as_level(value: Any, what: str = "level") -> float:
@@ -507,12 +505,8 @@ def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
     TypeError
         For text, and for collections without order or that can be read only once: sets, dicts, generators.
     """
-    if isinstance(value, _TEXT):
-        raise TypeError(f"{what} must be {form}; got the string {shorten(value)}.")
-    if isinstance(value, (AbstractSet, Mapping, Iterator)):
-        raise TypeError(
-            f"{what} must be {form}; got {shorten(value)} ({type(value).__name__}): give a list or a tuple."
-        )
+    if isinstance(value, (*_TEXT, AbstractSet, Mapping, Iterator)):
+        raise TypeError(f"{what} must be {form} in a list or a tuple; got {shorten(value)} ({type(value).__name__}).")
     try:
         return tuple(value)
     except Exception:  # TypeError; arrays without dimensions and others raise their own
