@@ -249,16 +249,12 @@ class Parameter:
             raise ValueError("Parameter value must have one entry or more; got none.")
         if not ((lower <= value).all() and (value <= upper).all()):
             bounds = f"[{shorten(self.lower)}, {shorten(self.upper)}]"
-            if not (lower <= upper).all():
-                raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {bounds}.")
             raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {bounds}.")
         if scale == "log":
             lower = np.where(np.isneginf(lower), 0.0, lower)
             if not (np.all(value > 0) and np.all(lower >= 0)):
-                raise ValueError(
-                    "Parameter with scale='log' must be positive, and its lower bound 0 or more; got the value "
-                    f"{shorten(self.value)} and the lower bound {shorten(self.lower)}."
-                )
+                given = f"{shorten(self.value)} and the lower bound {shorten(self.lower)}"
+                raise ValueError(f"Parameter with scale='log' must be positive; got {given}.")
         return {"value": value, "lower": lower, "upper": upper}
 
     def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
@@ -319,17 +315,10 @@ def as_parameter(
 
     Errors call it `what`, and `form` what it has to be.
     """
-    if isinstance(value, Parameter):
-        refuse_dates(value, what)
-        return value
-    array = as_array(value, what, form=form)
     try:
-        return Parameter(array, fixed=fixed)
-    except ValueError as error:
-        raise ValueError(f"{what} must be {form}: {error}") from error
-
-
-def refuse_dates(parameter: Parameter, what: str) -> None:
-    """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
+        parameter = value if isinstance(value, Parameter) else Parameter(value, fixed=fixed)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{what} must be {form}: {error}") from error
     for date in list_dates(parameter):
         raise ValueError(f"{what} must be a number; got the date {date!r}. Only transition times and tf may be dates.")
+    return parameter

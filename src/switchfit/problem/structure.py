@@ -369,7 +369,7 @@ def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channel
         return trace(item.observe, ((), (n,), None), (channels,), "observe", "h(t, x, p)")
     if channels != n:
         raise ValueError(
-            f"Without observe=h(t, x, p) -> ({channels},) the whole state is compared, {n} entries; got {channels} channels."
+            f"Without observe=h(t, x, p) -> ({channels},) the whole state is compared: its {n} entries; got {channels}."
         )
     return None
 
