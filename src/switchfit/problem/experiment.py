@@ -575,6 +575,6 @@ def _check_final_time(given: Any) -> float | Parameter:
         return float(given.value)
     if not np.isfinite(given.upper):
         raise ValueError(
-            f"A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0); got {given.upper}."
+            f"A free tf needs a finite upper bound, as sf.Parameter(2.0, upper=5.0); got the upper bound {given.upper}."
         )
     return given

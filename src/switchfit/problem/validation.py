@@ -117,10 +117,7 @@ MOST_LISTED = 10
 _INTEGERS = (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64)
 _EXACT: frozenset[type] = frozenset({int, float, np.float64, *_INTEGERS})
 """Types that `numpy.array(..., dtype=float64)` reads without change."""
-NO_DATES = (
-    ": dates and time differences are not supported. Give numbers in one unit, such as the seconds since the start: "
-    "(dates - dates[0]) / np.timedelta64(1, 's')"
-)
+NO_DATES = ": dates and time differences are not supported; give (dates - dates[0]) / np.timedelta64(1, 's')"
 _TEXT = (str, bytes, bytearray)
 _DATES = (datetime.date, datetime.time, datetime.timedelta)
 
@@ -288,7 +285,10 @@ def as_seed(value: Any, what: str = "seed") -> int:
 
 def as_index(value: Any, what: str, size: int) -> int:
     """Return an index from 0 to `size` - 1."""
-    return as_count(value, what, at_most=size - 1)
+    try:
+        return as_count(value, what, at_most=size - 1)
+    except ValueError:
+        raise ValueError(f"{what} must lie in 0..{size - 1}; got {shorten(value)}.") from None
 
 
 def _read_exactly(value: Any, what: str, missing: bool, depth: int = 0) -> Any:
