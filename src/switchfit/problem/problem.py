@@ -232,11 +232,13 @@ class Problem:
         if not self.max_transitions:
             require_unknowns(self)
         self._check_noise()
+        states = [self.system.initial_state, *(run.initial_state for run in experiments)]
+        sizes = {len(state) for state in states if state is not None and not callable(state)}
+        if len(sizes) > 1:
+            raise ValueError(f"initial_state must have as many entries in the system and all experiments; got {sizes}.")
         set_fields(self, structures=self._trace_structures())
-        sizes = [structure.n for structure in self.structures]
-        if len(set(sizes)) > 1:
-            raise ValueError(f"the initial states of all experiments must have as many entries; got {shorten(sizes)}.")
-        self.system.check_labels_of(sizes[0])
+        for structure in self.structures:
+            self.system.check_labels_of(structure.n)
 
     def _check_noise(self) -> None:
         """Raise ValueError if something is weighed against noise that is unknown."""
@@ -580,8 +582,8 @@ class Problem:
             seen = self.late_times(checked, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.earliest_end):
                 raise ValueError(
-                    f"{what} has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}, "
-                    f"outside (t0, tf) = ({experiment.t0}, {experiment.earliest_end})."
+                    f"{what} has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
+                    f"{unit_suffix(experiment.time_unit)}, outside ({experiment.t0}, {experiment.earliest_end})."
                 )
         return checked
 
