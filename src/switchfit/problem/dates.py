@@ -171,11 +171,6 @@ class Dates:
     instants: Instants
     time_zone: str = ""
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the array, () for a single date."""
-        return self.instants.shape
-
     def __len__(self) -> int:
         return len(self.instants)
 
@@ -187,7 +182,7 @@ class Dates:
         return self.instants if dtype is None else self.instants.astype(dtype)
 
     def __repr__(self) -> str:
-        if self.shape == ():
+        if self.instants.shape == ():
             return format_instant(self.instants, self.time_zone)
         if len(self) == 0:
             return "no dates"
@@ -211,7 +206,7 @@ class Dates:
             return self
         minutes, places = np.unique(self.instants.astype("datetime64[m]").ravel(), return_inverse=True)
         offsets = [_find_offset(minute, zone, what) for minute in minutes.tolist()]
-        found = np.array(offsets, dtype="timedelta64[us]")[places].reshape(self.shape)
+        found = np.array(offsets, dtype="timedelta64[us]")[places].reshape(self.instants.shape)
         return Dates(self.instants - found, zone)
 
 
@@ -278,7 +273,7 @@ def _read_entries(entries: list[Any], what: str) -> Dates:
 def read_date(value: Any, what: str) -> Any:
     """Return a single date as `Dates`, ValueError for several; anything else as it is."""
     date = read_dates(value, what)
-    if date is not None and date.shape != ():
+    if date is not None and date.instants.shape != ():
         raise ValueError(f"{what} must be one date; got {date!r}.")
     return value if date is None else date
 

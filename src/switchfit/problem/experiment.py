@@ -318,7 +318,7 @@ class Experiment:
         return tuple(bounded)
 
     @cached_property
-    def _acts(self) -> list[tuple[float, Callable[..., Any]]]:
+    def acts(self) -> list[tuple[float, Callable[..., Any]]]:
         """Time and map of each jump, in the order in which they act."""
         acts = [(time, jump.map) for jump in self.jumps for time in np.atleast_1d(jump.time).tolist()]  # type: ignore[union-attr]
         return sorted(acts, key=lambda act: act[0])
@@ -326,12 +326,7 @@ class Experiment:
     @cached_property
     def jump_times(self) -> FloatArray:
         """Times of all jumps, ascending: (K,)."""
-        return np.array([time for time, _ in self._acts], dtype=np.float64)
-
-    @property
-    def jump_maps(self) -> list[Callable[..., Any]]:
-        """The map of each of `jump_times`."""
-        return [jump for _, jump in self._acts]
+        return np.array([time for time, _ in self.acts], dtype=np.float64)
 
     @cached_property
     def passed_by_jumps(self) -> NDArray[np.intp]:

@@ -317,7 +317,7 @@ def trace_structure(
         names = (*names, REST)
     after_jumps = (own_modes[i] for i in experiment.passed_by_jumps)  # the mode before it
     sequence = (own_modes[0], *insert_jumps(experiment, own_modes[1:], after_jumps))
-    jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for jump in experiment.jump_maps]
+    jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for _, jump in experiment.acts]
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)", jump_maps)

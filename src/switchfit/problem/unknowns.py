@@ -257,7 +257,7 @@ def list_unknowns(
 
     def add(name: str, unit: str, parameter: Parameter) -> slice:
         first = len(names)
-        entries = map(_index, np.ndindex(parameter.shape)) if parameter.shape else [""]
+        entries = [f"[{','.join(map(str, k))}]" for k in np.ndindex(parameter.shape)] if parameter.shape else [""]
         names.extend(f"{name}{entry}" for entry in entries)
         units.extend([unit] * parameter.value.size)
         pieces.append(parameter)
@@ -294,10 +294,6 @@ def list_unknowns(
     A, b, rows = _build_ordering(experiments, where, len(names), durations)
     places = tuple(where), spans, tuple(states)
     return Unknowns(tuple(names), tuple(units), value, lower, upper, *places, A, b, rows, priors, log, starts)
-
-
-def _index(k: tuple[int, ...]) -> str:
-    return f"[{','.join(map(str, k))}]"
 
 
 def get_min_duration(min_duration: float | Mapping[str, float], mode: str) -> float:
