@@ -286,16 +286,20 @@ def as_date(value: Any, what: str) -> Dates:
     return date
 
 
-def list_dates(value: Any) -> Iterator[Dates]:
-    """Yield all dates in a value: in the fields of dataclasses, and in tuples."""
+Given = tuple[str, Dates]
+"""Dates among the arguments of an experiment, and what messages call them."""
+
+
+def list_dates(value: Any, what: str = "") -> Iterator[Given]:
+    """Yield all dates in a value, in the fields of dataclasses and in tuples, and what to call them."""
     if isinstance(value, Dates):
-        yield value
+        yield what, value
     elif isinstance(value, tuple):
         for entry in value:
-            yield from list_dates(entry)
+            yield from list_dates(entry, what)
     elif is_dataclass(value):
         for each in fields(value):
-            yield from list_dates(getattr(value, each.name))
+            yield from list_dates(getattr(value, each.name), what or f"times of {type(value).__name__}")
 
 
 def has_dates(value: Any) -> bool:
@@ -431,10 +435,6 @@ class Origin:
             return moment if self.zone is None else moment.replace(tzinfo=datetime.UTC).astimezone(self.zone)
         except (OverflowError, ValueError):
             return None
-
-
-Given = tuple[str, Dates]
-"""Dates among the arguments of an experiment, and what messages call them."""
 
 
 def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, time_zone: Any, t0: Any) -> Origin:

@@ -273,11 +273,7 @@ class Experiment:
         parts: dict[str, Any] = {"data": data, "jumps": jumps, "inputs": self.inputs, "transition_times": times}
         parts |= {name: read_date(getattr(self, name), name) for name in ("t0", "tf")}
         names = {"transition_times": "a transition time", "t0": "t0", "tf": "tf"}
-        given = []
-        for name, part in parts.items():
-            for item in part if isinstance(part, tuple) else (part,):
-                what = names.get(name, f"times of {type(item).__name__}")
-                given += [(what, dates) for dates in list_dates(item)]
+        given = [dates for name, part in parts.items() for dates in list_dates(part, names.get(name, ""))]
         if given or self.origin is not None or self.time_zone is not None:
             timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
             of_data = given[: len(timed)] if all(map(has_dates, timed)) else []  # they stand first
