@@ -134,10 +134,6 @@ class _Short(reprlib.Repr):
         self.maxlevel = 4
         self.maxstring = self.maxother = 60
 
-    def repr_int(self, x: int, level: int) -> str:
-        """Python refuses to write integers of more than 4,300 digits."""
-        return repr(x) if x.bit_length() <= 128 else f"an integer of {x.bit_length()} bits"
-
     def repr_ndarray(self, x: Any, level: int) -> str:
         array = np.asarray(x)
         if array.size <= 8:
