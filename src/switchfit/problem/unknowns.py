@@ -319,28 +319,22 @@ def _build_ordering(
             "min_duration must be 0 where transition times are on a logarithmic scale, or in different units "
             f"({join_names(sorted(units))}); got {durations}."
         )
+    unit_rows = np.eye(d + 1, d)  # the last one, of times that are fixed, is zero
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else labels[e]
         knots = experiment.ends_of_modes(experiment.initial_times)
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
-        unit = unit_suffix(experiment.time_unit)
+        lengths, known = np.diff(knots), np.diff(np.where(ends < 0, knots, 0.0))
         for i, mode in enumerate(experiment.mode_sequence):
-            length, dwell = knots[i + 1] - knots[i], get_min_duration(durations, mode)
-            if length < dwell * (1 - 1e-12):
+            dwell, unit = get_min_duration(durations, mode), unit_suffix(experiment.time_unit)
+            if lengths[i] < dwell * (1 - 1e-12):
                 raise ValueError(
                     f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run and f' of {run}'} "
-                    f"only {length:.6g}{unit}."
+                    f"only {lengths[i]:.6g}{unit}."
                 )
-            if ends[i] < 0 and ends[i + 1] < 0:
-                continue
-            row, bound = np.zeros(d), dwell
-            for end, knot, sign in ((ends[i + 1], knots[i + 1], 1.0), (ends[i], knots[i], -1.0)):
-                if end >= 0:
-                    row[end] += sign
-                else:
-                    bound -= sign * knot
-            rows.append(row)
-            bounds.append(bound)
-            kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
-            constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))
+            if ends[i] >= 0 or ends[i + 1] >= 0:
+                rows.append(unit_rows[ends[i + 1]] - unit_rows[ends[i]])
+                bounds.append(dwell - known[i])
+                kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
+                constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))
     return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(constraints)
