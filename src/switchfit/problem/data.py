@@ -773,13 +773,11 @@ def _check_samples(
     form = "an array of numbers"
     times = as_array(times, f"{what} times", form=form, finite=True) if dates is None else _count_seconds(dates)
     values = as_array(values, f"{what} values", form=form, missing=missing, finite=not missing)
-    if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):
+    if values.ndim not in ((1, 2) if columns else (1,)) or times.shape != values.shape[:1]:
         raise ValueError(
             f"{what} needs times of shape (K,) and values of shape (K,){' or (K, q)' if columns else ''}; "
             f"got {times.shape} and {values.shape}."
         )
-    if len(times) != len(values):
-        raise ValueError(f"{what} needs one row of values for each time; got {len(times)} times, {len(values)} rows.")
     if len(times) < at_least or not values.shape[-1]:
         raise ValueError(f"{what} needs {max(at_least, 1)} sample(s) or more; got {len(times)}.")
     if np.isinf(values).any():
