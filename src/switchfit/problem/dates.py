@@ -184,9 +184,7 @@ class Dates:
     def __repr__(self) -> str:
         if self.instants.shape == ():
             return format_instant(self.instants, self.time_zone)
-        if len(self) == 0:
-            return "no dates"
-        return f"{len(self)} dates from {self[0]!r} to {self[-1]!r}"
+        return f"{len(self)} dates from {self[0]!r} to {self[-1]!r}" if len(self) else "no dates"
 
     def localize(self, zone: str, what: str) -> Dates:
         """Return dates without a zone as those of a zone; others as they are.
@@ -262,10 +260,7 @@ def _read_entries(entries: list[Any], what: str) -> Dates:
     pairs = [_read_date(entry, what, f" at index {index}") for index, entry in enumerate(entries)]
     zones = {zone for _, zone in pairs}
     if "" in zones and len(zones) > 1:
-        bare, zoned = (next(e for e, (_, z) in zip(entries, pairs, strict=True) if bool(z) is k) for k in (False, True))
-        raise ValueError(
-            f"{what} must all have a time zone, or none; got dates with one and without: {shorten([zoned, bare])}."
-        )
+        raise ValueError(f"{what} must all have a time zone, or none; got {shorten(entries)}.")
     zone = zones.pop() if len(zones) == 1 else "UTC"
     return Dates(np.array([instant for instant, _ in pairs], dtype="datetime64[us]"), zone)
 
