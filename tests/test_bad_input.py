@@ -122,7 +122,7 @@ def refused(build, error, *said):
         (lambda: system(reset_maps={("grow", "shrink"): 1}), ["reset map ('grow', 'shrink') must be a function"]),
         (
             lambda: system(state_names="x"),
-            ["state_names must be a sequence of strings", "in a list or a tuple; got 'x' (str)"],
+            ["state_names must be a sequence of strings", "got 'x': give a list or a tuple"],
         ),
         (lambda: samples(observe=3), ["observe must be a function h(t, x, p); got 3"]),
         (lambda: samples(sigma={"x": 1}), ["sigma must be a number or an array of numbers; got {'x': 1}"]),
@@ -136,7 +136,7 @@ def refused(build, error, *said):
         (lambda: sf.Parameter(1.0, prior=0.1), ["must be an sf.Normal or an sf.LogNormal; got 0.1"]),
         (
             lambda: experiment(mode_sequence="grow"),
-            ["mode_sequence must be a sequence of mode names in a list", "'grow' (str)"],
+            ["mode_sequence must be a sequence of mode names; got 'grow': give a list or a tuple"],
         ),
         (lambda: experiment(transition_times=[None]), ["a transition time must be a number", "None"]),
         (lambda: experiment(inputs=3), ["inputs must be an sf.Input; got int"]),
@@ -190,7 +190,7 @@ def test_wrong_types(build, said):
         (lambda: samples(sigma=1.0, loss="huber", loss_scale=0.0), ["loss_scale must be positive", "0.0"]),
         (lambda: samples(loss="huber"), ["loss='huber' measures residuals in units of sigma: give it"]),
         (lambda: samples(sigma="s", loss="cauchy"), ["needs a loss_scale above 1", "got 1.0"]),
-        (lambda: samples(delay=math.nan), ["delay must be finite; got nan"]),
+        (lambda: samples(delay=math.nan), ["delay (a number, or the name of a parameter) must be finite; got nan"]),
         (lambda: samples(delay=[1.0, 2.0]), ["delay (a number, or the name of a parameter) must be a"]),
         (lambda: sf.Input([0.0], [1.0], kind="step"), ["'hold', 'linear' or 'cubic'; got 'step'"]),
         (lambda: sf.Input([0, 1, 2], [1, 2, 3], kind="cubic"), ["Input needs 4 sample(s) or more; got 3"]),
@@ -221,7 +221,7 @@ def test_wrong_types(build, said):
         (lambda: sf.Parameter(1.0, -1.0, scale="log"), ["with scale='log' must be positive", "lower bound -1.0"]),
         (lambda: sf.Parameter(1.0, prior=sf.Normal([1, 2], 1)), ["prior must fit the value, of shape ()"]),
         (lambda: sf.Parameter(1.0, prior=sf.LogNormal(1.0, 0.1)), ["needs a lower bound above 0", "lower bound -inf"]),
-        (lambda: sf.Normal(0.0, 0.0), ["Normal sd must be positive and finite; got", "0.0"]),
+        (lambda: sf.Normal(0.0, 0.0), ["Normal sd must be positive and finite", "got 0.0"]),
         (lambda: sf.LogNormal(0.0, 1.0), ["LogNormal median must be positive; got 0.0"]),
         # Experiments
         (lambda: experiment(t0=1.0, tf=0.0), ["finite horizon with t0 < tf; got (1.0, 0.0)"]),
@@ -397,7 +397,7 @@ def test_a_state_that_blows_up(call):
     ("theta", "said"),
     [
         ([0.4], ["theta must have shape (2,): tau_1, k; got shape (1,)"]),
-        ([0.4, math.nan], ["theta must be finite; got [0.4, nan]"]),
+        ([0.4, math.nan], ["theta must be finite; got nan at index [1]"]),
         ("guess", ["theta must be a number or an array of numbers; got 'guess'"]),
         ([1.5, 1.0], ["must not decrease inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
     ],

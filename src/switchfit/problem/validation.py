@@ -502,7 +502,7 @@ def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
         For text, and for collections without order or that can be read only once: sets, dicts, generators.
     """
     if isinstance(value, (*_TEXT, AbstractSet, Mapping, Iterator)):
-        raise TypeError(f"{what} must be {form} in a list or a tuple; got {shorten(value)} ({type(value).__name__}).")
+        raise TypeError(f"{what} must be {form}; got {shorten(value)}: give a list or a tuple.")
     try:
         return tuple(value)
     except Exception:  # TypeError; arrays without dimensions and others raise their own
