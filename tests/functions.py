@@ -80,7 +80,6 @@ ROUNDING: dict[str, Function] = {
     ),
     "sign of zero": lambda x: jnp.sign(x * 0.0) + x,
     "copysign": lambda x: jnp.copysign(x, x[::-1]),
-    "signbit": lambda x: jnp.where(jnp.signbit(x), 1.0, 2.0) * x,
 }
 
 DECISIONS: dict[str, Function] = {
@@ -97,7 +96,6 @@ DECISIONS: dict[str, Function] = {
     "plus or minus one": lambda x: jnp.where(x > 0.7, 1, -1) * x,
     "integer division": lambda x: (jnp.where(x > 0.7, 7, 5) // 2) * x,
     "bits": lambda x: (jnp.where(x > 0.7, 7, 5) & 6) * x,
-    "shift": lambda x: (jnp.where(x > 0.7, 7, 5) << 2) * x,
     "large integers": lambda x: jnp.where(x > 0.7, 2**31, 5) * (jnp.where(x > 0.1, 2**33, 1)) * x,
     "clamp by states": lambda x: lax.clamp(0.5 * x, x**2, 1.5 * x),
     "select": lambda x: jnp.select([x < 0.5, x < 1.0], [x, x**2], jnp.cos(x)),
@@ -114,8 +112,6 @@ ARRAYS: dict[str, Function] = {
     "einsum of a batch": lambda x: jnp.einsum("bi,bj->bij", A * x, A),
     "solve": lambda x: jnp.linalg.solve(A + jnp.outer(x, x), x),
     "eigh": lambda x: jnp.linalg.eigh(A + jnp.outer(x, x))[0],
-    "svd": lambda x: jnp.linalg.svd(A + jnp.outer(x, x), compute_uv=False),
-    "qr": lambda x: jnp.linalg.qr(A + jnp.outer(x, x))[1],
     "expm": lambda x: jax.scipy.linalg.expm(0.1 * A * x),
     "sum of nothing": lambda x: jnp.sum(x[:0]) + x,
     "matrix of nothing": lambda x: jnp.zeros((3, 0)) @ x[:0] + x,
@@ -126,7 +122,6 @@ ARRAYS: dict[str, Function] = {
     "cummin": lambda x: lax.cummin(x),
     "cumlogsumexp": lambda x: lax.cumlogsumexp(x),
     "convolve": lambda x: jnp.convolve(x, np.array([0.2, 0.5, 0.3]), mode="same"),
-    "correlate": lambda x: jnp.correlate(x, x, mode="full"),
     "searchsorted": lambda x: jnp.searchsorted(TABLE_T, x) * x,
     "interp": lambda x: jnp.interp(x, TABLE_T, TABLE_Y),
     "interp by hand": lambda x: sum(
@@ -263,7 +258,6 @@ ORDER: dict[str, Function] = {
     "quantile by the state": lambda x: jnp.quantile(some(6)(x), jax.nn.sigmoid(x[0])),
     "nanmedian": lambda x: jnp.nanmedian(jnp.where(x > 0.5, x, jnp.nan)),
     "top_k 4": lambda x: lax.top_k(some(6)(x), 4)[0] * lax.top_k(some(6)(x), 4)[1],
-    "argpartition": lambda x: x[jnp.argpartition(x, 1)],
 }
 
 LOOPS: dict[str, Function] = {
@@ -289,9 +283,7 @@ SPECIAL: dict[str, Function] = {
     },
     "erfinv": lambda x: special.erfinv(0.5 * jnp.tanh(x)),
     "ndtr": special.ndtr,
-    "gammaln": special.gammaln,
     "betainc": lambda x: special.betainc(2.0, 3.0, nn.sigmoid(x)),
-    "i0e": special.i0e,
     "bessel_jn": lambda x: special.bessel_jn(x, v=2)[0],
     "expi": lambda x: special.expi(x),
 }
@@ -318,17 +310,12 @@ FUNCTIONS: dict[str, Function] = {
 FALLS_BACK = {
     "elementary: i0": "calls jnp.i0",
     "rounding: copysign": "calls jnp.copysign",
-    "rounding: signbit": "calls jnp.signbit",
     "decisions: mean of booleans": "converts what depends on the state to float32",
     "decisions: bits": "does integer arithmetic (and) with what depends on the state",
-    "decisions: shift": "does integer arithmetic (shift_left) with what depends on the state",
     "arrays: eigh": "calls jnp.linalg.eigh",
-    "arrays: svd": "calls jnp.linalg.svd",
-    "arrays: qr": "calls jnp.linalg.qr",
     "arrays: expm": "calls jax.scipy.linalg.expm, which takes more than 10000 operations",
     "arrays: cumlogsumexp": "calls jax.lax.cumlogsumexp",
     "arrays: convolve": "calls jnp.convolve",
-    "arrays: correlate": "calls jnp.correlate",
     "arrays: fft": "calls jnp.fft, which converts what depends on the state to complex128",
     "tables: too large a table": "calls jnp.interp, which searches a table of 200000 entries (limit: 100000)",
     "tables: too many states": "calls jnp.interp, which searches 70 numbers that depend on the state (limit: 64)",
@@ -339,16 +326,13 @@ FALLS_BACK = {
     "matrices: positive definite system 6": "takes more than 10000 operations",
     "order: sort 17": "calls jnp.sort, which sorts 17 numbers that depend on the state (limit: 16)",
     "order: top_k 4": "calls jax.lax.top_k",
-    "order: argpartition": "calls jnp.argpartition",
     "loops: while": "cannot be traced with its derivatives: ValueError",
     "loops: custom_vjp": "cannot be traced with its derivatives: TypeError",
     "loops: debug print": "calls jax.lax.debug_print",
     "loops: callback": "cannot be traced with its derivatives: ValueError",
     "loops: random by the state": "does integer arithmetic (random_seed) with what depends on the state",
     "special: erfinv": "calls jax.lax.erf_inv",
-    "special: gammaln": "calls jax.lax.lgamma",
     "special: betainc": "calls jax.lax.regularized_incomplete_beta",
-    "special: i0e": "calls jax.lax.bessel_i0e",
     "special: expi": "calls jax.scipy.special.expi",
 }
 """Functions that JAX has to evaluate, and why."""

@@ -250,7 +250,7 @@ def test_signals_and_inputs():
         (lambda: log(["2020-03-28", 3.0]), TypeError, "Measurements times must be numbers or dates, not both; got 3.0"),
         (lambda: log(["2020-03-28", None]), ValueError, "times must not be missing; the date at index 1 is. Leave"),
         (lambda: log(pd.DatetimeIndex(["2020", None])), ValueError, "must not be missing; the date at index 1"),
-        (lambda: log(["2020-03-28", "2020-03-29T00:00Z"]), ValueError, "has dates with a time zone and dates"),
+        (lambda: log(["2020-03-28", "2020-03-29T00:00Z"]), ValueError, "must all have a time zone, or none; got"),
         (lambda: log(DAYS[::-1]), ValueError, "must increase strictly; got 2020-03-31T00:00:00 followed by 2020-03-30"),
         (
             lambda: log(np.array(["12000-01-01"], dtype="datetime64[D]")),
@@ -270,7 +270,7 @@ def test_signals_and_inputs():
         (
             lambda: run_of([0.0, 9.0], ["2020-03-29"]),
             ValueError,
-            "a transition time is a date, but not all times of the",
+            "a transition time is a date, but not all times of the data",
         ),
         (lambda: sf.Experiment([log(DAYS), log([0.0, 1.0])], ("on",), ()), ValueError, "times of Measurements is a"),
         (lambda: run_of(DAYS, ["2020-04-02"]), ValueError, r"inside .t0, tf. = .2020-03-28 00:00:00, 2020-03-31"),
@@ -284,7 +284,7 @@ def test_signals_and_inputs():
         ),
         (lambda: run_of(DAYS, initial_state=[DATED]), ValueError, "must be a number; got the"),
         (lambda: sf.Problem(ROOM, run_of(DAYS), {"k": DATED}), ValueError, "'k' must be a number; got the date 20"),
-        (lambda: from_epoch([1e30]), ValueError, "numbers since 1970 in s must be finite, and lie in the"),
+        (lambda: from_epoch([1e30]), ValueError, "numbers since 1970 in s must lie in the years"),
         (lambda: from_epoch([1.0], "weeks"), ValueError, "unit must be one of ns, us"),
         (lambda: from_epoch(["2020"]), ValueError, "numbers since 1970 must be"),
         (

@@ -339,12 +339,16 @@ def cool_until(**tf):
 
 
 REFUSED = {
-    "needs a finite upper bound, .*; got the upper bound inf": lambda fit: cool_until(lower=2.0, upper=np.inf),
-    "at its earliest 1.5; 5 of 20 do not, .* a lower bound of 2.0 or more": lambda fit: cool_until(lower=1.5),
+    "A free tf needs a finite upper bound, .*; got the upper bound inf": lambda fit: cool_until(
+        lower=2.0, upper=np.inf
+    ),
+    "1.5, the lower bound of tf.; 5 of 20 do not, the first is": lambda fit: cool_until(lower=1.5),
     r"tf must be a single number .* the shape \(2,\)": lambda fit: cool_until(value=[5.0, 6.0]),
     "tf has the unit 'h', but time_unit of .* is 's'": lambda fit: cool_until(lower=2.0, unit="h"),
-    r"over \(t0, tf\) = \(0.0, 5.0\), whose end is the upper bound of tf": lambda fit: cool(),
-    r"Input must be known over .* = \(0.0, 5.0\)": lambda fit: cool(LONG, inputs=sf.Input(GRID, GRID, kind="linear")),
+    r"over \(t0, tf\) = \(0.0, 5.0, the upper bound of tf\)": lambda fit: cool(),
+    r"Input must be known over \(t0, tf\) = \(0.0, 5.0\)": lambda fit: cool(
+        LONG, inputs=sf.Input(GRID, GRID, kind="linear")
+    ),
     r"strictly inside \(t0, tf\) = \(0.0, 3.0\); got \[3.0\]": lambda fit: cool(LONG, ("a", "b"), (3.0,)),
     r"\(t0, tf\) = \(0.0, 5.0\), with the upper bound": lambda fit: sf.simulate(minimum_time(), [1.0, 5.5]),
     "must not decrease": lambda fit: sf.simulate(minimum_time(), [2.0, 1.5]),

@@ -276,7 +276,7 @@ def test_a_problem_whose_functions_have_changed_is_not_pickled_in_silence():
     problem = problem_of(lambda t, x, p: -g * p["a"] * x)
     g[0] = 2.0
     blob = cloudpickle.dumps(problem)
-    with pytest.raises(ValueError, match=r"mode 'fall' does something else .* build the problem anew"):
+    with pytest.raises(ValueError, match=r"mode 'fall' does something else .* Build the problem anew"):
         cloudpickle.loads(blob)
 
 

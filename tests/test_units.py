@@ -90,7 +90,7 @@ def simulate(on=on, **more):
     ("call", "message"),
     [
         (lambda: problem("min", min_duration=50.0), r"is 50\.0 min, but the guess gives mode 1 .* of run1 only 30 min"),
-        (late_problem, r"may lie in \[-inf, inf\] min, .*only from -3 to 1 min"),
+        (late_problem, r"may lie in \[-inf, inf\], .*only from -3 to 1 min"),
         (lambda: sf.evaluate(late_problem((0.0, 1.0)), [30.0, 0.3, 0.05, 3.0]), "are of moments from -2 to 114 min"),
         (lambda: simulate(lambda t, x, p: p["heating"] * jnp.sqrt(20.0 - t)), r"at t = 2\S* min, x = "),
         (lambda: simulate(lambda t, x, p: p["heating"] * x**2), r"beyond t = 0\.\S* min, where x = "),
@@ -303,7 +303,7 @@ def test_what_is_one_number_has_one_unit(tmp_path):
     minutes, hours = (sf.Problem(room(), run(time_unit=unit), RATES) for unit in ("min", "h"))
     both = [run(time_unit="min"), run(time_unit="h", name="other")]
     sf.Problem(room(), both, RATES)
-    with pytest.raises(ValueError, match=r"min_duration is one number .* different units \(run1 in min, other in h\)"):
+    with pytest.raises(ValueError, match=r"min_duration must be 0 .* different units \(h, min\); got"):
         sf.Problem(room(), both, RATES, min_duration=1e-3)
     assert sf.estimate_many([minutes, minutes]).theta_units[0] == "min"
     with pytest.raises(ValueError, match="problem 2 has its times in h, the first one in min"):

@@ -21,10 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial, ReferenceSignal
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.problem import Problem
-from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import pad_length, read_initial_values, select_kind
 
 SHARP = 1e-3

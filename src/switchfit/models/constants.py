@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.problem.validation import as_finite, as_positive, as_sequence, join_names, shorten
+from switchfit.problem.validation import as_finite, as_not_negative, as_positive, as_sequence, join_names, shorten
 
 Constant = float | str
 """A number that stays, or the name of a parameter of the problem, which may be estimated."""
@@ -45,11 +45,9 @@ def check_constants(
             found[name] = value
             continue
         if not isinstance(value, (float, int, np.integer, np.floating)) or isinstance(value, bool):
-            or_name = "or the name of a parameter to be fixed or estimated in the Problem"
-            raise TypeError(f"{name} must be a number, {or_name}; got {shorten(value)}.")
-        found[name] = as_positive(value, name) if name in positive else as_finite(value, name)
-        if name in not_negative and value < 0:
-            raise ValueError(f"{name} must be 0 or more; got {value}.")
+            raise TypeError(f"{name} must be a number, or the name of a parameter; got {shorten(value)}.")
+        check = as_positive if name in positive else as_not_negative if name in not_negative else as_finite
+        found[name] = check(value, name)
     return found
 
 
@@ -94,10 +92,7 @@ def check_length(initial_state: Any, states: Sequence[str]) -> Any:
     if not callable(initial_state) and not isinstance(initial_state, str) and np.ndim(initial_state) <= 1:
         count = np.size(initial_state)
         if count != len(states):
-            raise ValueError(
-                f"initial_state must have {len(states)} entries, {', '.join(states)}; got {count}: "
-                f"{shorten(initial_state)}."
-            )
+            raise ValueError(f"initial_state must have {len(states)} entries, {', '.join(states)}; got {count}.")
     return initial_state
 
 

@@ -30,9 +30,8 @@ from switchfit.modes.library import build_library
 from switchfit.online.saved import Journal, Kept, build_kept_problem, pack, read, read_journal, unpack
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus, calibrate, hold, read_sigma
 from switchfit.online.tracker import Feed, Settings, Start, StoppedError, Tracker, invert
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial
 from switchfit.problem.problem import Problem
-from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import (
     as_array,

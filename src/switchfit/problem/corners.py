@@ -97,7 +97,8 @@ class _Walk(Walk):
         is_search = equation.params.get("name") == "searchsorted" and moves[-1] and not moves[0]
         # A table that is looked up by the state is smooth between its knots: each knot is a corner.
         if is_search and np.ndim(values[0]) == 1 and len(values[0]) <= MOST_KNOTS:
-            return [self._search(values[0], values[1], origin).astype(equation.outvars[0].aval.dtype)]
+            below = [self._meet(values[1], values[0][k, ...], origin) for k in range(len(values[0]))]
+            return [np.sum(below, axis=0).astype(equation.outvars[0].aval.dtype)]
         if values and all(isinstance(value, np.ndarray) for value in values):  # also the sides of corners
             with jax.ensure_compile_time_eval():
                 return [np.asarray(value) for value in _bind(equation, values, origin)]
@@ -122,10 +123,6 @@ class _Walk(Walk):
         if name in ("max", "min"):
             return _choose(is_above, *((b, a) if name == "max" else (a, b)))
         return is_above if name in ("gt", "ge") else ~is_above
-
-    def _search(self, knots: Any, x: Any, origin: Any) -> Any:
-        """Return the number of knots below x, whose corners they are."""
-        return np.sum([self._meet(x, knots[k, ...], origin) for k in range(len(knots))], axis=0)
 
     def _meet(self, a: Any, b: Any, origin: Any) -> Any:
         """Note the corners a - b = 0, and return whether each is met on its positive side."""

@@ -1,5 +1,8 @@
 """What J is made of: measurements with robust losses, reference signals, and other costs; and known inputs.
 
+Signals in time are piecewise polynomials. Their knots are nodes of the mesh, so that the integrator never steps across
+one, and the signal is one polynomial inside a step.
+
 Robust losses: the cost of residuals that are larger than the noise explains.
 
 With ``u = (r / sigma)**2`` and C the scale of the loss, a sample costs ``1/2 C**2 rho(u / C**2)``, as in
@@ -23,31 +26,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.problem.dates import FIRST, LENGTHS, Dates, Origin, has_dates, read_dates
-from switchfit.problem.signals import (
-    PiecewisePolynomial,
-    build_polynomial,
-    filter_lowpass,
-    fit_bridged_spline,
-    fit_spline,
-    join_signals,
-)
 from switchfit.problem.validation import (
     as_array,
     as_callable,
     as_choice,
     as_finite,
+    as_instance,
     as_labels,
     as_name,
     as_named_columns,
-    as_number,
     as_positive,
-    find_names,
-    find_units,
+    find_labels,
     require_deviation,
     set_fields,
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_line, join_first
+
+FloatArray = NDArray[np.float64]
+Observe = Callable[..., Any]
+"""``h(t, x, p) -> (q,)``: the output of a sensor."""
 
 LOSSES = ("linear", "soft_l1", "huber", "cauchy")
 
@@ -208,9 +206,118 @@ class TerminalConstraint:
         as_callable(self.psi, "TerminalConstraint", "a function psi(x, p)")
 
 
-FloatArray = NDArray[np.float64]
-Observe = Callable[..., Any]
-"""``h(t, x, p) -> (q,)``: the output of a sensor."""
+MOST_FILTERED = 10**7
+"""Largest number of points at which a signal is filtered."""
+OVERFLOW = (
+    "The signal between the samples of an Input or a ReferenceSignal overflows: values must be smaller, or times "
+    "further apart."
+)
+LOWEST_CUTOFF = 1e-6
+"""Smallest cut-off of a low-pass filter, in cycles per point. At 1e-8 its output is off by 3 %; below, errors are
+unbounded."""
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewisePolynomial:
+    """A signal that is a cubic between knots: ``sum_i coefficients[k, i] (t - knots[k])**i`` from knot k on.
+
+    Attributes
+    ----------
+    knots : (K,) array, increasing
+    coefficients : (K - 1, 4, q) array, lowest power first
+    """
+
+    knots: FloatArray
+    coefficients: FloatArray
+
+    def __repr__(self) -> str:
+        return format_line(self, f"{len(self.knots)} knots", f"{self.channels} channels")
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.coefficients).all():
+            raise ValueError(OVERFLOW)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels, q."""
+        return int(self.coefficients.shape[2])
+
+    def interval(self, times: FloatArray) -> NDArray[np.intp]:
+        """Return the index of the knot interval that holds each of `times`; beyond the ends, the first or the last."""
+        return self.knots[1:-1].searchsorted(times, side="right")
+
+    def __call__(self, times: ArrayLike) -> FloatArray:
+        """Values at `times` (K,): a ``(K, q)`` array."""
+        times = np.asarray(times, dtype=np.float64)
+        k = self.interval(times)
+        s = (times - self.knots[k])[:, None]
+        c = self.coefficients[k]
+        return c[:, 0] + s * (c[:, 1] + s * (c[:, 2] + s * c[:, 3]))
+
+
+def fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+    """Return the not-a-knot cubic spline through samples.
+
+    Parameters
+    ----------
+    times : (K,)
+    values : (K, q)
+    """
+    from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
+
+    try:
+        with np.errstate(all="ignore"):
+            spline = CubicSpline(times, values, axis=0)
+    except ValueError:  # times and values are finite, but their slopes are not
+        raise ValueError(OVERFLOW) from None
+    return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
+
+
+def fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
+    """Return the spline through all samples; missing ones are interpolated first, by a spline of their channel.
+
+    Parameters
+    ----------
+    times : (K,)
+    values : (K, q)
+        NaN where a sample is missing.
+    """
+    filled = values.copy()
+    for channel in filled.T:
+        known = np.isfinite(channel)
+        if known.sum() < 4:
+            raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
+        if not known.all():
+            channel[~known] = fit_spline(times[known], channel[known][:, None])(times[~known])[:, 0]
+    return fit_spline(times, filled)
+
+
+def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
+    """Filter a signal by a second-order Butterworth filter, forward and backward, on a grid of ten points per period of
+    the cut-off.
+
+    Parameters
+    ----------
+    signal : PiecewisePolynomial
+    cutoff_hz : float
+        In cycles per unit of time.
+    """
+    import scipy.signal  # here, since importing it takes longer than most fits
+
+    start, end = signal.knots[[0, -1]].tolist()
+    step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
+    if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
+        raise ValueError(f"lowpass_hz must not need more than {MOST_FILTERED} points, ten a period; got {cutoff_hz:g}.")
+    grid = np.linspace(start, end, max(int(np.ceil((end - start) / step)) + 1, 8))
+    rate = (len(grid) - 1) / (end - start)
+    if cutoff_hz < LOWEST_CUTOFF * rate:
+        raise ValueError(
+            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} or more, else all is rounding error; got {cutoff_hz:g}."
+        )
+    sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
+    padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
+    filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
+    return fit_spline(grid, filtered)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +383,7 @@ class Input:
         for name in [""] if named is None else sorted(named):
             what, given = ("Input", self.values) if named is None else (f"Input {shorten(name)}", named[name])
             times, values[name] = _check_samples(self.times, given, what, at_least=at_least, columns=named is None)
-        units, found = self.units, find_units(self.values)
+        units, (_, found) = self.units, find_labels(self.values)
         if units is None and found is not None:
             units = found if named is None else tuple(unit for _, unit in sorted(zip(named, found, strict=True)))
         set_fields(self, kind=kind, times=times, values=values[""] if named is None else values)
@@ -316,12 +423,14 @@ class Input:
             )
         if self.kind == "cubic":
             return fit_spline(times, values)
+        if self.kind == "hold":
+            times, values = np.append(times, max(tf, times[-1] + 1.0)), np.append(values, values[-1:], axis=0)
+        coefficients = np.zeros((len(times) - 1, 4, values.shape[1]))
+        coefficients[:, 0] = values[:-1]
         if self.kind == "linear":
             with np.errstate(all="ignore"):
-                slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
-            return build_polynomial(times, [values[:-1], slopes])
-        end = max(tf, times[-1] + 1.0)
-        return build_polynomial(np.append(times, end), [values])
+                coefficients[:, 1] = np.diff(values, axis=0) / np.diff(times)[:, None]
+        return PiecewisePolynomial(times, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,16 +483,10 @@ class ReferenceSignal:
         return format_line(self, join_first(self.names or ()), format_count(self.signal.channels, "channel"))
 
     def __post_init__(self) -> None:
-        if not isinstance(self.signal, PiecewisePolynomial):
-            raise TypeError(
-                "ReferenceSignal is made from samples by sf.ReferenceSignal.from_samples(times, values, ...); "
-                f"got {type(self.signal).__name__}."
-            )
-        _check_observe(self.observe)
-        q = self.signal.channels
-        set_fields(self, weights=_build_weight_matrix(self.weights, q))
-        for label in ("names", "units"):
-            set_fields(self, **{label: as_labels(getattr(self, label), label, "channel", q)})
+        form = "made by sf.ReferenceSignal.from_samples(times, values, ...)"
+        as_instance(self.signal, "signal of a ReferenceSignal", PiecewisePolynomial, form)
+        _check_channels(self, self.signal.channels, None, None)
+        set_fields(self, weights=_build_weight_matrix(self.weights, self.signal.channels))
 
     @classmethod
     def from_samples(
@@ -437,18 +540,21 @@ class ReferenceSignal:
         >>> reference.signal([1.0]).round(6)
         array([[0.841471]])
         """
-        names, units = _find_labels(values, names, units)
+        found = find_labels(values)
         given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(given), -1)
         # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
         times = _count_seconds(given) if isinstance(given, Dates) else given
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
-        parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
-        signal = join_signals([fit_bridged_spline(part_times, part) for part_times, part in parts])
+        pieces = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
+        parts = [fit_bridged_spline(part_times, part) for part_times, part in pieces]
+        knots = np.concatenate([part.knots[:-1] for part in parts] + [times[-1:]])
+        signal = PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
             if given is times:
                 signal = filter_lowpass(signal, lowpass_hz)
+        names, units = (found[0] if names is None else names), (found[1] if units is None else units)
         return cls(signal, observe, weights, names, (given, table), lowpass_hz, units)
 
 
@@ -535,21 +641,15 @@ class Measurements:
         return format_line(self, channels, format_count(len(self.times), "time"))
 
     def __post_init__(self) -> None:
-        names, units = _find_labels(self.values, self.names, self.units)
+        found = find_labels(self.values)
         times, values = _check_samples(self.times, self.values, "Measurements", at_least=0, missing=True)
         values = values[:, None] if values.ndim == 1 else values
         if len(values) and np.isnan(values).all():
             raise ValueError("Measurements values are all NaN: there is nothing to fit.")
-        _check_observe(self.observe)
         set_fields(self, times=times, values=values, sigma=_check_sigma(self.sigma, values))
-        q = values.shape[1]
-        set_fields(self, names=as_labels(names, "names", "channel", q), units=as_labels(units, "units", "channel", q))
+        _check_channels(self, values.shape[1], *found)
         self._check_loss()
-        if isinstance(self.delay, str):
-            delay: float | str = as_name(self.delay, "delay")
-        else:
-            delay = as_finite(as_number(self.delay, "delay (a number, or the name of a parameter)"), "delay")
-        set_fields(self, delay=delay)
+        set_fields(self, delay=_read_number_or_name(self.delay, "delay"))
 
     @property
     def seen_times(self) -> FloatArray:
@@ -564,13 +664,11 @@ class Measurements:
         set_fields(self, loss=loss, loss_scale=scale)
         if self.loss != "linear" and self.sigma is None:
             raise ValueError(
-                f"loss={self.loss!r} measures residuals in units of sigma, which is left out: set sigma to a number, "
-                "or to the name of a parameter to estimate it."
+                f"loss={self.loss!r} measures residuals in units of sigma: give it, or the name of a parameter for it."
             )
         if self.loss == "cauchy" and self.sigma_names and scale <= 1:
             raise ValueError(
-                "loss='cauchy' with a sigma that is a parameter needs a loss_scale above 1, otherwise J falls without "
-                f"end as sigma vanishes; got {scale}."
+                f"loss='cauchy' with an estimated sigma needs a loss_scale above 1, or sigma vanishes; got {scale}."
             )
 
     @property
@@ -672,21 +770,17 @@ def _check_samples(
     `columns`, the shape of the values must be (K,).
     """
     dates = read_dates(times, f"{what} times")
-    times = as_array(times, f"{what} times", form="an array of numbers") if dates is None else _count_seconds(dates)
-    values = as_array(values, f"{what} values", form="an array of numbers", missing=missing)
-    if times.ndim != 1 or values.ndim not in ((1, 2) if columns else (1,)):
+    form = "an array of numbers"
+    times = as_array(times, f"{what} times", form=form, finite=True) if dates is None else _count_seconds(dates)
+    values = as_array(values, f"{what} values", form=form, missing=missing, finite=not missing)
+    if values.ndim not in ((1, 2) if columns else (1,)) or times.shape != values.shape[:1]:
         raise ValueError(
             f"{what} needs times of shape (K,) and values of shape (K,){' or (K, q)' if columns else ''}; "
             f"got {times.shape} and {values.shape}."
         )
-    if len(times) != len(values):
-        raise ValueError(f"{what} needs one row of values for each time; got {len(times)} times, {len(values)} rows.")
     if len(times) < at_least or not values.shape[-1]:
         raise ValueError(f"{what} needs {max(at_least, 1)} sample(s) or more; got {len(times)}.")
-    _require_finite(times, f"{what} times")
-    if not missing:
-        _require_finite(values, f"{what} values")
-    elif np.isinf(values).any():
+    if np.isinf(values).any():
         raise ValueError(f"{what} values must be finite, or NaN where a sample is missing; got infinity.")
     wrong = np.diff(times) <= 0
     if breaks:
@@ -708,16 +802,20 @@ def _count_seconds(dates: Dates) -> FloatArray:
     return np.asarray((dates.instants - first) / LENGTHS["s"])
 
 
-def _check_observe(observe: Any) -> None:
-    if observe is not None:
-        as_callable(observe, "observe", "a function h(t, x, p)")
+def _check_channels(item: Measurements | ReferenceSignal, q: int, names: Any, units: Any) -> None:
+    """Check the function that makes q channels; set their names and units, those of a table where they are left out."""
+    if item.observe is not None:
+        as_callable(item.observe, "observe", "a function h(t, x, p)")
+    for label, found in (("names", names), ("units", units)):
+        given = getattr(item, label)
+        set_fields(item, **{label: as_labels(found if given is None else given, label, "channel", q)})
 
 
-def _require_finite(values: FloatArray, what: str) -> None:
-    bad = ~np.isfinite(values)
-    if bad.any():
-        where = np.argwhere(bad)[0].tolist()
-        raise ValueError(f"{what} must be finite; got {values[tuple(where)]} at index {where}.")
+def _read_number_or_name(value: Any, what: str) -> float | str:
+    """Return a finite number, or the name of the parameter that it is."""
+    if isinstance(value, str):
+        return as_name(value, what)
+    return as_finite(value, f"{what} (a number, or the name of a parameter)")
 
 
 def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | float, ...] | None:
@@ -726,9 +824,13 @@ def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | flo
     if sigma is None:
         return None
     if isinstance(sigma, str):
-        return (as_name(sigma, "sigma"),) * shape[1]
+        sigma = [sigma] * shape[1]
     if isinstance(sigma, (list, tuple)) and any(isinstance(entry, str) for entry in sigma):
-        return _check_sigma_of_channels(sigma, shape[1])
+        if len(sigma) != shape[1]:
+            raise ValueError(f"sigma must have one entry for each of the {shape[1]} channels; got {shorten(sigma)}.")
+        entries = tuple(_read_number_or_name(entry, "sigma") for entry in sigma)
+        require_deviation(np.array([entry for entry in entries if not isinstance(entry, str)]), "sigma")
+        return entries
     sigma = as_array(sigma, "sigma")
     if sigma.shape not in ((), (shape[1],), shape) or not sigma.size:
         raise ValueError(
@@ -744,34 +846,15 @@ def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | flo
     return sigma
 
 
-def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
-    """Return names of parameters and numbers, one per channel."""
-    if len(sigma) != channels:
-        raise ValueError(f"sigma must have one entry for each of the {channels} channels; got {shorten(sigma)}.")
-    what = "sigma of a channel (a number, or the name of a parameter)"
-    entries = [as_name(entry, what) if isinstance(entry, str) else as_number(entry, what) for entry in sigma]
-    require_deviation(np.array([entry for entry in entries if not isinstance(entry, str)]), "sigma")
-    return tuple(entries)
-
-
-def _find_labels(
-    values: Any, names: Sequence[str] | None, units: Sequence[str] | None
-) -> tuple[Sequence[str] | None, Sequence[str] | None]:
-    """Return names and units, those of the table of values where they are left out."""
-    return find_names(values) if names is None else names, find_units(values) if units is None else units
-
-
 def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:
     """Return W as a symmetric positive semi-definite ``(q, q)`` matrix."""
     if weights is None:
         return np.eye(channels)
-    matrix = as_array(weights, "weights")
+    matrix = as_array(weights, "weights", finite=True)
     if matrix.shape not in ((channels,), (channels, channels)):
         raise ValueError(f"weights must have shape ({channels},) or ({channels}, {channels}); got {matrix.shape}.")
     matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
-    if not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-        raise ValueError(f"weights must be finite and symmetric; got {shorten(matrix.tolist())}.")
-    smallest = np.linalg.eigvalsh(matrix)[0]
-    if smallest < -1e-12 * np.abs(matrix).max():
-        raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
+    is_symmetric = np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0)
+    if not is_symmetric or np.linalg.eigvalsh(matrix)[0] < -1e-12 * np.abs(matrix).max():
+        raise ValueError(f"weights must be symmetric and positive semi-definite; got {shorten(matrix.tolist())}.")
     return matrix

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -117,10 +117,10 @@ def _read_date(value: Any, what: str, place: str = "") -> tuple[Any, str]:
             wanted = "numbers or dates" if place else "a number or a date"
             raise ValueError(f"{what} must be {wanted}; got {shorten(value)}{place}. Write dates as {EXAMPLES}.")
         return found
+    if value is None or str(value) in ("NaT", "<NA>", "nan"):
+        _refuse_missing(what, place)
     if isinstance(value, np.datetime64):
         return _as_instants(np.asarray(value), what)[()], ""
-    if value is None or value != value:  # NaT of pandas differs from itself
-        _refuse_missing(what, place)
     if isinstance(value, datetime.datetime):
         return _split(value)
     if isinstance(value, datetime.date):
@@ -171,11 +171,6 @@ class Dates:
     instants: Instants
     time_zone: str = ""
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the array, () for a single date."""
-        return self.instants.shape
-
     def __len__(self) -> int:
         return len(self.instants)
 
@@ -187,11 +182,9 @@ class Dates:
         return self.instants if dtype is None else self.instants.astype(dtype)
 
     def __repr__(self) -> str:
-        if self.shape == ():
+        if self.instants.shape == ():
             return format_instant(self.instants, self.time_zone)
-        if len(self) == 0:
-            return "no dates"
-        return f"{len(self)} dates from {self[0]!r} to {self[-1]!r}"
+        return f"{len(self)} dates from {self[0]!r} to {self[-1]!r}" if len(self) else "no dates"
 
     def localize(self, zone: str, what: str) -> Dates:
         """Return dates without a zone as those of a zone; others as they are.
@@ -211,7 +204,7 @@ class Dates:
             return self
         minutes, places = np.unique(self.instants.astype("datetime64[m]").ravel(), return_inverse=True)
         offsets = [_find_offset(minute, zone, what) for minute in minutes.tolist()]
-        found = np.array(offsets, dtype="timedelta64[us]")[places].reshape(self.shape)
+        found = np.array(offsets, dtype="timedelta64[us]")[places].reshape(self.instants.shape)
         return Dates(self.instants - found, zone)
 
 
@@ -249,24 +242,17 @@ def read_dates(value: Any, what: str) -> Dates | None:
         instant, zone = _read_date(value, what)
         return Dates(np.array(instant), zone)
     dtype = getattr(value, "dtype", None)
-    kind, is_polars = getattr(dtype, "kind", ""), is_of_library(value, "polars")
-    if kind == "M" or (is_polars and str(dtype).startswith("Date")):
-        return _read_column(value, what)
-    has_types = isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1)
-    has_dates = has_types and any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))
-    if has_dates or kind == "U" or (is_polars and str(dtype) == "String"):
-        return _read_entries(value.to_list() if is_polars else list(value), what)
+    tz = getattr(dtype, "tz", None) or getattr(dtype, "time_zone", None)  # of pandas, of polars
+    if tz or is_of_library(value, "polars"):
+        value = np.asarray(value, dtype="datetime64[us]" if tz else None)  # in UTC if it has a zone
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if kind == "M":
+        zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
+        return Dates(_as_instants(np.asarray(value), what), zone)
+    is_list = isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1)
+    if kind == "U" or (is_list and any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))):
+        return _read_entries(list(value), what)
     return None
-
-
-def _read_column(value: Any, what: str) -> Dates:
-    """Return an array or a column of datetime64 as dates."""
-    tz = getattr(value.dtype, "tz", None) or getattr(value.dtype, "time_zone", None)  # of pandas, of polars
-    if is_of_library(value, "polars"):
-        value = (value.dt.convert_time_zone("UTC") if tz else value).to_numpy()
-    array = np.asarray(value, dtype="datetime64[us]" if tz else None)  # in UTC if it has a zone
-    zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
-    return Dates(_as_instants(array, what), zone)
 
 
 def _read_entries(entries: list[Any], what: str) -> Dates:
@@ -274,11 +260,7 @@ def _read_entries(entries: list[Any], what: str) -> Dates:
     pairs = [_read_date(entry, what, f" at index {index}") for index, entry in enumerate(entries)]
     zones = {zone for _, zone in pairs}
     if "" in zones and len(zones) > 1:
-        bare, zoned = (next(e for e, (_, z) in zip(entries, pairs, strict=True) if bool(z) is k) for k in (False, True))
-        raise ValueError(
-            f"{what} has dates with a time zone and dates without one: {shorten(zoned)} and {shorten(bare)}. Write the "
-            "zone into all of them, or into none."
-        )
+        raise ValueError(f"{what} must all have a time zone, or none; got {shorten(entries)}.")
     zone = zones.pop() if len(zones) == 1 else "UTC"
     return Dates(np.array([instant for instant, _ in pairs], dtype="datetime64[us]"), zone)
 
@@ -286,7 +268,7 @@ def _read_entries(entries: list[Any], what: str) -> Dates:
 def read_date(value: Any, what: str) -> Any:
     """Return a single date as `Dates`, ValueError for several; anything else as it is."""
     date = read_dates(value, what)
-    if date is not None and date.shape != ():
+    if date is not None and date.instants.shape != ():
         raise ValueError(f"{what} must be one date; got {date!r}.")
     return value if date is None else date
 
@@ -299,16 +281,20 @@ def as_date(value: Any, what: str) -> Dates:
     return date
 
 
-def list_dates(value: Any) -> Iterator[Dates]:
-    """Yield all dates in a value: in the fields of dataclasses, and in tuples."""
+Given = tuple[str, Dates]
+"""Dates among the arguments of an experiment, and what messages call them."""
+
+
+def list_dates(value: Any, what: str = "") -> Iterator[Given]:
+    """Yield all dates in a value, in the fields of dataclasses and in tuples, and what to call them."""
     if isinstance(value, Dates):
-        yield value
+        yield what, value
     elif isinstance(value, tuple):
         for entry in value:
-            yield from list_dates(entry)
+            yield from list_dates(entry, what)
     elif is_dataclass(value):
         for each in fields(value):
-            yield from list_dates(getattr(value, each.name))
+            yield from list_dates(getattr(value, each.name), what or f"times of {type(value).__name__}")
 
 
 def has_dates(value: Any) -> bool:
@@ -361,9 +347,7 @@ def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     micros = as_array(numbers, "numbers since 1970") * (1e6 * SECONDS[key])
     first, last = (day.astype("datetime64[us]").astype(np.int64) for day in (FIRST, LAST))
     if not ((micros >= first) & (micros <= last)).all():
-        raise ValueError(
-            f"numbers since 1970 in {key} must be finite, and lie in the years 1 to 9999; got {shorten(numbers)}."
-        )
+        raise ValueError(f"numbers since 1970 in {key} must lie in the years 1 to 9999; got {shorten(numbers)}.")
     return Dates(np.rint(micros).astype(np.int64).astype("datetime64[us]"), "UTC")
 
 
@@ -412,10 +396,7 @@ class Origin:
             For dates with a zone if the origin has none, and for times that clocks skip or show twice.
         """
         if dates.time_zone and not self.time_zone:
-            raise ValueError(
-                f"{what}: {dates!r} has a time zone, but the dates of the experiment have none. Leave it out, or give "
-                "the experiment a time_zone."
-            )
+            raise ValueError(f"{what}: {dates!r} has a time zone, but the dates of the experiment have none.")
         dates = dates.localize(self.time_zone, what) if self.time_zone else dates
         return np.asarray((dates.instants - self.instant) / LENGTHS[normalize_time_unit(time_unit)])
 
@@ -451,13 +432,6 @@ class Origin:
             return None
 
 
-class Given(NamedTuple):
-    """Dates among the arguments of an experiment, and what messages call them."""
-
-    what: str
-    dates: Dates
-
-
 def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, time_zone: Any, t0: Any) -> Origin:
     """Return the origin of an experiment: as given, else t0 if that is a date, else the earliest date of the data.
 
@@ -485,25 +459,26 @@ def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, ti
     asked = None if time_zone is None else as_name(time_zone, "time_zone", form)
     if asked is not None:
         find_zone(asked)
-    every = [*given, *([] if start is None else [Given("origin", start)])]
+    every = [*given, *([] if start is None else [("origin", start)])]
     if not every:
-        raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date at which times are 0.")
-    bare, zoned = ([one for one in every if bool(one.dates.time_zone) is has] for has in (False, True))
+        raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date of time 0.")
+    bare, zoned = ([one for one in every if bool(one[1].time_zone) is has] for has in (False, True))
     if asked is None and bare and zoned:
+        (what, dates), (other, others) = zoned[0], bare[0]
         raise ValueError(
-            f"{zoned[0].what} has a time zone ({zoned[0].dates!r}), but {bare[0].what} has none ({bare[0].dates!r}). "
-            "Say where those were read, such as time_zone='Europe/Berlin', or write the zone into all dates."
+            f"{what} has a time zone ({dates!r}), but {other} has none ({others!r}): give time_zone='Europe/Berlin', "
+            "or whatever it is, for those."
         )
-    zones = {one.dates.time_zone for one in zoned}
+    zones = {dates.time_zone for _, dates in zoned}
     zone = asked if asked is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"
     start = t0 if start is None and isinstance(t0, Dates) else start
-    candidates = data if start is None else [Given("origin", start)]
+    candidates = data if start is None else [("origin", start)]
     if not candidates:
         raise ValueError(
-            f"{given[0].what} is a date, but not all times of the data are: give origin, the date at which times are 0."
+            f"{given[0][0]} is a date, but not all times of the data are: give origin, the date of time 0."
         )
-    dates = [one.dates.localize(zone, one.what) if zone else one.dates for one in candidates]
-    return make_origin(min(each.instants.min() for each in dates), zone)
+    located = [dates.localize(zone, what) if zone else dates for what, dates in candidates]
+    return make_origin(min(each.instants.min() for each in located), zone)
 
 
 def make_origin(instant: Any, zone: str) -> Origin:

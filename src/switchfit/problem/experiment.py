@@ -9,16 +9,23 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
-from switchfit.problem.dates import Given, choose_origin, has_dates, list_dates, read_date, read_dates
+from switchfit.problem.data import (
+    Data,
+    FloatArray,
+    Input,
+    Measurements,
+    PiecewisePolynomial,
+    ReferenceSignal,
+    count_from,
+)
+from switchfit.problem.dates import choose_origin, has_dates, list_dates, read_date, read_dates
 from switchfit.problem.parameter import Parameter as Parameter
-from switchfit.problem.parameter import as_parameter, unit_suffix
-from switchfit.problem.signals import PiecewisePolynomial
+from switchfit.problem.parameter import as_parameter, require_time_unit, unit_suffix
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import (
     as_array,
@@ -88,11 +95,9 @@ class Jump:
         as_callable(self.map, "Jump map", "a function map(t, x, p)", arguments=3)
         dates = read_dates(self.time, "Jump time")
         form = "a number or a sequence of numbers"
-        times = as_array(self.time, "Jump time", form=form) if dates is None else dates.instants
-        if times.ndim > 1 or not times.size or not np.isfinite(times).all():
-            raise ValueError(f"Jump time must be a finite number or several; got {shorten(self.time)}.")
-        if np.any(np.diff(np.atleast_1d(times)) <= 0):
-            raise ValueError(f"The times of a Jump must increase strictly; got {shorten(self.time)}.")
+        times = as_array(self.time, "Jump time", form=form, finite=True) if dates is None else dates.instants
+        if times.ndim > 1 or not times.size or np.any(np.diff(np.atleast_1d(times)) <= 0):
+            raise ValueError(f"Jump time must be {form} that increase strictly; got {shorten(self.time)}.")
         listed = times.tolist()
         set_fields(self, time=dates if dates is not None else tuple(listed) if isinstance(listed, list) else listed)
 
@@ -227,9 +232,11 @@ class Experiment:
         tf = span[1] if self.tf is None else _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
         if not (np.isfinite(t0) and np.isfinite(last) and t0 < last):
-            ends = f"({show_time(self, t0)}, {show_time(self, last)})"
-            why = f" {_say_left_out(missing)}, and taken from the data: give it." if missing else ""
-            raise ValueError(f"An experiment needs a finite horizon with t0 < tf; got {ends}.{why}")
+            why = f" ({' and '.join(missing)} from the data)" if missing else ""
+            raise ValueError(
+                "An experiment needs a finite horizon with t0 < tf; got "
+                f"({show_time(self, t0)}, {show_time(self, last)}){why}."
+            )
         set_fields(self, taken_from_data=missing)
         modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
@@ -240,10 +247,7 @@ class Experiment:
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
         if len(given) != len(sequence) - 1:
-            raise ValueError(
-                f"transition_times must be one fewer than the {len(sequence)} modes of mode_sequence; "
-                f"got {len(given)}, needed {len(sequence) - 1}."
-            )
+            raise ValueError(f"transition_times must be one fewer than the {len(sequence)} modes; got {len(given)}.")
         times = tuple(as_parameter(tau, "a transition time") for tau in given)
         if self.inputs is not None:
             as_instance(self.inputs, "inputs", Input, "an sf.Input")
@@ -253,7 +257,6 @@ class Experiment:
             set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
         set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
         set_fields(self, parameter_map=_check_map(self.parameter_map))
-        self._check_time_unit()
         self._check_times()
         self._check_jumps()
         self._check_data_inside()
@@ -262,6 +265,7 @@ class Experiment:
 
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
+        set_fields(self, time_unit=as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'"))
         data, jumps, times = _check_data(self.data), _check_jumps(self.jumps), self.transition_times
         if times is not None:
             times = as_sequence(times, "transition_times", "a sequence of numbers or sf.Parameter")
@@ -269,17 +273,13 @@ class Experiment:
         parts: dict[str, Any] = {"data": data, "jumps": jumps, "inputs": self.inputs, "transition_times": times}
         parts |= {name: read_date(getattr(self, name), name) for name in ("t0", "tf")}
         names = {"transition_times": "a transition time", "t0": "t0", "tf": "tf"}
-        given = []
-        for name, part in parts.items():
-            for item in part if isinstance(part, tuple) else (part,):
-                what = names.get(name, f"times of {type(item).__name__}")
-                given += [Given(what, dates) for dates in list_dates(item)]
+        given = [dates for name, part in parts.items() for dates in list_dates(part, names.get(name, ""))]
         if given or self.origin is not None or self.time_zone is not None:
             timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
             of_data = given[: len(timed)] if all(map(has_dates, timed)) else []  # they stand first
             origin = choose_origin(given, of_data, self.origin, self.time_zone, parts["t0"])
-            unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-            parts = {name: count_from(part, origin, unit, names.get(name, "")) for name, part in parts.items()}
+            for name, part in parts.items():
+                parts[name] = count_from(part, origin, self.time_unit, names.get(name, ""))
             parts |= {"origin": origin, "time_zone": origin.time_zone or None}
         set_fields(self, **parts)
 
@@ -305,19 +305,16 @@ class Experiment:
     @cached_property
     def times(self) -> tuple[Parameter, ...]:
         """All transition times, then tf where it is free; each bounded by the jumps between which its guess lies."""
-        acts = self.jump_times
+        edges = np.array([-np.inf, *self.jump_times[self.jump_times > self.t0], np.inf])
         bounded = []
-        for tau, before in zip(self._own_times, np.searchsorted(acts, self.initial_times, "right"), strict=True):
-            low = acts[before - 1] if before and acts[before - 1] > self.t0 else -np.inf
-            high = acts[before] if before < len(acts) else np.inf
-            inside = tau.fixed or (low <= tau.lower and tau.upper <= high)
-            bounded.append(
-                tau if inside else replace(tau, lower=np.maximum(low, tau.lower), upper=np.minimum(high, tau.upper))
-            )
+        for tau, k in zip(self._own_times, np.searchsorted(edges, self.initial_times, "right"), strict=True):
+            if len(edges) > 2 and not tau.fixed:
+                tau = replace(tau, lower=np.maximum(edges[k - 1], tau.lower), upper=np.minimum(edges[k], tau.upper))
+            bounded.append(tau)
         return tuple(bounded)
 
     @cached_property
-    def _acts(self) -> list[tuple[float, Callable[..., Any]]]:
+    def acts(self) -> list[tuple[float, Callable[..., Any]]]:
         """Time and map of each jump, in the order in which they act."""
         acts = [(time, jump.map) for jump in self.jumps for time in np.atleast_1d(jump.time).tolist()]  # type: ignore[union-attr]
         return sorted(acts, key=lambda act: act[0])
@@ -325,12 +322,7 @@ class Experiment:
     @cached_property
     def jump_times(self) -> FloatArray:
         """Times of all jumps, ascending: (K,)."""
-        return np.array([time for time, _ in self._acts], dtype=np.float64)
-
-    @property
-    def jump_maps(self) -> list[Callable[..., Any]]:
-        """The map of each of `jump_times`."""
-        return [jump for _, jump in self._acts]
+        return np.array([time for time, _ in self.acts], dtype=np.float64)
 
     @cached_property
     def passed_by_jumps(self) -> NDArray[np.intp]:
@@ -383,28 +375,15 @@ class Experiment:
         """Length of the horizon at the guess."""
         return float(self.ends_of_modes(self.initial_times)[-1]) - self.t0
 
-    def _check_time_unit(self) -> None:
-        unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
-        for i, tau in enumerate(self._own_times, start=1):
-            if tau.unit not in ("", unit):
-                what = "tf" if i > len(self.transition_times) else f"transition time {i}"
-                raise ValueError(
-                    f"{what} has the unit {tau.unit!r}, but time_unit of the experiment is {unit!r}, and times are not "
-                    f"converted. If all times are in {tau.unit}, give it time_unit={tau.unit!r}; otherwise give {what} "
-                    f"in {unit}."
-                )
-
     def _check_times(self) -> None:
-        scales = {tau.scale for tau in self._own_times if not tau.fixed}
-        if len(scales) > 1:
+        for i, tau in enumerate(self._own_times, start=1):
+            what = "tf" if i > len(self.transition_times) else f"transition time {i}"
+            _require_single(tau, what)
+            require_time_unit(tau, what, self.time_unit)
+        if len({tau.scale for tau in self._own_times if not tau.fixed}) > 1:
             raise ValueError(
-                "the transition times of an experiment that are estimated, and a free tf, must be on one scale; got "
+                "transition times that are estimated, and a free tf, must be on one scale; got "
                 f"{shorten([tau.scale for tau in self._own_times])}. Give scale='log' to all of them, or to none."
-            )
-        if any(tau.shape != () for tau in self.transition_times):
-            shapes = [tau.shape for tau in self.transition_times]
-            raise ValueError(
-                f"transition_times must be single numbers or Parameters of one; got the shapes {shorten(shapes)}."
             )
         knots = self.ends_of_modes(self.initial_times)
         if np.any(np.diff(knots) <= 0):
@@ -414,55 +393,45 @@ class Experiment:
             )
 
     def _show_times(self, times: FloatArray) -> str:
-        return shorten(times) if self.origin is None else shorten([show_time(self, time) for time in times])
+        return f"[{join_names(show_time(self, time) for time in times)}]"
 
     def _check_jumps(self) -> None:
-        acts, unit = self.jump_times, unit_suffix(self.time_unit) if self.origin is None else ""
-        last = self.t0 + self.initial_length
+        acts, last = self.jump_times, self.t0 + self.initial_length
         outside = (acts < self.t0) | (acts >= last)
         if outside.any():
             raise ValueError(
-                f"A Jump must lie in [t0, tf) = [{show_time(self, self.t0)}, {show_time(self, last)}){unit}; got "
+                f"A Jump must lie in [t0, tf) = [{show_time(self, self.t0)}, {show_time(self, last)}); got "
                 f"{self._show_times(acts[outside])}. Leave it out, or move t0 or tf."
             )
         for i, tau in enumerate(self._own_times, start=1):
             if not tau.fixed and np.any(acts == tau.value):
                 raise ValueError(
-                    f"Transition time {i} is guessed at {show_time(self, float(tau.value))}{unit}, the time of a jump. "
+                    f"Transition time {i} is guessed at {show_time(self, float(tau.value))}, the time of a jump. "
                     "The two keep their order: give a guess a little before or after the jump."
                 )
 
     def _check_data_inside(self) -> None:
         for item in self.data:
-            if isinstance(item, Measurements):
-                if not isinstance(item.delay, str):  # otherwise its bounds decide, which the Problem knows
+            if isinstance(item, Measurements) and not isinstance(item.delay, str):  # else its bounds decide
+                times, last = item.seen_times, self.earliest_end
+                outside = (times < self.t0) | (times > last)
+                if outside.any():
                     late = f" less the delay of {item.delay:g}" if item.delay else ""
-                    self._require_inside(item.seen_times, f"Measurements times{late}")
+                    bound = ", the lower bound of tf" if self.has_free_tf else ""
+                    raise ValueError(
+                        f"Measurements times{late} must lie inside [t0, tf] = [{show_time(self, self.t0)}, "
+                        f"{show_time(self, last)}{bound}]; {outside.sum()} of {len(times)} do not, the first is "
+                        f"{show_time(self, times[outside][0])}."
+                    )
             elif isinstance(item, ReferenceSignal):
                 first, last = item.signal.knots[[0, -1]]
                 if first > self.t0 or last < self.end:
-                    bound = ", whose end is the upper bound of tf" if self.has_free_tf else ""
+                    bound = ", the upper bound of tf" if self.has_free_tf else ""
                     raise ValueError(
                         f"A ReferenceSignal must reach over (t0, tf) = ({show_time(self, self.t0)}, "
-                        f"{show_time(self, self.end)}){bound}; this one is known from {show_time(self, first)} to "
+                        f"{show_time(self, self.end)}{bound}); this one is known from {show_time(self, first)} to "
                         f"{show_time(self, last)}. Give t0 and tf inside that, or a longer signal."
                     )
-
-    def _require_inside(self, times: FloatArray, what: str) -> None:
-        """Raise ValueError for times of samples before t0, or after any tf that there may be."""
-        last = self.earliest_end
-        outside = (times < self.t0) | (times > last)
-        if not outside.any():
-            return
-        count = f"{outside.sum()} of {len(times)} do not, the first is {show_time(self, times[outside][0])}."
-        if self.has_free_tf and not np.any(times < self.t0):
-            raise ValueError(
-                f"{what} must not lie after a free tf, at its earliest {show_time(self, last)}; {count} Give tf a "
-                f"lower bound of {show_time(self, times.max())} or more, or leave out later samples."
-            )
-        raise ValueError(
-            f"{what} must lie inside [t0, tf] = [{show_time(self, self.t0)}, {show_time(self, last)}]; {count}"
-        )
 
     @property
     def earliest_end(self) -> float:
@@ -472,12 +441,8 @@ class Experiment:
 
 def _propose_times(t0: float, tf: float, count: int, jumps: Sequence[float]) -> list[float]:
     """Return evenly spaced transition times, moved on a little from the time of a jump."""
-    step = (tf - t0) / (count + 1)
-    proposed = []
-    for time in np.linspace(t0, tf, count + 2)[1:-1].tolist():
-        later = [*(jump for jump in jumps if jump > time), time + step]
-        proposed.append(time + 0.25 * (min(later) - time) if time in jumps else time)
-    return proposed
+    aside = 0.0237 * (tf - t0) / (count + 1)  # at which no other jump is likely
+    return [time + aside if time in jumps else time for time in np.linspace(t0, tf, count + 2)[1:-1].tolist()]
 
 
 def insert_jumps(experiment: Experiment, of_times: Iterable[Any], of_jumps: Iterable[Any]) -> list[Any]:
@@ -488,8 +453,6 @@ def insert_jumps(experiment: Experiment, of_times: Iterable[Any], of_jumps: Iter
     experiment : Experiment
     of_times, of_jumps : iterable
     """
-    if not len(experiment.jump_times):
-        return list(of_times)
     times, jumps = iter(of_times), iter(of_jumps)
     return [next(jumps if is_jump else times) for is_jump in experiment.is_jump.tolist()]
 
@@ -556,12 +519,9 @@ def _check_map(given: Any) -> Mapping[str, str]:
 
 def _check_data(data: Any) -> tuple[Data, ...]:
     items = tuple(data) if isinstance(data, (list, tuple)) else (data,)
+    kinds = [f"sf.{kind.__name__}" for kind in get_args(Data)]
     for item in items:
-        if not isinstance(item, Data):
-            raise TypeError(
-                "data must be sf.Measurements, sf.ReferenceSignal, sf.RunningCost, sf.TransitionCost, sf.TerminalCost, "
-                f"sf.TerminalConstraint or a list of them; got {type(item).__name__}."
-            )
+        as_instance(item, "data", Data, f"{', '.join(kinds)} or a list of them")  # type: ignore[arg-type]
     if not items:
         raise ValueError("data is empty: an experiment needs at least one cost.")
     return items
@@ -584,28 +544,24 @@ def _find_span(data: tuple[Data, ...], missing: tuple[str, ...], t0: Any) -> tup
         spans = [as_number(t0, "t0") + np.array([0.0, 1.0])]
     if not spans:
         kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
-        raise ValueError(
-            f"{_say_left_out(missing)}, but nothing among the data ({kinds}) has times that say where the horizon "
-            f"begins and ends: give {' and '.join(missing)}."
-        )
+        raise ValueError(f"{' and '.join(missing)} must be given, as nothing among the data ({kinds}) has times.")
     return float(np.min(spans)), float(np.max(spans))
 
 
-def _say_left_out(missing: tuple[str, ...]) -> str:
-    return f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} left out"
+def _require_single(time: Parameter, what: str) -> None:
+    if time.shape != ():
+        raise ValueError(f"{what} must be a single number or a Parameter of one; got the shape {time.shape}.")
 
 
 def _check_final_time(given: Any) -> float | Parameter:
     """Return tf as a number, or as a `Parameter` where it is free."""
     if not isinstance(given, Parameter):
         return as_number(given, "tf")
-    if given.shape != ():
-        raise ValueError(f"tf must be a single number or a Parameter of one; got the shape {given.shape}.")
+    _require_single(given, "tf")
     if given.fixed:
         return float(given.value)
     if not np.isfinite(given.upper):
         raise ValueError(
-            "A free tf needs a finite upper bound, such as sf.Parameter(2.0, upper=5.0): the latest time to which the "
-            f"model may be integrated; got the upper bound {given.upper}."
+            f"A free tf needs a finite upper bound, as sf.Parameter(2.0, upper=5.0); got the upper bound {given.upper}."
         )
     return given

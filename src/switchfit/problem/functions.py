@@ -294,7 +294,9 @@ def trace_function(call: Call, parameters: Mapping[str, Shape]) -> Function:
     ValueError
         If it raises, returns another shape or dtype, or computes in less than double precision.
     """
-    function = _without_jit(call.function)
+    function = call.function
+    while type(function) is JITTED and hasattr(function, "__wrapped__"):  # JAX would not trace it again
+        function = function.__wrapped__
     content = read_contents(function)
     asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()))
     key = None if content is None else (content, asked)
@@ -310,13 +312,6 @@ def trace_function(call: Call, parameters: Mapping[str, Shape]) -> Function:
             if len(_traces) > MOST_TRACES:
                 del _traces[next(iter(_traces))]
     return traced
-
-
-def _without_jit(function: Any) -> Any:
-    """Return the function inside `jax.jit`, which would not trace it again."""
-    while type(function) is JITTED and hasattr(function, "__wrapped__"):
-        function = function.__wrapped__
-    return function
 
 
 def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
@@ -462,10 +457,7 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
             "transition time."
         ) from error
     except Exception as error:
-        message = str(error).rstrip(".")
-        if "u)" in form and "string indexing" in message:  # u["left"] of an array
-            message += ". u has no names: give sf.Input a dict of name -> samples"
-        raise ValueError(f"{what}: {form} raised {type(error).__name__}: {message}.") from error
+        raise ValueError(f"{what}: {form} raised {type(error).__name__}: {str(error).rstrip('.')}.") from error
     try:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:

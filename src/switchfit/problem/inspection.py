@@ -277,7 +277,7 @@ def find_undefined(
         named = [jnp.asarray(parameters[name], dtype=jnp.float64) for name in function.parameters]
         is_timed = bool(given) and given[0].ndim == 1
         moves = [derivatives and not (is_timed and k == 0) for k in range(len(given) + len(named))]
-        check = _compile(function, tuple(moves), len(given))
+        check = _compile(function, tuple(np.flatnonzero(moves).tolist()), len(given))
         finite = np.asarray(check(given, named)).reshape(-1, 2)  # the value, and the derivatives
         for point in np.flatnonzero(~finite.all(1))[:MOST_POINTS].tolist():
             walk = _Checking()
@@ -289,19 +289,20 @@ def find_undefined(
 
 
 @lru_cache(maxsize=64)
-def _compile(function: Function, moves: tuple[bool, ...], varying: int) -> Callable[..., Any]:
-    """Return a compiled check whether the value of a function is finite, and its derivatives, at each point: (N, 2)."""
+def _compile(function: Function, moving: tuple[int, ...], varying: int) -> Callable[..., Any]:
+    """Return a compiled check whether the value of a function is finite, and its derivatives in some of its arguments,
+    at each point: (N, 2).
+    """
+
+    def call(*every: Any) -> Any:
+        return function.evaluate(every)
+
+    slope = jax.jacrev(call, moving)
 
     def check(given: list[Any], named: list[Any]) -> Any:
         every = [*given, *named]
-
-        def call(moving: list[Any]) -> Any:
-            each = iter(moving)
-            return function.evaluate([next(each) if m else a for a, m in zip(every, moves, strict=True)])
-
-        moving = [a for a, m in zip(every, moves, strict=True) if m]
-        derivatives = [jax.jacrev(call)(moving), jax.jacfwd(jax.jacrev(call))(moving)] if moving else []
-        return jnp.stack([_are_finite([call(moving)]), _are_finite(jax.tree.leaves(derivatives))])
+        derivatives = [slope(*every), jax.jacfwd(slope, moving)(*every)] if moving else []
+        return jnp.stack([_are_finite([call(*every)]), _are_finite(jax.tree.leaves(derivatives))])
 
     return jax.jit(jax.vmap(check, in_axes=(0, None)) if varying else check)
 

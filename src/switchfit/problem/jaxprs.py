@@ -308,10 +308,7 @@ def _is_update(equation: Any) -> bool:
     """Return whether a scatter is an update of the user, ``x.at[index].set(value)``, and not one by JAX, as derivatives
     of ``x.at[index].get(mode="fill")`` are.
     """
-    frames = zip(*equation.source_info.traceback.raw_frames(), strict=True)
-    found = next((inner for inner, outer in pairwise(code for code, _ in frames) if _is_of_user(outer)), None)
+    calls = pairwise(code for code, _ in zip(*equation.source_info.traceback.raw_frames(), strict=True))
+    is_of_user = source_info_util.is_user_filename
+    found = next((inner for inner, outer in calls if is_of_user(outer.co_filename)), None)
     return found is not None and found.co_qualname.startswith(WRITER) and found.co_name != "get"
-
-
-def _is_of_user(code: Any) -> bool:
-    return bool(source_info_util.is_user_filename(code.co_filename))

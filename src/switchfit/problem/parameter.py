@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.dates import Dates, list_dates, read_date
-from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, require_deviation, set_fields, shorten
+from switchfit.problem.validation import as_array, as_choice, as_flag, as_name, require_deviation, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -108,9 +108,7 @@ Prior = Normal | LogNormal
 def _check(prior: Any, center: str, spread: str) -> None:
     kind = type(prior).__name__
     for name in (center, spread):
-        set_fields(prior, **{name: as_array(getattr(prior, name), f"{kind} {name}")})
-    if not np.all(np.isfinite(getattr(prior, center))):
-        raise ValueError(f"{kind} {center} must be finite; got {shorten(getattr(prior, center))}.")
+        set_fields(prior, **{name: as_array(getattr(prior, name), f"{kind} {name}", finite=name == center)})
     require_deviation(getattr(prior, spread), f"{kind} {spread}")
 
 
@@ -234,8 +232,8 @@ class Parameter:
 
     def __post_init__(self) -> None:
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
-        set_fields(self, unit=as_text(self.unit, "Parameter unit"), fixed=as_flag(self.fixed, "Parameter fixed"))
-        set_fields(self, scale=scale)
+        unit = as_name(self.unit, "Parameter unit", empty=True)
+        set_fields(self, unit=unit, fixed=as_flag(self.fixed, "Parameter fixed"), scale=scale)
         given = {name: read_date(getattr(self, name), f"Parameter {name}") for name in ("value", *BOUNDS)}
         if any(isinstance(each, Dates) for each in (*given.values(), getattr(self.prior, "mean", None))):
             set_fields(self, **given)  # an experiment makes numbers of them, and checks these
@@ -245,24 +243,18 @@ class Parameter:
 
     def _read_numbers(self, scale: str) -> dict[str, FloatArray]:
         """Return the value and the bounds, checked against one another."""
-        value = as_array(self.value, "Parameter value")
+        value = as_array(self.value, "Parameter value", finite=True)
         lower, upper = (self._bound(name, value.shape) for name in BOUNDS)
         if value.size == 0:
             raise ValueError("Parameter value must have one entry or more; got none.")
-        if not np.isfinite(value).all():
-            raise ValueError(f"Parameter value must be finite; got {shorten(value)}.")
         if not ((lower <= value).all() and (value <= upper).all()):
             bounds = f"[{shorten(self.lower)}, {shorten(self.upper)}]"
-            if not (lower <= upper).all():
-                raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {bounds}.")
             raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {bounds}.")
         if scale == "log":
             lower = np.where(np.isneginf(lower), 0.0, lower)
             if not (np.all(value > 0) and np.all(lower >= 0)):
-                raise ValueError(
-                    "Parameter with scale='log' must be positive, and its lower bound 0 or more; got the value "
-                    f"{shorten(self.value)} and the lower bound {shorten(self.lower)}."
-                )
+                given = f"{shorten(self.value)} and the lower bound {shorten(self.lower)}"
+                raise ValueError(f"Parameter with scale='log' must be positive; got {given}.")
         return {"value": value, "lower": lower, "upper": upper}
 
     def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
@@ -274,10 +266,7 @@ class Parameter:
         try:
             return np.broadcast_to(bound, shape).copy()
         except ValueError:
-            raise ValueError(
-                f"Parameter needs numbers that fit its value, of shape {shape}; got {name} {shorten(bound)} of shape "
-                f"{bound.shape}."
-            ) from None
+            raise ValueError(f"Parameter {name} must fit the value, of shape {shape}; got {shorten(bound)}.") from None
 
     def _check_prior(self) -> None:
         if self.prior is None:
@@ -287,14 +276,11 @@ class Parameter:
         try:
             PriorTerms.of(self.prior, self.shape)
         except ValueError as error:
-            raise ValueError(
-                f"Parameter prior does not fit a value of shape {self.shape}: "
-                f"{', '.join(f'{name} has shape {np.shape(number)}' for name, number in vars(self.prior).items())}."
-            ) from error
+            raise ValueError(f"Parameter prior must fit the value, of shape {self.shape}; got {self.prior}.") from error
         if isinstance(self.prior, LogNormal) and not (self.positive or self.fixed):
             raise ValueError(
-                "Parameter with a LogNormal prior must stay positive: give it a lower bound above 0, or scale='log'; "
-                f"got the lower bound {shorten(self.lower)}."
+                "Parameter with a LogNormal prior needs a lower bound above 0, or scale='log'; got the lower bound "
+                f"{shorten(self.lower)}."
             )
 
     @property
@@ -313,6 +299,15 @@ def unit_suffix(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
 
 
+def require_time_unit(parameter: Parameter, what: str, time_unit: str) -> None:
+    """Raise ValueError for a time with another unit than its experiment's."""
+    if parameter.unit not in ("", time_unit):
+        raise ValueError(
+            f"{what} has the unit {parameter.unit!r}, but time_unit of its experiment is {time_unit!r}, and times are "
+            "not converted. Give both in the same unit."
+        )
+
+
 def as_parameter(
     value: Any, what: str, form: str = "a number, an array or an sf.Parameter", *, fixed: bool = False
 ) -> Parameter:
@@ -320,17 +315,10 @@ def as_parameter(
 
     Errors call it `what`, and `form` what it has to be.
     """
-    if isinstance(value, Parameter):
-        refuse_dates(value, what)
-        return value
-    array = as_array(value, what, form=form)
     try:
-        return Parameter(array, fixed=fixed)
-    except ValueError as error:
-        raise ValueError(f"{what} must be {form}: {error}") from error
-
-
-def refuse_dates(parameter: Parameter, what: str) -> None:
-    """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
-    for date in list_dates(parameter):
+        parameter = value if isinstance(value, Parameter) else Parameter(value, fixed=fixed)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{what} must be {form}: {error}") from error
+    for _, date in list_dates(parameter):
         raise ValueError(f"{what} must be a number; got the date {date!r}. Only transition times and tf may be dates.")
+    return parameter

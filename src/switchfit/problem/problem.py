@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize import LinearConstraints
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
-from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_of, insert_jumps, name_runs, prefix_runs
-from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
+from switchfit.problem.experiment import Experiment, drop_jumps, insert_jumps, name_runs, prefix_runs
+from switchfit.problem.parameter import Parameter, as_parameter, require_time_unit, unit_suffix
 from switchfit.problem.structure import Functions, Structure, choose_common_lengths, trace_structure
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.unknowns import Constraint, Unknowns, list_unknowns
@@ -27,7 +27,7 @@ from switchfit.problem.validation import (
     as_count,
     as_instance,
     as_name,
-    as_number,
+    as_not_negative,
     as_positive,
     join_names,
     require_known,
@@ -49,9 +49,9 @@ def check_parameters(parameters: Any) -> dict[str, Parameter]:
 def check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
     """Return the shortest duration of all modes, or of each mode that a mapping names."""
     if not isinstance(given, Mapping):
-        return as_number(given, "min_duration")
+        return as_not_negative(given, "min_duration")
     require_known(given, "min_duration", system.modes)
-    return {mode: as_number(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}
+    return {mode: as_not_negative(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}
 
 
 def check_sequences(system: HybridSystem, experiments: tuple[Experiment, ...], max_transitions: int | None) -> None:
@@ -61,93 +61,45 @@ def check_sequences(system: HybridSystem, experiments: tuple[Experiment, ...], m
     if max_transitions is not None:
         longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
         if max_transitions < longest:
-            jumps = " and jumps" if any(len(e.jump_times) for e in experiments) else ""
-            raise ValueError(
-                f"max_transitions is {max_transitions}, but a mode_sequence has {longest} transitions{jumps}."
-            )
+            raise ValueError(f"max_transitions is {max_transitions}; there are {longest} transitions and jumps.")
 
 
-def check_maps(experiments: tuple[Experiment, ...], parameters: Mapping[str, Parameter]) -> None:
-    """Check that parameter maps lead to parameters."""
-    for name, experiment in zip(name_runs(experiments), experiments, strict=True):
-        for here, target in experiment.parameter_map.items():
-            if target not in parameters:
-                raise ValueError(
-                    f"parameter_map of experiment {join_names([name])} gives the model's {shorten(here)} as the "
-                    f"unknown parameter {shorten(target)}; the problem has {join_names(parameters)}."
-                )
-
-
-def check_states(system: HybridSystem, experiments: tuple[Experiment, ...]) -> None:
-    """Check the sizes of initial states that are not functions."""
-    own = system.initial_state
-    for e, experiment in enumerate(experiments):
-        initial = initial_state_of(system, experiment)
-        if callable(initial):
-            continue
-        if not callable(own) and len(initial) != len(own):
-            raise ValueError(
-                f"initial_state of experiment {experiment.name or e + 1} must have "
-                f"{len(own)} entries, as the system's has; got {len(initial)}."
-            )
-
-
-def check_noise(experiments: tuple[Experiment, ...], parameters: Mapping[str, Parameter], *, has_priors: bool) -> None:
-    """Check the parameters that are a sigma, and that the noise is known where something is weighed against it."""
-    items = [(e, item) for e in experiments for item in e.measurements]
-    for experiment, item in items:
-        for name in filter(None, item.sigma_names):
-            parameter = parameters.get(experiment.parameter_map.get(name, name))
-            if parameter is None:
-                raise ValueError(
-                    f"sigma names the parameter {shorten(name)}, which the problem lacks; it has "
-                    f"{join_names(parameters)}."
-                )
-            if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
-                raise ValueError(
-                    f"sigma names the parameter {name!r}, which must be one number that stays positive: give it a "
-                    f"lower bound above 0, or scale='log'; got shape {parameter.shape}, lower bound "
-                    f"{parameter.lower.tolist()}."
-                )
-    unknown = any(item.sigma is None for _, item in items)
-    if unknown and any(item.sigma_names or item.loss != "linear" for _, item in items):
-        raise ValueError(
-            "sigma is left out in some Measurements, and a parameter or measured against by a robust loss in "
-            "others: their costs are then not in the same units. Name a parameter for it there too."
-        )
-    if unknown and has_priors:
-        raise ValueError(
-            "a prior is weighed against the noise of the Measurements, whose sigma is left out: give sigma a "
-            "number, or the name of a parameter to estimate it."
-        )
-
-
-def check_delays(experiments: tuple[Experiment, ...], parameters: Mapping[str, Parameter]) -> None:
-    """Check the parameters that are a delay: within their bounds all samples must be of times inside
-    the horizon.
+def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
+    """Check the parameters that a map, a sigma or a delay names; with a delay, all samples must be inside the horizon
+    wherever it is within its bounds.
     """
-    for experiment in experiments:
-        for item in experiment.measurements:
-            if not isinstance(item.delay, str):
-                continue
-            parameter = parameters.get(experiment.parameter_map.get(item.delay, item.delay))
-            if parameter is None or parameter.shape != ():
+    for here, target in run.parameter_map.items():
+        if target not in parameters:
+            raise ValueError(
+                f"parameter_map has {shorten(here)} -> {shorten(target)}, but the problem has {join_names(parameters)}."
+            )
+
+    def find_scalar(what: str, name: str) -> Parameter:
+        parameter = parameters.get(run.parameter_map.get(name, name))
+        if parameter is None or parameter.shape != ():
+            raise ValueError(
+                f"{what} names {shorten(name)}, which must be a parameter of one number; the problem has "
+                f"{join_names(parameters)}."
+            )
+        return parameter
+
+    for item in run.measurements:
+        for name in filter(None, item.sigma_names):
+            sigma = find_scalar("sigma", name)
+            if not (sigma.positive or (sigma.fixed and sigma.value > 0)):
                 raise ValueError(
-                    f"delay names {shorten(item.delay)}, which must be a parameter of one number; the problem has "
-                    f"{join_names(parameters)}."
+                    f"sigma names the parameter {name!r}, which must stay positive: give it a lower bound above 0, or "
+                    f"scale='log'; got the lower bound {sigma.lower}."
                 )
-            if parameter.unit not in ("", experiment.time_unit):
-                raise ValueError(
-                    f"the delay {item.delay!r} has the unit {parameter.unit!r}, but time_unit of its experiment is "
-                    f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
-                )
-            unit = unit_suffix(experiment.time_unit)
-            low, high = item.times[-1] - experiment.earliest_end, item.times[0] - experiment.t0
-            least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
+        if isinstance(item.delay, str):
+            delay = find_scalar("delay", item.delay)
+            require_time_unit(delay, f"the delay {item.delay!r}", run.time_unit)
+            low, high = item.times[-1] - run.earliest_end, item.times[0] - run.t0
+            least, most = (delay.value,) * 2 if delay.fixed else (delay.lower, delay.upper)
             if not low <= least <= most <= high:
                 raise ValueError(
-                    f"the delay {item.delay!r} may lie in [{least}, {most}]{unit}, but only from {low:.6g} to "
-                    f"{high:.6g}{unit} are all samples inside (t0, tf) = ({experiment.t0}, {experiment.earliest_end}): "
+                    f"the delay {item.delay!r} may lie in [{least}, {most}], but only from {low:.6g} to {high:.6g}"
+                    f"{unit_suffix(run.time_unit)} are all samples inside (t0, tf) = ({run.t0}, {run.earliest_end}): "
                     "give it narrower bounds, move t0 or tf, or leave out samples at the ends."
                 )
 
@@ -274,16 +226,30 @@ class Problem:
         parameters = check_parameters(self.parameters)
         dwell = check_durations(self.min_duration, self.system)
         set_fields(self, parameters=parameters, min_duration=dwell)
-        check_maps(experiments, parameters)
-        check_states(self.system, experiments)
+        for run in experiments:
+            check_names(run, parameters)
         set_fields(self, unknowns=list_unknowns(self.system, experiments, parameters, dwell))
         if not self.max_transitions:
             require_unknowns(self)
-        check_noise(experiments, parameters, has_priors=self.unknowns.priors.any)
-        check_delays(experiments, parameters)
+        self._check_noise()
+        states = [self.system.initial_state, *(run.initial_state for run in experiments)]
+        sizes = {len(state) for state in states if state is not None and not callable(state)}
+        if len(sizes) > 1:
+            raise ValueError(f"initial_state must have as many entries in the system and all experiments; got {sizes}.")
         set_fields(self, structures=self._trace_structures())
         for structure in self.structures:
             self.system.check_labels_of(structure.n)
+
+    def _check_noise(self) -> None:
+        """Raise ValueError if something is weighed against noise that is unknown."""
+        items = self.measurements
+        relative = self.unknowns.priors.any or any(item.sigma_names or item.loss != "linear" for item in items)
+        if relative and any(item.sigma is None for item in items):
+            raise ValueError(
+                "sigma is left out in some Measurements, and something is weighed against the noise: a prior, a robust "
+                "loss, or other Measurements whose sigma is a parameter. Give sigma a number there, or the name of a "
+                "parameter to estimate it."
+            )
 
     def _trace_structures(self) -> tuple[Structure, ...]:
         settings = self._functions, self.solver, self.max_transitions
@@ -324,11 +290,9 @@ class Problem:
         >>> problem.with_sequences([("off", "on", "off")], [(1.0, 3.0)]).theta_names
         ('tau_1', 'tau_2', 'k')
         """
-        if not len(sequences) == len(transition_times) == len(self.experiments):
-            raise ValueError(
-                f"with_sequences needs a sequence and its times for each of {len(self.experiments)} experiments; got "
-                f"{len(sequences)} sequences and {len(transition_times)} arrays of times."
-            )
+        counts = [len(each) for each in (self.experiments, sequences, transition_times)]
+        if len(set(counts)) > 1:
+            raise ValueError(f"each experiment needs a sequence and its times; got {counts} of them.")
         given = zip(self.experiments, sequences, transition_times, strict=True)
         experiments = tuple(
             replace(run, mode_sequence=tuple(modes), transition_times=tuple(np.asarray(times, dtype=float).tolist()))
@@ -361,8 +325,8 @@ class Problem:
             changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
             if changed:
                 raise ValueError(
-                    f"{', '.join(changed)} does something else in this process, or now, than when the problem was "
-                    "built, as what it reads has changed: build the problem anew before it is sent to other processes."
+                    f"{', '.join(changed)} does something else in this process than when the problem was built: what "
+                    "it reads has changed. Build the problem anew before it is sent to other processes."
                 )
 
     @property
@@ -567,11 +531,9 @@ class Problem:
         >>> problem.late_times(problem.initial_theta, 0)
         array([], dtype=float64)
         """
-        late = [(i.times, i.delay) for i in self.experiments[e].measurements if isinstance(i.delay, str)]
-        if not late:
-            return np.zeros(0)
-        named = self.name_parameters(theta, e)
-        return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
+        late = [item for item in self.experiments[e].measurements if isinstance(item.delay, str)]
+        named = self.name_parameters(theta, e) if late else {}
+        return np.concatenate([np.zeros(0), *(item.times - named[item.delay] for item in late)])
 
     def check_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
         """Return `theta`, or the initial guess for None, as a ``(d,)`` array; messages call it `what`.
@@ -596,15 +558,12 @@ class Problem:
         """
         if theta is None:
             return self.initial_theta
-        checked = as_array(theta, what)
+        checked = as_array(theta, what, finite=True)
         if checked.shape != self.unknowns.initial.shape:
             raise ValueError(
                 f"{what} must have shape ({len(self.theta_names)},): {join_names(self.theta_names)}; "
                 f"got shape {checked.shape}."
             )
-        if not np.isfinite(checked).all():
-            raise ValueError(f"{what} must be finite; got {shorten(checked)}.")
-        checked = checked.copy()
         for e, (experiment, where) in enumerate(zip(self.experiments, self.unknowns.times, strict=True)):
             times = self._select_times(checked, e)
             knots = np.concatenate([[experiment.t0], times, [experiment.end]])
@@ -620,18 +579,13 @@ class Problem:
                 high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.end)[::-1])[::-1]
                 ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
                 checked[where[where >= 0]] = ordered[where >= 0]
-        self._check_delays_inside(checked, what)
-        return checked
-
-    def _check_delays_inside(self, theta: FloatArray, what: str) -> None:
-        for e, experiment in enumerate(self.experiments):
-            seen = self.late_times(theta, e)
+            seen = self.late_times(checked, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.earliest_end):
                 raise ValueError(
                     f"{what} has delays with which samples are of moments from {seen.min():.6g} to {seen.max():.6g}"
-                    f"{unit_suffix(experiment.time_unit)}, outside (t0, tf) = ({experiment.t0}, "
-                    f"{experiment.earliest_end})."
+                    f"{unit_suffix(experiment.time_unit)}, outside ({experiment.t0}, {experiment.earliest_end})."
                 )
+        return checked
 
     def ends_of_modes(self, theta: FloatArray) -> list[FloatArray]:
         """Return when each mode begins and the last one ends, at tf, for theta (..., d): an array (..., one more than
@@ -771,9 +725,7 @@ def require_samples(problem: Problem) -> None:
     names = name_runs(problem.experiments)
     for name, run in zip(names, problem.experiments, strict=True):
         if not all(len(item.times) for item in run.measurements):
-            raise ValueError(
-                f"the Measurements of {name} have no samples: give times and values (sf.OnlineEstimator needs none)."
-            )
+            raise ValueError(f"the Measurements of {name} have no samples; only sf.OnlineEstimator needs none.")
 
 
 def require_unknowns(problem: Problem) -> None:

@@ -317,7 +317,7 @@ def trace_structure(
         names = (*names, REST)
     after_jumps = (own_modes[i] for i in experiment.passed_by_jumps)  # the mode before it
     sequence = (own_modes[0], *insert_jumps(experiment, own_modes[1:], after_jumps))
-    jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for jump in experiment.jump_maps]
+    jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for _, jump in experiment.acts]
     references = ((item, item.signal.channels) for item in items(ReferenceSignal))
     measurements = ((item, item.values.shape[1]) for item in items(Measurements))
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)", jump_maps)
@@ -369,8 +369,7 @@ def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channel
         return trace(item.observe, ((), (n,), None), (channels,), "observe", "h(t, x, p)")
     if channels != n:
         raise ValueError(
-            f"Without observe the whole state is compared: its {n} entries need as many channels of data; got "
-            f"{channels}. Give observe=h(t, x, p) -> ({channels},)."
+            f"Without observe=h(t, x, p) -> ({channels},) the whole state is compared: its {n} entries; got {channels}."
         )
     return None
 
@@ -379,9 +378,7 @@ def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int)
     """Return the function psi(x, p) of a terminal constraint, which returns a number or (m,)."""
     psi = trace(item.psi, ((n,), None), None, "TerminalConstraint", "psi(x, p)")
     if len(psi.shape) > 1:
-        raise ValueError(
-            f"TerminalConstraint: psi(x, p) must return a number or an array of shape (m,); got shape {psi.shape}."
-        )
+        raise ValueError(f"TerminalConstraint: psi(x, p) must return a number or (m,) of them; got {psi.shape}.")
     return psi
 
 

@@ -124,11 +124,7 @@ class HybridSystem:
         >>> system.check_labels_of(2)
         """
         for label in ("state_names", "state_units"):
-            labels = getattr(self, label)
-            if labels is not None and len(labels) != n:
-                raise ValueError(
-                    f"{label} must have one entry for each of the {n} states; got {len(labels)}: {shorten(labels)}."
-                )
+            as_labels(getattr(self, label), label, "state", n)
 
 
 def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
@@ -143,30 +139,23 @@ def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ..
         form = "a number or an sf.Parameter"
         entries = tuple(as_parameter(entry, f"each entry of {name}", form, fixed=True) for entry in value)
         if any(entry.shape != () for entry in entries):
-            wrong = next(entry.shape for entry in entries if entry.shape != ())
-            raise ValueError(
-                f"{name} must have one number or one sf.Parameter of one number for each state; got an entry of shape "
-                f"{wrong}."
-            )
+            shapes = [entry.shape for entry in entries]
+            raise ValueError(f"{name} must have {form} of one number for each state; got the shapes {shorten(shapes)}.")
         return entries
-    state = as_array(value, name, form="an array of numbers, one for each state")
+    state = as_array(value, name, form="an array of numbers, one for each state", finite=True)
     if state.ndim != 1 or state.size == 0:
         raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
-    if not np.all(np.isfinite(state)):
-        raise ValueError(f"{name} must be finite; got {shorten(state)}.")
     state.flags.writeable = False
     return state
 
 
 def _check_pairs(given: AtTransitions | None, name: str, modes: Mapping[str, VectorField]) -> AtTransitions:
     """Return functions of transitions, by the modes before and after."""
-    if not isinstance(given, Mapping | None):
+    checked = {} if given is None else given
+    if not isinstance(checked, Mapping) or not all(isinstance(key, tuple) and len(key) == 2 for key in checked):
         raise TypeError(f"{name} must be a dict of (mode before, mode after) -> function; got {shorten(given)}.")
-    checked = {} if given is None else dict(given)
     for key, function in checked.items():
-        if not (isinstance(key, tuple) and len(key) == 2):
-            raise ValueError(f"{name} must have keys (mode before, mode after); got {shorten(key)}.")
         require_known(key, name, modes)
         what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
         as_callable(function, f"{what} {shorten(key)}", f"a function {form}")
-    return checked
+    return dict(checked)

@@ -257,7 +257,7 @@ def list_unknowns(
 
     def add(name: str, unit: str, parameter: Parameter) -> slice:
         first = len(names)
-        entries = map(_index, np.ndindex(parameter.shape)) if parameter.shape else [""]
+        entries = [f"[{','.join(map(str, k))}]" for k in np.ndindex(parameter.shape)] if parameter.shape else [""]
         names.extend(f"{name}{entry}" for entry in entries)
         units.extend([unit] * parameter.value.size)
         pieces.append(parameter)
@@ -296,10 +296,6 @@ def list_unknowns(
     return Unknowns(tuple(names), tuple(units), value, lower, upper, *places, A, b, rows, priors, log, starts)
 
 
-def _index(k: tuple[int, ...]) -> str:
-    return f"[{','.join(map(str, k))}]"
-
-
 def get_min_duration(min_duration: float | Mapping[str, float], mode: str) -> float:
     """Return the shortest duration of a mode, given that of a problem.
 
@@ -315,47 +311,30 @@ def _build_ordering(
     experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, durations: float | Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
-    given = list(durations.values()) if isinstance(durations, Mapping) else [durations]
-    if not all(np.isfinite(value) and value >= 0 for value in given):
-        raise ValueError(f"min_duration must be zero or positive; got {durations}.")
-    longest = max(given, default=0.0)
     rows, bounds, constraints = [], [], []
-    labels = name_runs(experiments)
-    if longest > 0 and any(
-        tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times
-    ):
+    labels, units = name_runs(experiments), {experiment.time_unit for experiment in experiments}
+    is_log = any(tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times)
+    if (is_log or len(units) > 1) and (any(durations.values()) if isinstance(durations, Mapping) else durations):
         raise ValueError(
-            f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
-            f"them is then not linear in what is estimated; got {durations}. Leave out min_duration, or scale='log'."
+            "min_duration must be 0 where transition times are on a logarithmic scale, or in different units "
+            f"({join_names(sorted(units))}); got {durations}."
         )
-    if longest > 0 and len({experiment.time_unit for experiment in experiments}) > 1:
-        units = ", ".join(f"{name} in {run.time_unit}" for name, run in zip(labels, experiments, strict=True))
-        raise ValueError(
-            f"min_duration is one number for experiments whose times are in different units ({units}), and times are "
-            "not converted. Give all times in one unit, or leave it out and bound the transition times of each."
-        )
+    unit_rows = np.eye(d + 1, d)  # the last one, of times that are fixed, is zero
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else labels[e]
         knots = experiment.ends_of_modes(experiment.initial_times)
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
-        unit = unit_suffix(experiment.time_unit)
+        lengths, known = np.diff(knots), np.diff(np.where(ends < 0, knots, 0.0))
         for i, mode in enumerate(experiment.mode_sequence):
-            length, dwell = knots[i + 1] - knots[i], get_min_duration(durations, mode)
-            if length < dwell * (1 - 1e-12):
+            dwell, unit = get_min_duration(durations, mode), unit_suffix(experiment.time_unit)
+            if lengths[i] < dwell * (1 - 1e-12):
                 raise ValueError(
                     f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run and f' of {run}'} "
-                    f"only {length:.6g}{unit}."
+                    f"only {lengths[i]:.6g}{unit}."
                 )
-            if ends[i] < 0 and ends[i + 1] < 0:
-                continue
-            row, bound = np.zeros(d), dwell
-            for end, knot, sign in ((ends[i + 1], knots[i + 1], 1.0), (ends[i], knots[i], -1.0)):
-                if end >= 0:
-                    row[end] += sign
-                else:
-                    bound -= sign * knot
-            rows.append(row)
-            bounds.append(bound)
-            kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
-            constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))
+            if ends[i] >= 0 or ends[i + 1] >= 0:
+                rows.append(unit_rows[ends[i + 1]] - unit_rows[ends[i]])
+                bounds.append(dwell - known[i])
+                kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
+                constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))
     return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(constraints)

@@ -31,10 +31,8 @@ import numbers
 import operator
 import os
 import reprlib
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import is_dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeVar
@@ -68,23 +66,18 @@ def list_columns(value: Any) -> list[tuple[Any, Any]] | None:
     return [(name, value[name]) for name in value.columns]
 
 
-def find_names(value: Any) -> tuple[str, ...] | None:
-    """Return the names of the columns of a table, or of the one column that it is, if all are strings and differ.
+def find_labels(value: Any) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
+    """Return the names and the units of the columns of a table, or of the one column that it is.
 
-    An array of xarray with labels along its second dimension has these for names.
+    Names are None unless all are strings and differ; an array of xarray with labels along its second dimension has
+    these. Units are in ``attrs["units"]`` of the table or the column, a string or a mapping from names to units; they
+    are None where no unit is given.
     """
-    names = [name for name, _ in _list_channels(value)]
+    channels = _list_channels(value)
+    names = [name for name, _ in channels]
     proper = all(isinstance(name, str) and name.strip() for name in names) and len(set(names)) == len(names)
-    return tuple(map(str, names)) if names and proper else None
-
-
-def find_units(value: Any) -> tuple[str, ...] | None:
-    """Return the unit of each column from ``attrs["units"]`` of the table or the column; None where no unit is given.
-
-    ``attrs["units"]`` is a string, or a mapping from names to units.
-    """
-    units = tuple(_find_unit(column, name) or _find_unit(value, name) for name, column in _list_channels(value))
-    return units if any(units) else None
+    units = tuple(_find_unit(column, name) or _find_unit(value, name) for name, column in channels)
+    return tuple(map(str, names)) if names and proper else None, units if any(units) else None
 
 
 def _find_unit(value: Any, name: Any) -> str:
@@ -115,6 +108,7 @@ LARGEST_COUNT = 10**9
 LARGEST_SEED = 2**64 - 1
 MOST_DIMENSIONS = 8
 """Largest depth of nested lists: lists that contain themselves have no end."""
+BEYOND = "beyond the largest double, 1.8e308"
 LONGEST = 120
 """Largest number of characters of a value that a message shows."""
 MOST_LISTED = 10
@@ -123,10 +117,7 @@ MOST_LISTED = 10
 _INTEGERS = (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64)
 _EXACT: frozenset[type] = frozenset({int, float, np.float64, *_INTEGERS})
 """Types that `numpy.array(..., dtype=float64)` reads without change."""
-NO_DATES = (
-    ": dates and time differences are not supported. Give numbers in one unit, such as the seconds since the start: "
-    "(dates - dates[0]) / np.timedelta64(1, 's')"
-)
+NO_DATES = ": dates and time differences are not supported; give (dates - dates[0]) / np.timedelta64(1, 's')"
 _TEXT = (str, bytes, bytearray)
 _DATES = (datetime.date, datetime.time, datetime.timedelta)
 
@@ -143,22 +134,11 @@ class _Short(reprlib.Repr):
         self.maxlevel = 4
         self.maxstring = self.maxother = 60
 
-    def repr_int(self, x: int, level: int) -> str:
-        """Python refuses to write integers of more than 4,300 digits."""
-        return repr(x) if x.bit_length() <= 128 else f"an integer of {x.bit_length()} bits"
-
     def repr_ndarray(self, x: Any, level: int) -> str:
         array = np.asarray(x)
         if array.size <= 8:
             return self.repr1(array.tolist(), level)
         return f"an array of shape {array.shape} ({array.dtype})"
-
-    def repr_instance(self, x: Any, level: int) -> str:
-        """Return only the type of a dataclass: a problem contains all its data."""
-        return f"<{type(x).__name__}>" if is_dataclass(type(x)) else super().repr_instance(x, level)
-
-    def repr_Dates(self, x: Any, level: int) -> str:  # reprlib calls repr_<name of the type>
-        return repr(x)
 
     repr_ArrayImpl = repr_MaskedArray = repr_ndarray  # noqa: N815  # reprlib calls repr_<name of the type>
 
@@ -187,8 +167,8 @@ class _WrongEntryError(Exception):
     """An entry of an argument is not a number: the entry, the type of the error to raise, and why."""
 
 
-def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False) -> FloatArray:
-    """Return `value` as a new float64 array of any shape; NaN and infinities are allowed.
+def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False, finite: bool = False) -> FloatArray:
+    """Return `value` as a new float64 array of any shape.
 
     Parameters
     ----------
@@ -199,6 +179,8 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False)
         Its required form, for messages.
     missing : bool, optional
         Whether masked entries become NaN; otherwise they are refused.
+    finite : bool, optional
+        Whether NaN and infinities are refused.
 
     Raises
     ------
@@ -208,25 +190,23 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False)
         For text, nested lists of different lengths, numbers beyond the range of doubles, masked entries, or
         single-precision numbers that have lost digits.
     """
-    if type(value) is float or (type(value) is np.ndarray and value.dtype == np.float64):
-        return np.array(value, dtype=np.float64)
     try:
-        exact = _read_exactly(value, what, missing)
+        is_double = type(value) is float or (type(value) is np.ndarray and value.dtype == np.float64)
+        exact = value if is_double else _read_exactly(value, what, missing)
     except _WrongEntryError as wrong:
         entry, error, why = wrong.args
         inside = "" if entry is value else f", in which {shorten(entry)} is not a number"
         raise error(f"{what} must be {form}; got {shorten(value)}{inside}{why}.") from None
     try:
         with np.errstate(all="ignore"):
-            return np.array(exact, dtype=np.float64)
-    except OverflowError:
-        raise ValueError(
-            f"{what} must be {form} up to 1.8e308, the largest double; got {shorten(value)}, which is larger."
-        ) from None
-    except ValueError:
-        raise ValueError(
-            f"{what} must be {form}; got {shorten(value)}, whose rows differ in length or in shape."
-        ) from None
+            array = np.array(exact, dtype=np.float64)
+    except (OverflowError, ValueError) as error:
+        why = f"with a number {BEYOND}" if isinstance(error, OverflowError) else "whose rows differ in length or shape"
+        raise ValueError(f"{what} must be {form}; got {shorten(value)}, {why}.") from None
+    if finite and not np.isfinite(array).all():
+        where = np.argwhere(~np.isfinite(array))[0].tolist()
+        raise ValueError(f"{what} must be finite; got {array[tuple(where)]}{f' at index {where}' if where else ''}.")
+    return array
 
 
 def as_number(value: Any, what: str) -> float:
@@ -255,14 +235,19 @@ def as_positive(value: Any, what: str) -> float:
     return as_finite(number, what)
 
 
+def as_not_negative(value: Any, what: str) -> float:
+    """Return `value` as a finite float that is 0 or more."""
+    number = as_finite(value, what)
+    if number < 0:
+        raise ValueError(f"{what} must be 0 or more; got {number}.")
+    return number
+
+
 def require_deviation(sd: FloatArray, what: str) -> None:
     """Raise ValueError unless standard deviations are positive and finite, and so are their inverse squares."""
-    if not np.all((sd > 0) & np.isfinite(sd)):
-        raise ValueError(f"{what} must be positive and finite; got a smallest value of {sd.min()}.")
-    with np.errstate(over="ignore"):
-        if not np.all(np.isfinite(sd**-2.0)):
-            name = what.split()[-1]
-            raise ValueError(f"{what} must not be so small that 1 / {name}**2 is infinite; got {shorten(sd)}.")
+    with np.errstate(all="ignore"):
+        if not np.all((sd > 0) & np.isfinite(sd) & np.isfinite(sd**-2.0)):
+            raise ValueError(f"{what} must be positive and finite, and so must its inverse square; got {sd.min()}.")
 
 
 def as_level(value: Any, what: str = "level") -> float:
@@ -318,16 +303,13 @@ def _read_exactly(value: Any, what: str, missing: bool, depth: int = 0) -> Any:
         kinds = set(map(type, value))
         if kinds <= _EXACT:
             return list(value)
-        if len(kinds) == 1 and issubclass(next(iter(kinds)), np.number):
-            return _read_array_exactly(np.array(value), what, missing, depth)
         return [_read_exactly(entry, what, missing, depth + 1) for entry in value]
     if isinstance(value, (numbers.Real, Decimal)) and not isinstance(value, bool):
         try:
             return float(value)
-        except OverflowError:
-            raise _WrongEntryError(value, ValueError, ", which is beyond the largest double, 1.8e308") from None
-        except Exception:
-            raise _WrongEntryError(value, TypeError, "") from None
+        except Exception as error:  # also a faulty __float__
+            is_large = isinstance(error, OverflowError)
+            raise _WrongEntryError(value, ValueError if is_large else TypeError, f", {BEYOND}" * is_large) from None
     if isinstance(value, _DATES):
         raise _WrongEntryError(value, TypeError, NO_DATES)
     why = ": give a list or an array" if isinstance(value, (Iterator, AbstractSet)) else ""
@@ -346,7 +328,7 @@ def _read_array_exactly(value: Any, what: str, missing: bool, depth: int) -> Any
     if array.dtype.kind == "O":
         array = _read_exactly(array.tolist(), what, missing, depth + 1)
     elif is_low_precision(array.dtype):
-        refuse_single_precision(value if _is_of_jax(value) else array, what)
+        refuse_single_precision(array, what)
         array = array.astype(np.float64)
     elif array.dtype.kind not in "iuf":
         raise _WrongEntryError(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
@@ -365,8 +347,7 @@ def _read_pandas(value: Any) -> NDArray[Any]:
     kind = getattr(getattr(value, "dtype", None), "numpy_dtype", None)
     if kind is None or kind.kind not in "iuf":
         return np.asarray(value)
-    gaps = bool(value.isna().any())
-    return np.asarray(value.to_numpy(dtype=np.float64 if gaps and kind.kind != "f" else kind, na_value=np.nan))
+    return np.asarray(value.to_numpy(dtype=kind if kind.kind == "f" else np.float64, na_value=np.nan))
 
 
 # --- single precision -------------------------------------------------------------------------------------------------
@@ -376,11 +357,6 @@ def is_low_precision(dtype: Any) -> bool:
     """Return whether this is the dtype of floating-point numbers of less than double precision."""
     dtype = np.dtype(dtype)
     return dtype.itemsize < 8 and dtype.name.startswith(("float", "bfloat"))
-
-
-def _is_of_jax(value: Any) -> bool:
-    """Return whether a value is an array of JAX, which need not be imported."""
-    return "jax" in sys.modules and isinstance(value, sys.modules["jax"].Array)
 
 
 def refuse_single_precision(value: Any, what: str) -> None:
@@ -411,14 +387,11 @@ def refuse_single_precision(value: Any, what: str) -> None:
     changed = np.flatnonzero(np.isfinite(wide) & (meant != wide))
     if not changed.size:
         return
-    advice = "Give doubles (float64); if the numbers really have that precision, as those of a log may, "
-    advice += "write np.asarray(values, dtype=np.float64)."
-    if _is_of_jax(value):
-        advice = "By default JAX makes arrays of 32 bits: write a list or a NumPy array in place of the jnp array."
     first = changed[0]
     raise ValueError(
         f"{what} must be in double precision: {float(meant[first])!r} became {float(wide[first])!r} "
-        f"({given.dtype.name}). {advice}"
+        f"({given.dtype.name}). Write a list or a NumPy array: by default JAX makes arrays of 32 bits. If the numbers "
+        "really have that precision, as those of a log may, write np.asarray(values, dtype=np.float64)."
     )
 
 
@@ -448,19 +421,12 @@ def as_choice(value: Any, what: str, choices: Sequence[str]) -> Any:
     raise error(f"{what} must be {wanted}; got {shorten(value)}.")
 
 
-def as_name(value: Any, what: str, form: str = "a string") -> str:
-    """Return a string that is not empty."""
+def as_name(value: Any, what: str, form: str = "a string", *, empty: bool = False) -> str:
+    """Return a string, which must not be empty unless that is allowed."""
     if not isinstance(value, str):
         raise TypeError(f"{what} must be {form}; got {shorten(value)}.")
-    if not value.strip():
+    if not (value.strip() or empty):
         raise ValueError(f"{what} must not be empty; got {shorten(value)}.")
-    return str(value)
-
-
-def as_text(value: Any, what: str) -> str:
-    """Return a string, which may be empty."""
-    if not isinstance(value, str):
-        raise TypeError(f"{what} must be a string; got {shorten(value)}.")
     return str(value)
 
 
@@ -500,7 +466,7 @@ def as_labels(value: Any, what: str, each: str, count: int | None = None) -> tup
     if what.endswith("names"):
         checked = as_names(labels, what, form)
     else:
-        checked = tuple(as_text(unit, f"each of {what}") for unit in labels)
+        checked = tuple(as_name(unit, f"each of {what}", empty=True) for unit in labels)
     if count is not None and len(checked) != count:
         raise ValueError(f"{what} must have one entry for each of the {count} {each}s; got {shorten(checked)}.")
     return checked
@@ -535,12 +501,8 @@ def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
     TypeError
         For text, and for collections without order or that can be read only once: sets, dicts, generators.
     """
-    if isinstance(value, _TEXT):
-        raise TypeError(f"{what} must be {form}; got the string {shorten(value)}.")
-    if isinstance(value, (AbstractSet, Mapping, Iterator)):
-        raise TypeError(
-            f"{what} must be {form}; got {shorten(value)} ({type(value).__name__}): give a list or a tuple."
-        )
+    if isinstance(value, (*_TEXT, AbstractSet, Mapping, Iterator)):
+        raise TypeError(f"{what} must be {form}; got {shorten(value)}: give a list or a tuple.")
     try:
         return tuple(value)
     except Exception:  # TypeError; arrays without dimensions and others raise their own
@@ -567,8 +529,7 @@ def as_callable(value: Any, what: str, form: str, *, arguments: int | None = Non
         Number of arguments with which it is called; checked if its signature is known.
     """
     if not callable(value) or isinstance(value, type):
-        given = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
-        raise TypeError(f"{what} must be {form}; got {given}.")
+        raise TypeError(f"{what} must be {form}; got {shorten(value)}.")
     misfit = None if arguments is None else find_misfit(value, range(arguments))
     if misfit is not None:
         raise TypeError(
