@@ -37,9 +37,8 @@ from switchfit.runtime.frames import Tabular
 from switchfit.runtime.json_records import find_dtype, from_json, to_json
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 from switchfit.runtime.progress import show_progress
-from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.verdict import Verdict
+from switchfit.uncertainty.verdict import LEVELS, Doubt, Verdict, find_levels
 from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"

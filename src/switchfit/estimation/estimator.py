@@ -43,7 +43,7 @@ from switchfit.uncertainty.prediction import (
     predict,
 )
 from switchfit.uncertainty.profiles import Profile, profile
-from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_covariance, correct_errors, diagnose
+from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, diagnose, measure_widening
 from switchfit.uncertainty.verdict import Verdict, judge
 from switchfit.uncertainty.walks import HIGHEST_LEVEL, compute_threshold, replace_intervals, trace_profiles
 
@@ -170,7 +170,8 @@ class Estimate(Fit, Tabular, Displayed):
         Its standard errors are `corrected_standard_errors`, its correlations those of `covariance`. Bands of fitted
         curves follow from it.
         """
-        return correct_covariance(self)
+        factors = measure_widening(self)
+        return np.asarray(factors[:, None] * self.covariance * factors)
 
     def report(self, *, full: bool = False) -> str:
         """Return the report that `print` shows: the verdict and one screen of numbers.
