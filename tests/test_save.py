@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
-from switchfit.estimation.saved import FORMAT, VERSION, load_saved, save_fit
+from switchfit.estimation.estimator import FORMAT, VERSION, load_saved, save_fit
 from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
 from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.runtime.errors import Issue
-from switchfit.runtime.json_records import find_dtype, from_json, to_json
+from switchfit.runtime.files import find_dtype, from_json, to_json
 from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower, constraint_errors, cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
-from switchfit.fit.faults import explain_nonfinite
 from switchfit.fit.result import termination_of
-from switchfit.fit.solution import minimize_cost
+from switchfit.fit.solution import explain_nonfinite, minimize_cost
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
 from switchfit.optimize.matrix import Dense, null_space

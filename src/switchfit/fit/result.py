@@ -460,18 +460,9 @@ class Fit(Termination):
         for e, (run, trajectory, times, places) in enumerate(each):
             modes = [mode for mode, _, _ in trajectory.mode_spans]
             for i, (time, place) in enumerate(zip(times.tolist(), places.tolist(), strict=True)):
-                found.append(
-                    Transition(
-                        experiment=e,
-                        run="" if single else run,
-                        name=f"{'' if single else f'{run}.'}tau_{i + 1}",
-                        time=time,
-                        unit=trajectory.time_unit,
-                        before=modes[i],
-                        after=modes[i + 1],
-                        index=place if place >= 0 else None,
-                    )
-                )
+                name, label = (f"tau_{i + 1}", "") if single else (f"{run}.tau_{i + 1}", run)
+                index = place if place >= 0 else None
+                found.append(Transition(e, label, name, time, trajectory.time_unit, modes[i], modes[i + 1], index))
         return found
 
     @property

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import Provenance, load_saved
+from switchfit.estimation.estimator import Estimate, Provenance, load_saved
 from switchfit.io.problem_file import load_problem
 from switchfit.io.problem_file.building import ProblemFile, digest_file
 from switchfit.problem.data import Measurements
