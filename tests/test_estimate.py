@@ -243,7 +243,7 @@ def test_a_budget_is_that_of_one_mesh():
     """The fit converges on the first mesh with its last iteration, and is resumed on a finer one all the same."""
     problem = refined_fit().problem
     first = evaluator_of(problem)
-    on_first = minimize_cost(first, problem.initial_theta, "auto", 1e-7, 200, follower=Follower(first)).iterations
+    on_first = minimize_cost(Follower(first), problem.initial_theta, "auto", 1e-7, 200).iterations
     found = sf.estimate(problem, max_iterations=on_first)
     assert found.success
     assert found.iterations == refined_fit().iterations > on_first

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -848,11 +848,10 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        found = load_saved(as_path(path, "path"))
-        fit = found.fit
+        fit, certificate, provenance = load_saved(as_path(path, "path"))
         if problem is not None:
             _check_loaded(fit, problem, path)
-        return cls(**vars(fit), saved_certificate=found.certificate, problem=problem, provenance=found.provenance)
+        return cls(**vars(fit), saved_certificate=certificate, problem=problem, provenance=provenance)
 
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
@@ -1083,24 +1082,14 @@ def _compute_seal(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
 
 
-class SavedFit(NamedTuple):
-    """What a file holds; a fit that was saved without its provenance has None."""
+def load_saved(path: Path) -> tuple[Fit, Certificate, Provenance | None]:
+    """Return what `save_fit` wrote, with the provenance if it was saved.
 
-    fit: Fit
-    certificate: Certificate
-    provenance: Provenance | None
-
-
-def load_saved(path: Path) -> SavedFit:
-    """Read what `save_fit` wrote; every field is equal, and arrays have the same bits, dtype and shape.
+    Every field is equal, and arrays have the same bits, dtype and shape.
 
     Parameters
     ----------
     path : Path
-
-    Returns
-    -------
-    SavedFit
 
     Raises
     ------
@@ -1114,7 +1103,7 @@ def load_saved(path: Path) -> SavedFit:
         fit, certificate = parse_fit(content)
         given = content.get("provenance")
         provenance = None if given is None else from_json(Provenance, given, "provenance")
-        return SavedFit(fit, certificate, None if provenance is None else provenance.find_from(Path(path)))
+        return fit, certificate, None if provenance is None else provenance.find_from(Path(path))
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
 

@@ -94,9 +94,7 @@ def fit_locally(
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
         follower = Follower(finer)
-        following = minimize_cost(
-            finer, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers, follower=follower
-        )
+        following = minimize_cost(follower, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers)
         if attempt and following.status is Status.NONFINITE_START:  # what was found stays
             broken = finer, following
             break
@@ -203,7 +201,8 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
         return result
     insignificant, hessian = _compute_insignificance(problem, result), result.hessian
     d = len(result.theta)
-    T = _list_horizons(problem)
+    lengths = [run.initial_length for run in problem.experiments]
+    T = problem.unknowns.put_at_times(np.full(d, np.inf), lengths)  # of times alone
     least = 2.0 * insignificant / T**2
     suspects = problem.unknowns.is_time & (np.abs(np.diag(hessian)) <= least)
     if not hessian[suspects].any():
@@ -219,13 +218,6 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
         return result
     kinks = tuple(kink for kink in result.kinks if not noise[kink[0]])
     return replace(result, status=Status.SINGULAR, hessian=cleaned, curvature=curvature, kinks=kinks)
-
-
-@keep_with_problem
-def _list_horizons(problem: Problem) -> FloatArray:
-    """Return the length of the horizon for each unknown that is a time, infinity for others: (d,)."""
-    lengths = [run.initial_length for run in problem.experiments]
-    return problem.unknowns.put_at_times(np.full(len(problem.theta_names), np.inf), lengths)
 
 
 def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:

@@ -5,7 +5,7 @@ How a fit ended, as data from which the report writes its message.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
@@ -140,7 +140,9 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
     smallest: float = np.nan
     flat: tuple[tuple[str, float], ...] = ()
     if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status needs them
-        smallest, flat = result.smallest_eigenvalue, _list_largest(result.flat_direction, names)
+        smallest, direction = result.smallest_eigenvalue, result.flat_direction
+        largest = [i for i in np.argsort(-np.abs(direction), kind="stable") if abs(direction[i]) > SMALL_WEIGHT]
+        flat = tuple((names[i], float(direction[i])) for i in largest[:NAMED])
     return Termination(
         status=result.status,
         cost=result.cost,
@@ -157,13 +159,6 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         reason=None if result.reason is None else _describe_failure(result, result.reason, problem),
         **find_unread(problem)._asdict(),
     )
-
-
-def _list_largest(direction: FloatArray, names: Sequence[str]) -> tuple[tuple[str, float], ...]:
-    """Return the unknowns with the largest components of a direction (d,) of unit length, and these components."""
-    parts = np.abs(direction)
-    largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
-    return tuple((names[i], float(direction[i])) for i in largest)
 
 
 def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:

@@ -153,7 +153,7 @@ the horizon."""
 
 
 def minimize_cost(
-    evaluator: Evaluator,
+    source: Evaluator | Follower,
     theta: Any,
     hessian: HessianKind,
     tolerance: float,
@@ -161,17 +161,18 @@ def minimize_cost(
     callback: Callable[[IterationRecord], object] | None = None,
     constraints: LinearConstraints | None = None,
     multipliers: Sequence[float] | None = None,
-    follower: Follower | None = None,
 ) -> Result:
-    """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
+    """Run the optimizer once on the meshes of an evaluator; arguments as in `estimate`.
 
-    With a `follower` of the evaluator, meshes are made anew where they are too coarse: its own are then those of the
+    With a follower of one in its place, meshes are made anew where they are too coarse: its own are then those of the
     result.
 
     `constraints` are by default those of the problem. The arrow shape of the Hessian of several runs is used where that
     is faster, and never with guards or terminal constraints, whose `multipliers` may be known from a fit on other
     meshes.
     """
+    follower = source if isinstance(source, Follower) else None
+    evaluator = source.evaluator if isinstance(source, Follower) else source
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
@@ -183,7 +184,6 @@ def minimize_cost(
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
 
-    source = evaluator if follower is None else follower
     evaluate_theta: Callable[..., Evaluation[Any]] = source
     if by_blocks and hessian not in ("none", "descent-first"):
         evaluate_theta = source.arrow

@@ -109,7 +109,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     InputError
         If the problem cannot be built again, or its data are no longer those that were fitted.
     """
-    given = check_provenance(path, load_saved(path).provenance)
+    given = check_provenance(path, load_saved(path)[2])
     loaded, where = rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):

@@ -449,7 +449,6 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         asked = _check_times(times, problem, experiment)
         mesh = evaluator.meshes[experiment]
         if asked.max() > fit.trajectories[experiment].times[-1]:
-            _require_covariance(estimate)
             points = _simulate_beyond(problem, experiment, fit.theta, mesh, asked)
         else:
             points = compute_sensitivity(problem, experiment, fit.theta, mesh.insert(asked)).at(asked)

@@ -145,9 +145,8 @@ class Profile(Tabular, Displayed):
         self.value, self.standard_error = float(fit.theta[k]), float(fit.standard_errors[k])
         runs = [e for e, place in list_transitions(evaluator.problem) if place == k]  # that of a transition time
         self.sample_times = list_sample_times(evaluator.problem, fit.theta, runs[0]) if runs else np.zeros(0)
-        self._evaluator, self._constraints = evaluator.halved, evaluator.problem.constraints
-        self._scale = fit.variance_scale
-        self._follower = Follower(self._evaluator)
+        self._constraints, self._scale = evaluator.problem.constraints, fit.variance_scale
+        self._follower = Follower(evaluator.halved)
         self._starts = {side: self._describe(fit.theta, self._follower(fit.theta, side), True) for side in (-1, 1)}
         self._centre = self._starts[1]
         self.points, self.fits = [self._centre], 0
@@ -242,10 +241,7 @@ class Profile(Tabular, Displayed):
         """
         threshold = self.fit.quantile(self.level if level is None else level)
         threshold *= self.widening if as_flag(corrected, "corrected") else 1.0
-        try:
-            return self._find_regions(threshold)
-        except KeyboardInterrupt:
-            return [(np.nan, np.nan)]
+        return self._find_regions(threshold)
 
     def interval(self, level: float | None = None, *, corrected: bool = False) -> tuple[float, float]:
         """Return the likelihood-ratio confidence interval that contains the estimate: (low, high).
@@ -351,15 +347,7 @@ class Profile(Tabular, Displayed):
         self.fits += 1
         try:
             begin = nearest_feasible(held, np.clip(start, lower, upper))
-            result = minimize_cost(
-                self._evaluator,
-                begin,
-                "exact",
-                self.fit.tolerance,
-                ITERATIONS,
-                constraints=held,
-                follower=self._follower,
-            )
+            result = minimize_cost(self._follower, begin, "exact", self.fit.tolerance, ITERATIONS, constraints=held)
         except ValueError:  # infeasible by rounding
             return None
         if result.status is Status.INTERRUPTED or self._should_stop():
@@ -434,7 +422,9 @@ class Profile(Tabular, Displayed):
         step = float(find_first_root(np.array(rise), np.array(side * here.slope), np.array(here.curvature)))
         if len(points) > 1:
             return min(step, LONGEST_GROWTH * abs(last.value - points[-2].value))
-        return step if np.isfinite(step) else 1e-2 * self._size
+        # 1 % of the feasible range, or of the value.
+        span = self.limits[1] - self.limits[-1]
+        return step if np.isfinite(step) else 1e-2 * float(span if np.isfinite(span) else abs(self.value) or 1.0)
 
     def _add_next(self, side: int, last: Point, step: float, most: float) -> Point | None:
         """Return the next point outwards; the step is halved while a fit fails or zeta is above `most`."""
@@ -477,12 +467,6 @@ class Profile(Tabular, Displayed):
                 return
             self._insert(found)
             outer = found
-
-    @property
-    def _size(self) -> float:
-        """Typical size of the unknown: its feasible range, or its value."""
-        span = self.limits[1] - self.limits[-1]
-        return float(span if np.isfinite(span) else abs(self.value) or 1.0)
 
     # --- crossings of the threshold
 
@@ -586,21 +570,6 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
     evaluator = estimate.evaluator_at_solution()
-    check_has_profile(fit)
-    found = Profile(fit, evaluator, name, level)
-    with show_progress(callback, f"Profile of {name}") as report:
-        # Of as many fits as a profile usually takes.
-        found._should_stop = lambda: bool(report(found.fits, max(2 * (STEPS + LOOK_AHEAD + 2), found.fits)))
-        try:
-            found._find_regions(fit.quantile(level))
-        except KeyboardInterrupt:
-            found._interrupted = True
-    found._should_stop = lambda: False
-    return found
-
-
-def check_has_profile(fit: Fit) -> None:
-    """Raise ValueError unless a fit is a minimum with a noise model, as profiles and regions need."""
     if not fit.status.successful:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.constraints:
@@ -614,3 +583,13 @@ def check_has_profile(fit: Fit) -> None:
         raise ValueError(
             f"sigma is unknown and {fit.samples} values are too few to estimate it along with the unknowns."
         )
+    found = Profile(fit, evaluator, name, level)
+    with show_progress(callback, f"Profile of {name}") as report:
+        # Of as many fits as a profile usually takes.
+        found._should_stop = lambda: bool(report(found.fits, max(2 * (STEPS + LOOK_AHEAD + 2), found.fits)))
+        try:
+            found._find_regions(fit.quantile(level))
+        except KeyboardInterrupt:
+            found._interrupted = True
+    found._should_stop = lambda: False
+    return found

@@ -28,7 +28,7 @@ at any level.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -411,8 +411,9 @@ def trace_profiles(
         return nothing
     if any(mesh.has_layers for mesh in evaluator.meshes):
         return nothing
-    movable, kinks = _find_movable(fit), {kink.unknown for kink in fit.kinks}
-    at, places = fit.theta[None], []
+    # Unknowns that are free one by one, and have an effect on J.
+    movable = (np.sum(fit.free_basis**2, axis=1) > 1 - 1e-9) & fit.hessian.any(axis=1)
+    kinks, at, places = {kink.unknown for kink in fit.kinks}, fit.theta[None], []
     ways: list[Walks] = []
     for e, k in list_transitions(problem):
         samples = stack_sample_times(problem, at, e)
@@ -459,12 +460,6 @@ def is_any_near(samples: FloatArray, values: FloatArray, errors: FloatArray) -> 
     with np.errstate(invalid="ignore"):
         near = np.abs(samples - values[:, None]) <= NEAR * errors[:, None]
     return np.asarray((errors > 0) & near.any(axis=1))
-
-
-def _find_movable(fit: Fit) -> Any:
-    """Return which unknowns are free one by one, and have an effect on J: (d,) of bool."""
-    Z = fit.free_basis
-    return (np.sum(Z * Z, axis=1) > 1 - 1e-9) & fit.hessian.any(axis=1)
 
 
 def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArray:
