@@ -73,6 +73,9 @@ class Derivatives(NamedTuple):
     hessian: FloatArray
 
 
+Evaluate = Callable[[NDArray[np.intp], FloatArray], Derivatives]
+
+
 class Walks(NamedTuple):
     """W ways from estimates of transition times, each to one side.
 
@@ -207,23 +210,15 @@ def join_walks(ways: Sequence[Walks]) -> Walks:
     return Walks(*map(np.concatenate, zip(*ways, strict=True)))
 
 
-def trace_walks(
-    walks: Walks,
-    start: Derivatives,
-    smooth: NDArray[np.bool_],
-    evaluate: Callable[[NDArray[np.intp], FloatArray], Derivatives],
-    most: int,
-) -> FloatArray:
+def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -> FloatArray:
     """Go all ways up to their thresholds: pieces (W, `most`, 5), outwards, NaN behind the last, which has no end of its
     own: it holds up to the limit.
 
     Parameters
     ----------
     walks : Walks
-    start : Derivatives
-        Where they begin.
-    smooth : (W,) bool
-        Whether J has one derivative there; if not, that to the side of the way is evaluated.
+    cost : (W,)
+        J where they begin.
     evaluate : callable
         ``evaluate(which, thetas)`` returns the derivatives of some ways (n,) at thetas (n, d), to their sides.
     most : int
@@ -234,13 +229,9 @@ def trace_walks(
     passed, halvings, repeats = np.zeros((3, count), dtype=int)
     theta = walks.theta.copy()
     going = np.arange(count)
-    # One piece a turn for all ways that go on. `at` has derivatives where each stands; `new` says which are to be
-    # evaluated.
-    new, at = ~smooth, Derivatives(*(each.copy() for each in start))
+    # One piece a turn for all ways that go on.
     while going.size:
-        if new.any():
-            for known, found in zip(at, evaluate(going[new], theta[going[new]]), strict=True):
-                known[new] = found
+        at = evaluate(going, theta[going])
         # Ways whose derivatives are not finite end here; what they have so far is kept.
         sound = np.all(np.abs(at.gradient) < LARGEST, axis=1) & np.isfinite(at.hessian).all(axis=(1, 2))
         going, at = going[sound], Derivatives(*(each[sound] for each in at))
@@ -254,7 +245,7 @@ def trace_walks(
         # wrong.
         repeat = ~lost & (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
         piece = np.column_stack(
-            [value, own.stops[each, passed[going]], height - start.cost[going], own.side * slope, curvature]
+            [value, own.stops[each, passed[going]], height - cost[going], own.side * slope, curvature]
         )
         # A piece ends at the next stop, or halfway to the threshold where it is not to be trusted as far as that.
         halfway = _find_halfway(piece, pieces[going, kept[going] - 1], own.threshold, own.side)
@@ -275,8 +266,6 @@ def trace_walks(
         moved[each, own.place] = there
         theta[going] = moved
         going = going[~last]
-        new = np.ones(going.size, dtype=bool)
-        at = Derivatives(*(found[~last] for found in at))
     return pieces
 
 
@@ -429,11 +418,8 @@ def trace_profiles(
         found = [follower(theta, side) for theta, side in zip(thetas, walks.side[which].tolist(), strict=True)]
         return Derivatives(*(np.array([getattr(one, name) for one in found]) for name in Derivatives._fields))
 
-    count = len(walks.place)
-    start = Derivatives(*(np.array([each] * count) for each in (fit.cost, fit.gradient, fit.hessian)))
-    smooth = np.zeros(count, dtype=bool)
     most = MOST_PIECES + MOST_HALVINGS + 1
-    pieces = trace_walks(walks, start, smooth, evaluate, most).reshape(-1, 2, most, PIECE)
+    pieces = trace_walks(walks, np.full(len(walks.place), fit.cost), evaluate, most).reshape(-1, 2, most, PIECE)
     known = ~np.isnan(pieces[..., 0])
     complete = known[:, :, 0].all(axis=1)
     return pieces[complete, :, : int(known.sum(axis=2).max())], np.array(places)[complete]
