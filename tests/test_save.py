@@ -187,13 +187,6 @@ def test_a_file_in_the_repository_prints_the_same_report_as_ever():
     )
 
 
-def test_a_link_stays_one(tmp_path):
-    (tmp_path / "link.json").symlink_to(tmp_path / "fit.json")
-    save_fit(made(), CERTIFICATE, tmp_path / "link.json")
-    assert (tmp_path / "link.json").is_symlink()
-    assert load_saved(tmp_path / "fit.json")[0].cost == 28.0
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

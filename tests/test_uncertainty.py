@@ -229,7 +229,6 @@ def test_correlated_residuals_are_worth_fewer():
     assert found.effective == pytest.approx(2000 * 0.4 / 1.6, rel=0.15)
     fit = made(comparisons=((diagnostics_of(residual),),), cost=2000.0, sigma_known=False)
     (warning,) = warnings_of(fit)
-    assert warning.startswith("Neighbouring residuals are correlated in X (0.")
     assert f"too small by a factor of up to {found.narrowing:.2g}." in warning
 
 
@@ -283,14 +282,6 @@ def test_a_channel_met_exactly_and_a_short_one():
 
 
 # The certificate
-
-
-def test_a_good_certificate():
-    certificate = sf.estimate(noisy_decay(0.1)).certificate
-    assert certificate.passed
-    assert certificate.failures == ()
-    assert certificate.taylor_orders[1:] == pytest.approx((2.0, 3.0), abs=0.1)
-    assert str(certificate).splitlines()[-1].split() == ["verdict", "passed"]
 
 
 def shift_derivatives(monkeypatch, method, *, gradient=0.0, hessian=0.0):
