@@ -306,9 +306,9 @@ class Profile(Tabular, Displayed):
         return size if point.value > self.value else -size
 
     def _list_side(self, side: int) -> list[Point]:
-        """Return the points of one side from the estimate outwards, the estimate first."""
-        chosen = [q for q in self.points if side * (q.value - self.value) >= 0]
-        return sorted(chosen, key=lambda q: side * q.value)
+        """Return the points of one side from the estimate outwards, the estimate first, with its derivatives there."""
+        beyond = [q for q in self.points if side * (q.value - self.value) > 0]
+        return [self._starts[side], *beyond[::side]]
 
     # --- adding points
 
@@ -415,11 +415,10 @@ class Profile(Tabular, Displayed):
     def _choose_step(self, side: int, last: Point, spacing: float) -> float:
         """Return the step after which zeta should have risen by the spacing, by the derivatives."""
         points = self._list_side(side)
-        here = last if len(points) > 1 else self._starts[side]
         # zeta^2 = 2 (J_p - J_0) / scale, so that zeta + spacing is reached where slope x + curvature x^2 / 2 has risen
         # by this.
-        rise = 0.5 * self._scale * (self._measure_zeta(here.cost) + spacing) ** 2 - (here.cost - self._centre.cost)
-        step = float(find_first_root(np.array(rise), np.array(side * here.slope), np.array(here.curvature)))
+        rise = 0.5 * self._scale * (self._measure_zeta(last.cost) + spacing) ** 2 - (last.cost - self._centre.cost)
+        step = float(find_first_root(np.array(rise), np.array(side * last.slope), np.array(last.curvature)))
         if len(points) > 1:
             return min(step, LONGEST_GROWTH * abs(last.value - points[-2].value))
         # 1 % of the feasible range, or of the value.
@@ -429,12 +428,11 @@ class Profile(Tabular, Displayed):
     def _add_next(self, side: int, last: Point, step: float, most: float) -> Point | None:
         """Return the next point outwards; the step is halved while a fit fails or zeta is above `most`."""
         limit = self.limits[side]
-        near = last if last is not self._centre else self._starts[side]
         for attempt in range(1, HALVINGS + 1):
             value = last.value + side * step
             if side * (value - limit) > -1e-3 * step:
                 value = limit
-            new = self._add(value, near)
+            new = self._add(value, last)
             if new is not None and new.converged and (attempt == HALVINGS or self._measure_zeta(new.cost) <= most):
                 return new
             self.points = [q for q in self.points if q is not new]
@@ -496,19 +494,14 @@ class Profile(Tabular, Displayed):
         """Return all intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
         for side in (-1, 1):
             self._follow(side, threshold)
-        points = list(self.points)
-        inside = [abs(self._compute_zeta(q)) <= threshold for q in points]
-        low = self._get_open_end(-1) if inside[0] else None
-        found: list[tuple[float, float]] = []
-        for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
-            if a_in != b_in:
-                edge = self._find_crossing(a, b, threshold)
-                if b_in:
-                    low = edge
-                elif low is not None:
-                    found.append((low, edge))
-                    low = None
-        return found if low is None else [*found, (low, self._get_open_end(1))]
+        inside = [abs(self._compute_zeta(q)) <= threshold for q in self.points]
+        pairs = zip(pairwise(self.points), pairwise(inside), strict=True)
+        edges = [self._find_crossing(a, b, threshold) for (a, b), (here, there) in pairs if here != there]
+        if inside[0]:
+            edges.insert(0, self._get_open_end(-1))
+        if inside[-1]:
+            edges.append(self._get_open_end(1))
+        return list(zip(edges[::2], edges[1::2], strict=True))
 
     def _get_open_end(self, side: int) -> float:
         """Return the end of a region on a side where the threshold was not crossed."""
