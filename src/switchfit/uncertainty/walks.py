@@ -244,17 +244,18 @@ def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -
         # Another Newton step of the others first, where the one just found would lower J by more than the piece may be
         # wrong.
         repeat = ~lost & (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
-        piece = np.column_stack(
-            [value, own.stops[each, passed[going]], height - cost[going], own.side * slope, curvature]
-        )
+        rise, steepness = height - cost[going], own.side * slope
+        ahead = find_first_root(own.threshold - rise, steepness, curvature)
+        reach = np.where(rise >= own.threshold, 0.0, ahead)  # how far it is to the threshold
+        piece = np.column_stack([value, own.stops[each, passed[going]], rise, steepness, curvature])
         # A piece ends at the next stop, or halfway to the threshold where it is not to be trusted as far as that.
-        halfway = _find_halfway(piece, pieces[going, kept[going] - 1], own.threshold, own.side)
+        halfway = _find_halfway(piece, pieces[going, kept[going] - 1], reach, own.threshold, own.side)
         cut = ~repeat & (halvings[going] < MOST_HALVINGS) & ~np.isnan(halfway)
         piece[cut, 1] = halfway[cut]
         passed[going] += ~repeat & ~cut
         halvings[going] += cut
         repeats[going] = np.where(repeat, repeats[going] + 1, 0)
-        ended = _is_end_inside(piece, own.threshold, own.side) | np.isnan(own.stops[each, passed[going]])
+        ended = (reach <= own.side * (piece[:, 1] - value)) | np.isnan(own.stops[each, passed[going]])
         last = lost | (~repeat & ((~cut & ended) | (kept[going] == most - 1)))
         piece[last, 1] = own.limit[last]
         done = ~repeat & ~lost
@@ -300,29 +301,21 @@ def _solve_each(matrices: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _find_halfway(
-    pieces: FloatArray, before: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]
+    pieces: FloatArray, before: FloatArray, reach: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]
 ) -> FloatArray:
     """Return where pieces (n, 5) are cut off, halfway to where they reach the threshold; NaN if they hold to the end.
 
     A piece holds if it begins near the threshold, if it ends before it is halfway there, or if the piece before it, of
     NaN for the first one, was right about the rise here: errors of parabolas grow with the third power of their length.
     """
-    start, stop, rise, slope, curvature = pieces.T
+    start, stop, rise, _, _ = pieces.T
     begun, met, height, steepness, bend = before.T
-    reach = find_first_root(thresholds - rise, slope, curvature)
     length = sides * (met - begun)
     error = rise - (height + steepness * length + 0.5 * bend * length**2)
     with np.errstate(invalid="ignore"):  # a piece that never reaches it
         right = np.abs(error) * reach**3 <= RIGHT * thresholds * length**3
         holds = (rise >= NEAR_END**2 * thresholds) | (0.5 * reach >= sides * (stop - start)) | right
         return np.where(holds, np.nan, start + 0.5 * sides * reach)
-
-
-def _is_end_inside(pieces: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which pieces (n, 5) begin above the threshold, or reach it before they end."""
-    start, stop, rise, slope, curvature = pieces.T
-    reach = np.where(rise >= thresholds, 0.0, find_first_root(thresholds - rise, slope, curvature))
-    return np.asarray(reach <= sides * (stop - start))
 
 
 def find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
