@@ -470,7 +470,6 @@ def place_on_guards(problem: Problem, theta: FloatArray) -> tuple[Evaluator, Flo
     ValueError
         Without guards, or if no transition times near `theta` meet them.
     """
-    find_guards(problem)  # an error where there are none
     near = _solve_guards(Evaluator(problem, theta), theta)
     evaluator = Evaluator(problem, near)
     return evaluator, _solve_guards(evaluator, near)

@@ -495,8 +495,6 @@ def refuse_hidden_switches(
     matrix : {"exact", "gauss-newton", "none"}
         What is evaluated beside the gradient: by what a fit has compiled already.
     """
-    if gradient.all():
-        return
     unknowns = evaluator.problem.unknowns
     suspects = np.flatnonzero((gradient == 0.0) & ~unknowns.is_time).tolist()
     if not suspects:

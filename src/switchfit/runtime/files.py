@@ -159,8 +159,7 @@ def read_document(path: Path, what: str, form: str, version: int) -> dict[str, A
         raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != form:
         raise ValueError(f'{path} is not {what}: it has no entry "format": "{form}" at its top.')
-    given = content.get("version")
-    if type(given) is not int or given != version:
+    if (given := content.get("version")) != version:
         raise ValueError(
             f"{path} is {what} of version {given!r}; this switchfit reads version {version}. Read it with the "
             "switchfit that wrote it."

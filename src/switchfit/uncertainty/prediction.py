@@ -42,7 +42,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import select_visible
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, influence
+from switchfit.problem.data import FloatArray, influence
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import count_times, show_time
 from switchfit.problem.parameter import Parameter, unit_suffix
@@ -172,12 +172,12 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     Parameters
     ----------
     problem : Problem
-        With Measurements; no delay of it is a parameter.
+        With Measurements and no reference signals; no delay of it is a parameter.
     sensitivities : sequence of Sensitivity, one per experiment
     """
     columns: list[tuple[NDArray[Any], ...]] = []
     for e, (experiment, found) in enumerate(zip(problem.experiments, sensitivities, strict=True)):
-        first = sum(q for _, q in problem.structures[e].references)
+        first = 0
         for k, item in enumerate(experiment.measurements):
             points, there = found.at(item.seen_times), ~np.isnan(item.values)
             channels = slice(first, first + item.values.shape[1])
@@ -230,11 +230,11 @@ class Prediction(Tabular):
     times : (K,) array, in `time_unit`
     states, state_errors : (K, n)
     outputs, output_errors : (K, q)
-        Outputs of the reference signals, then of the Measurements; their standard errors, as those of the states from
-        the corrected covariance where residuals are correlated.
+        Outputs of the Measurements; their standard errors, as those of the states from the corrected covariance where
+        residuals are correlated.
     noise : (K, q)
         Standard deviation of one sample: sigma (that of the sample nearest in time, if it varies); if sigma is unknown,
-        the root of the residual variance; NaN for reference signals.
+        the root of the residual variance.
     state_names, state_units, output_names : tuple of str
     time_unit : str
         Unit of the experiment's times.
@@ -534,16 +534,14 @@ def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArra
 
 def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     """Return the standard deviation of one sample of each output at each time: (K, q)."""
-    columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
-    compared = [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
-    for item, comparison in zip(compared, fit.comparisons[e], strict=True):
-        if isinstance(item, Measurements):
-            # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
-            unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
-            sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
-            halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
-            columns.append(sigma[np.searchsorted(halfway, times)])
-    return np.concatenate([np.zeros((len(times), 0)), *columns], axis=1)
+    columns = [np.zeros((len(times), 0))]
+    # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
+    unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
+    for item, comparison in zip(problem.experiments[e].measurements, fit.comparisons[e], strict=True):
+        sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
+        halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
+        columns.append(sigma[np.searchsorted(halfway, times)])
+    return np.concatenate(columns, axis=1)
 
 
 def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 
 MOST_HALVINGS = 3
@@ -126,8 +126,7 @@ def list_sample_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray
         With delays that are parameters.
     e : int, from 0
     """
-    items = [item for item in problem.experiments[e].data if isinstance(item, Measurements)]
-    known = [item.seen_times for item in items if not isinstance(item.delay, str)]
+    known = [item.seen_times for item in problem.experiments[e].measurements if not isinstance(item.delay, str)]
     return np.unique(np.concatenate([problem.late_times(theta, e), *known]))
 
 
