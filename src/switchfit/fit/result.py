@@ -715,20 +715,11 @@ def list_without_effect(fit: Fit) -> tuple[str, ...]:
     return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
 
 
-class ScaledSpectrum(NamedTuple):
-    """Eigenvalues (k,), ascending, and eigenvectors (d, k) of a Hessian scaled to unit curvature of each unknown.
-
-    `size` (d,) is the scaling: an eigenvector times it is a direction in theta.
-    """
-
-    values: FloatArray
-    vectors: FloatArray
-    size: FloatArray
-
-
 @one_thread()
-def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
-    """Return the scaled spectrum of a Hessian (d, d) on the directions Z (d, k), which need not be orthonormal.
+def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return eigenvalues (k,), ascending, and eigenvectors (d, k) of a Hessian (d, d) scaled to unit curvature of each
+    unknown, on the directions Z (d, k), which need not be orthonormal; and the scaling (d,): an eigenvector times it is
+    a direction in theta.
 
     Eigenvalues of the size of rounding, whose digits differ from processor to processor, are 0. NaN if the Hessian is
     not finite, or its numbers are near the limits of float64.
@@ -740,7 +731,7 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = basis.T @ (hessian * np.outer(size, size)) @ basis
     if not np.isfinite(scaled).all():
-        return ScaledSpectrum(np.full(len(scaled), np.nan), np.full(basis.shape, np.nan), size)
+        return np.full(len(scaled), np.nan), np.full(basis.shape, np.nan), size
     values, vectors = np.linalg.eigh(scaled)
     rounding = len(values) * np.finfo(float).eps * np.abs(values).max(initial=0.0)
-    return ScaledSpectrum(np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size)
+    return np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size

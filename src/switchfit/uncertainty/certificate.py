@@ -540,8 +540,7 @@ def analyse(
         return about
     flat = np.all(hessian == 0.0, axis=1).tolist()
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
-    spectrum = compute_scaled_spectrum(hessian, basis)
-    values, vectors = spectrum.values, spectrum.vectors
+    values, vectors, size = compute_scaled_spectrum(hessian, basis)
     # Unknowns on which the cost does not depend at all are reported separately.
     dead = np.array([n in without for n in names])
     kept = [k for k in range(len(values)) if not np.sum(vectors[dead, k] ** 2) > 0.5]
@@ -552,7 +551,7 @@ def analyse(
         v = vectors[:, k]
         # An eigenvector has no sign of its own: the largest entry is made positive.
         v = v * np.sign(v[np.argmax(np.abs(v))])
-        change, rises = _try_direction(spectrum.size * v, float(values[k]), theta, cost, about.rise)
+        change, rises = _try_direction(size * v, float(values[k]), theta, cost, about.rise)
         strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
         directions.append(Direction(float(values[k]), v, change, rises, tuple(names[i] for i in strong)))
     return replace(about, eigenvalues=values, without=without, directions=tuple(directions))
