@@ -6,10 +6,12 @@ import threading
 import time
 import types
 
+import numpy as np
 import pytest
 from test_strategy import FAR, thermostat
 
 import switchfit as sf
+from switchfit.batch.chunks import run_chunks
 from switchfit.runtime import progress
 from switchfit.runtime.progress import show_detail, show_line, show_progress
 
@@ -137,3 +139,33 @@ def test_a_notebook_shows_what_a_long_call_is_doing(monkeypatch, capfd):
     assert capfd.readouterr() == ("", "")
     ipython.get_ipython = lambda: None
     assert not progress.is_notebook()
+
+
+# --- a batch that is stopped ----------------------------------------------------------------------------------------------
+
+
+class Endless:
+    """Work whose second chunk takes very long."""
+
+    size = 1
+
+    def __init__(self):
+        self.released = threading.Event()
+
+    def __call__(self, runs):
+        if runs.start:
+            self.released.wait(60.0)
+        return {"run": np.array(runs)}
+
+    def fingerprint(self):
+        return "endless"
+
+
+def test_a_batch_that_is_stopped_does_not_wait_for_the_chunk_under_way():
+    work = Endless()
+    began = time.monotonic()
+    runs, _ = run_chunks(work, 2, progress=lambda done, total: True)
+    waited = time.monotonic() - began
+    work.released.set()
+    assert runs.tolist() == [0]
+    assert waited < 30.0, "as long as the chunk"
