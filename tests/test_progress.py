@@ -141,7 +141,7 @@ def test_a_notebook_shows_what_a_long_call_is_doing(monkeypatch, capfd):
     assert not progress.is_notebook()
 
 
-# --- a batch that is stopped ----------------------------------------------------------------------------------------------
+# A batch that is stopped
 
 
 class Endless:
