@@ -36,7 +36,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Mesh, merge_stiffness
+from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
@@ -447,11 +447,11 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         points = estimate.sensitivities[experiment].nodes
     else:
         asked = _check_times(times, problem, experiment)
-        mesh = evaluator.meshes[experiment]
         if asked.max() > fit.trajectories[experiment].times[-1]:
-            points = _simulate_beyond(problem, experiment, fit.theta, mesh, asked)
+            points = _simulate_beyond(problem, experiment, fit.theta, asked)
         else:
-            points = compute_sensitivity(problem, experiment, fit.theta, mesh.insert(asked)).at(asked)
+            mesh = evaluator.meshes[experiment].insert(asked)
+            points = compute_sensitivity(problem, experiment, fit.theta, mesh).at(asked)
     return build_prediction(estimate, problem, experiment, points)
 
 
@@ -498,11 +498,8 @@ def _require_covariance(fit: Any) -> FloatArray:
     return np.asarray(fit.corrected_covariance)
 
 
-def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, times: FloatArray) -> Points:
-    """Return states and outputs at times (K,), some of them after tf, with their derivatives in theta.
-
-    Up to tf the mesh is that of the fit; after it, it is refined anew.
-    """
+def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, times: FloatArray) -> Points:
+    """Return states and outputs at times (K,), some of them after tf, with their derivatives in theta."""
     experiment = problem.experiments[e]
     tf, last = experiment.end, float(times.max())
     if isinstance(experiment.tf, Parameter):
@@ -519,11 +516,7 @@ def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, ti
         ) from error
     runs = [longer if k == e else run for k, run in enumerate(problem.experiments)]
     extended = replace(problem, experiments=runs)
-    refined = refine_mesh(extended, e, theta)
-    after = refined.times[refined.times > tf]
-    stiffness = merge_stiffness(refined.stiffness, mesh.stiffness)
-    whole = Mesh.from_times(np.concatenate([mesh.times, after, times]), stiffness)
-    return compute_sensitivity(extended, e, theta, whole).at(times)
+    return compute_sensitivity(extended, e, theta, refine_mesh(extended, e, theta).insert(times)).at(times)
 
 
 def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
