@@ -11,7 +11,7 @@ import pytest
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.faults import explain_nonfinite
+from switchfit.fit.solution import explain_nonfinite
 from switchfit.problem.inspection import find_undefined
 from switchfit.runtime.errors import NotIntegrableError
 

@@ -109,10 +109,3 @@ def test_the_scheme_of_the_paper_descends_until_the_hessian_is_positive_definite
         step / np.linalg.norm(step), -start.gradient / np.linalg.norm(start.gradient), atol=1e-12
     )
     assert found.iterations - first <= 10
-
-
-def test_steepest_descent_is_slow():
-    steepest = sf.estimate(tracked_drive(), hessian="none", max_iterations=100)
-    assert steepest.status is sf.Status.MAX_ITERATIONS
-    assert steepest.optimality > 1e-3
-    assert steepest.cost < steepest.history[0].cost / 5

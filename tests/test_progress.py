@@ -6,10 +6,12 @@ import threading
 import time
 import types
 
+import numpy as np
 import pytest
 from test_strategy import FAR, thermostat
 
 import switchfit as sf
+from switchfit.batch.chunks import run_chunks
 from switchfit.runtime import progress
 from switchfit.runtime.progress import show_detail, show_line, show_progress
 
@@ -30,11 +32,11 @@ def open_terminal(monkeypatch):
     return stream
 
 
-def wait_for(text, stream, seconds=5.0):
+def wait_for(text, read, seconds=5.0):
     end = time.monotonic() + seconds
-    while text not in stream.getvalue() and time.monotonic() < end:
+    while text not in read() and time.monotonic() < end:
         time.sleep(0.01)
-    return text in stream.getvalue()
+    return text in read()
 
 
 def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
@@ -43,16 +45,16 @@ def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
     with show_line("begins") as line:
         assert line.is_started  # a fit writes to it
         assert not progress.Line("no terminal").is_started
-        assert wait_for("begins   ", terminal)
+        assert wait_for("begins   ", terminal.getvalue)
         line.write("many starts", 3.0)
         show_detail("start 3 of at most 127", 2.0)
-        assert wait_for("many starts, lowest J = 2, start 3 of at most 127   ", terminal)
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127   ", terminal.getvalue)
         line.write("other")
-        assert wait_for("other   ", terminal)
+        assert wait_for("other   ", terminal.getvalue)
     assert terminal.getvalue().endswith("\x1b[2K")  # the line is erased
     with show_progress(lambda done, total: done, "runs") as report:
         assert report(3, 4) == 3
-        assert wait_for("runs, 3/4, 0 s left", terminal)
+        assert wait_for("runs, 3/4, 0 s left", terminal.getvalue)
     for thread in set(threading.enumerate()) - before:
         thread.join(5.0)
         assert not thread.is_alive()
@@ -61,7 +63,7 @@ def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
 def test_calls_inside_another_one_and_other_threads_show_nothing(monkeypatch):
     terminal = open_terminal(monkeypatch)
     with show_line("outer"):
-        assert wait_for("outer", terminal)
+        assert wait_for("outer", terminal.getvalue)
         with show_line("inner"):
             show_detail("deeper")
             time.sleep(0.3)
@@ -118,25 +120,52 @@ def test_a_notebook_shows_what_a_long_call_is_doing(monkeypatch, capfd):
     monkeypatch.setattr(progress, "DELAY", 0.0)
     monkeypatch.setattr(progress, "REDRAW", 0.001)
 
-    def wait_for(text):
-        end = time.monotonic() + 5.0
-        while not (found := any(text in html for html in shown)) and time.monotonic() < end:
-            time.sleep(0.005)
-        return found
+    def read():
+        return "\n".join(shown)
 
     with progress.show_line("looks for <modes>") as line:
-        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s")
+        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s", read)
         line.write("many starts", 3.0)
         progress.show_detail("start 3 of at most 127", 2.0)
-        assert wait_for("many starts, lowest J = 2, start 3 of at most 127")
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127", read)
     assert shown[-1] == ""
     count = len(shown)
     time.sleep(0.1)
     assert len(shown) == count, "drawn after its end"
     with progress.show_progress(lambda done, total: done, "Profile of <k>") as report:
         assert report(1, 4) == 1
-        assert wait_for('<progress value="1" max="4"></progress> Profile of &lt;k&gt;, 1/4, 0 s left')
+        assert wait_for('<progress value="1" max="4"></progress> Profile of &lt;k&gt;, 1/4, 0 s left', read)
     assert shown[-1] == ""
     assert capfd.readouterr() == ("", "")
     ipython.get_ipython = lambda: None
     assert not progress.is_notebook()
+
+
+# A batch that is stopped
+
+
+class Endless:
+    """Work whose second chunk takes very long."""
+
+    size = 1
+
+    def __init__(self):
+        self.released = threading.Event()
+
+    def __call__(self, runs):
+        if runs.start:
+            self.released.wait(60.0)
+        return {"run": np.array(runs)}
+
+    def fingerprint(self):
+        return "endless"
+
+
+def test_a_batch_that_is_stopped_does_not_wait_for_the_chunk_under_way():
+    work = Endless()
+    began = time.monotonic()
+    runs, _ = run_chunks(work, 2, progress=lambda done, total: True)
+    waited = time.monotonic() - began
+    work.released.set()
+    assert runs.tolist() == [0]
+    assert waited < 30.0, "as long as the chunk"

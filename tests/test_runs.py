@@ -228,10 +228,10 @@ def tank(e, samples=25, sigma=0.02, seed=0, names=None, **given):
     )
 
 
-def tanks(count, samples=None, **given):
+def tanks(count, samples=None, system=TANK, **given):
     guess = {"k": 1.0, "c": 0.2} | {f"r_{e}": sf.Parameter(0.5, lower=0.0, upper=3.0) for e in range(count)}
     runs = [tank(e, samples=25 if samples is None else samples[e], **given) for e in range(count)]
-    return sf.Problem(TANK, runs, guess)
+    return sf.Problem(system, runs, guess)
 
 
 @pytest.fixture(scope="module")
@@ -288,30 +288,18 @@ def test_one_program_for_ten_runs_of_different_lengths():
     """For the first of them, and nothing for the others, nor for the ten together."""
     samples = [29, 37, 31, 42, 51, 38, 49, 54, 59, 33]
 
-    def compiled(call):
+    def compiled(problem):
         before = _program_of.cache_info().misses
-        call()
+        sf.evaluate(problem)
+        sf.estimate(problem, max_iterations=1)
         return _program_of.cache_info().misses - before
 
-    def blank(t, x, p):
-        return 1.0 * fall(t, x, p)
-
-    global TANK  # new functions, which nothing has compiled before
-    before = TANK
-    try:
-        TANK = sf.HybridSystem({"fall": blank, "rise": rise}, [0.0], state_names=("h",))
-        problem = tanks(10, samples)
-        assert len(set(problem.structures)) == 1
-        assert compiled(lambda: evaluated(problem)) == 1
-        assert compiled(lambda: evaluated(tanks(10, samples[::-1]))) == 0
-        assert compiled(lambda: evaluated(tanks(12, [*samples, 40, 45]))) == 0
-    finally:
-        TANK = before
-
-
-def evaluated(problem):
-    sf.evaluate(problem)
-    sf.estimate(problem, max_iterations=1)
+    new = sf.HybridSystem({"fall": lambda t, x, p: 1.0 * fall(t, x, p), "rise": rise}, [0.0], state_names=("h",))
+    problem = tanks(10, samples, new)
+    assert len(set(problem.structures)) == 1
+    assert compiled(problem) == 1
+    assert compiled(tanks(10, samples[::-1], new)) == 0
+    assert compiled(tanks(12, [*samples, 40, 45], new)) == 0
 
 
 def test_common_lengths():

@@ -14,7 +14,7 @@ from test_cli import PROBLEM, ROOM
 from test_many_logs import log_of, run
 
 import switchfit as sf
-from switchfit.estimation.saved import describe_python_problem
+from switchfit.estimation.estimator import describe_python_problem
 from switchfit.io.problem_file import load_problem
 from switchfit.io.saved_problem import list_changed_models, load_with_problem
 from switchfit.models import heater_problem

@@ -314,10 +314,10 @@ def test_a_simulation_up_to_a_free_tf_and_times_outside():
     path = sf.simulate(problem, times=[0.0, 1.0, 1.7])
     np.testing.assert_allclose(path.states[:, 0], [0.0, 2.0, 3.4], rtol=1e-9)
     for given, times, message in (
-        (problem, [2.0], r"times must lie inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"),
+        (problem, [2.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"),
         (problem, "samples", "times='samples' needs data with samples, and experiment 0 has none"),
-        (heater_problem(), [-1.0], r"times must lie inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
-        (heater_problem(), [1.0, 1.0], "times must increase strictly; got 1.0 after 1.0"),
+        (heater_problem(), [-1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
+        (heater_problem(), [1.0, 1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got 1.0"),
         (heater_problem(), [], r"times must be finite numbers of shape \(K,\), or 'samples'; got shape \(0,\)"),
         (heater_problem(), [np.nan], "times must be finite numbers"),
         (heater_problem(), "sample", "times must be 'samples'; got 'sample'|times must be .*samples"),

@@ -15,8 +15,8 @@ from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
 from switchfit.report.sentences import format_share
-from switchfit.uncertainty.answers import Numbers, compare_with_sigma, find_doubts
-from switchfit.uncertainty.residuals import correct_correlation
+from switchfit.uncertainty.residuals import compare_with_sigma, correct_correlation
+from switchfit.uncertainty.verdict import Numbers, find_doubts
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 

@@ -23,23 +23,21 @@ from switchfit.batch.chunks import read_arrays, run_chunks, write_arrays
 from switchfit.batch.program import Limits
 from switchfit.batch.study import StudyOfLogs, list_places
 from switchfit.batch.verdict import count_priors, find_doubts, has_converged, judge_many, measure_variance
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimator import Estimate, parse_fit, write_fit
 from switchfit.estimation.local_fit import check_settings
-from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.faults import refuse_hidden_switches
 from switchfit.fit.result import interval, measure_quantile
+from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_callable, as_instance, as_level, as_path, as_sequence, join_names
+from switchfit.runtime.files import find_dtype, from_json, to_json
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.json_records import find_dtype, from_json, to_json
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 from switchfit.runtime.progress import show_progress
-from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.verdict import Verdict
+from switchfit.uncertainty.verdict import LEVELS, Doubt, Verdict, find_levels
 from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"

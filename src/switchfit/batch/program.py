@@ -42,7 +42,6 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit, Kink, Termination, inverse_on, termination_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Result, Status
-from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, Task, minimize_traced
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
@@ -463,9 +462,9 @@ class Batch:
             return Batch(problem, meshes, varying, limits)._give_data(k)
 
         has_own_times = len(varying) == len(jax.tree.leaves(self._base))
-        follower = None if has_own_times else Follower(self.evaluator, build)
-        hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
-        return minimize_cost(self.evaluator, start, hessian, *limits, follower=follower)
+        if has_own_times:
+            return minimize_cost(self.evaluator, start, "exact", *limits)
+        return minimize_cost(Follower(self.evaluator, build), start, "auto", *limits)  # fewer steps by a trust region
 
     def _finish_rest(self, outcome: Outcome, starts: FloatArray) -> Chunk:
         """Return the outcomes as a chunk; fits that did not settle are done by `minimize`, one by one.

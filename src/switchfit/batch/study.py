@@ -109,17 +109,15 @@ def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], ba
     if not lots:
         return found
     fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
-    smooth = chunk.status[fits] != AT_KINK
     # Other evaluations have to be compiled for this: it is done for kinks alone, where there is nothing else.
     if not batch.layout.natively:
-        kept = ~smooth
-        fits, rows, walks, smooth = fits[kept], rows[kept], Walks(*(each[kept] for each in walks)), smooth[kept]
+        kept = chunk.status[fits] == AT_KINK
+        fits, rows, walks = fits[kept], rows[kept], Walks(*(each[kept] for each in walks))
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
         return batch.evaluate(fits[which], thetas, walks.side[which])
 
-    start = Derivatives(chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits])
-    pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)
+    pieces = trace_walks(walks, chunk.cost[fits], evaluate, MOST_KEPT)
     found[fits, rows, (walks.side + 1) // 2] = pieces
     incomplete = np.isnan(found[:, :, :, 0, 0]).any(axis=2)
     found[incomplete] = np.nan

@@ -2,7 +2,7 @@
 
 Ten thousand fits cannot be simulated one by one. Each is judged by what its program returns (status, J, theta, the
 Hessian) and by the share of its data's variance that J leaves, by the rules of single fits
-(`switchfit.uncertainty.answers`), as if its residuals could not be tested. Not looked at are the correlation of the
+(`switchfit.uncertainty.verdict`), as if its residuals could not be tested. Not looked at are the correlation of the
 residuals, single channels, other starts, and checks of derivatives: fit one by itself for these.
 
 How well each of many fits explains its data, and where it ended: from J and theta alone, without a simulation.
@@ -29,9 +29,9 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import get_min_duration
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
-from switchfit.uncertainty import answers
-from switchfit.uncertainty.answers import FINE, HALF, LEVELS, UNLIKELY, Doubt, Level, Numbers, compare_with_sigma
-from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
+from switchfit.uncertainty import verdict
+from switchfit.uncertainty.residuals import HALF, UNLIKELY, compare_with_sigma
+from switchfit.uncertainty.verdict import FINE, LEVELS, Doubt, Finding, Level, Numbers, Verdict, build_verdict
 
 AT_END = 1e-9
 """Duration of a mode, as a part of the horizon, or distance from a bound, as a part of it, that counts as zero."""
@@ -138,14 +138,14 @@ def find_doubts(fits: Mapping[str, NDArray[Any]], sigma_known: bool | None, prio
     if has_shares and sigma_known:
         probability, known = compare_with_sigma(2 * fits["cost"], numbers.freedom, tests=len(status))
         numbers = replace(numbers, probability=probability, known=known)
-    return answers.find_doubts(numbers)
+    return verdict.find_doubts(numbers)
 
 
 def judge_many(fits: Any) -> Verdict:
     """Return the verdict on fits of many logs, or of anything in which each fit counts by itself."""
     R = len(fits.status)
     doubts = fits.doubts
-    levels = answers.find_levels(doubts, R)
+    levels = verdict.find_levels(doubts, R)
     counts: dict[str, float] = {level: float(np.sum(levels == level)) for level in LEVELS}
     stopped = list(_find_stop(fits))
     if not doubts and not stopped:

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower, constraint_errors, cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
-from switchfit.fit.faults import explain_nonfinite
-from switchfit.fit.result import termination_of
-from switchfit.fit.solution import minimize_cost
+from switchfit.fit.result import Termination, termination_of
+from switchfit.fit.solution import explain_nonfinite, minimize_cost
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
 from switchfit.optimize.matrix import Dense, null_space
@@ -95,9 +94,7 @@ def fit_locally(
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
         follower = Follower(finer)
-        following = minimize_cost(
-            finer, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers, follower=follower
-        )
+        following = minimize_cost(follower, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers)
         if attempt and following.status is Status.NONFINITE_START:  # what was found stays
             broken = finer, following
             break
@@ -125,19 +122,19 @@ def fit_locally(
         except NotIntegrableError:  # what was found stays, with its integration error
             break
     result = _drop_noise_of_times(problem, result)
-    found = _estimate(
-        problem,
-        evaluator,
-        result,
-        earlier,
-        history,
-        hessian,
-        _explain_nonfinite(*(broken or (evaluator, result))),
-        follower.has_rough_hessian,
+    ended = _describe_ending(evaluator, result, earlier, error)
+    if undefined := _explain_nonfinite(*(broken or (evaluator, result))):
+        ended = replace(ended, reason=undefined)
+    found = Estimate(
+        **vars(ended),
+        **_describe(problem),
+        **_describe_solution(evaluator, result, hessian),
         initial_theta=first,
+        history=tuple(history),
         evaluations=evaluations,
         trajectories=(),
         comparisons=(),
+        hessian_kind="sharp" if follower.has_rough_hessian and hessian in ("auto", "exact") else hessian,
         integration_error=error,
         integration_error_of=output,
         seconds=time.perf_counter() - began,
@@ -204,7 +201,8 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
         return result
     insignificant, hessian = _compute_insignificance(problem, result), result.hessian
     d = len(result.theta)
-    T = _list_horizons(problem)
+    lengths = [run.initial_length for run in problem.experiments]
+    T = problem.unknowns.put_at_times(np.full(d, np.inf), lengths)  # of times alone
     least = 2.0 * insignificant / T**2
     suspects = problem.unknowns.is_time & (np.abs(np.diag(hessian)) <= least)
     if not hessian[suspects].any():
@@ -220,13 +218,6 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
         return result
     kinks = tuple(kink for kink in result.kinks if not noise[kink[0]])
     return replace(result, status=Status.SINGULAR, hessian=cleaned, curvature=curvature, kinks=kinks)
-
-
-@keep_with_problem
-def _list_horizons(problem: Problem) -> FloatArray:
-    """Return the length of the horizon for each unknown that is a time, infinity for others: (d,)."""
-    lengths = [run.initial_length for run in problem.experiments]
-    return problem.unknowns.put_at_times(np.full(len(problem.theta_names), np.inf), lengths)
 
 
 def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
@@ -286,53 +277,37 @@ def refine_meshes(
     return Evaluator(evaluator.problem, start, theta)
 
 
-def _estimate(
-    problem: Problem,
-    evaluator: Evaluator,
-    result: Result,
-    earlier: int,
-    history: list[IterationRecord],
-    hessian: HessianKind,
-    undefined: Issue | None,
-    is_sharp: bool,
-    **rest: Any,
-) -> Estimate:
-    """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one.
-
-    `earlier` is the number of iterations on coarser meshes, `undefined` which function was not finite, if any. A model
-    may be too sharp for an exact Hessian: see `Follower`.
-    """
-    times, parameters = problem.split(result.theta)
-    exact = result.hessian
-    if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
-        exact = evaluator(result.theta).hessian
+def _describe_ending(evaluator: Evaluator, result: Result, earlier: int, error: float) -> Termination:
+    """Return how a fit ended, with an integration error; `earlier`: the number of iterations on coarser meshes."""
+    problem = evaluator.problem
     ended = termination_of(result, problem, earlier)
-    if undefined is not None:
-        ended = replace(ended, reason=undefined)
-    elif ended.reason is None:
+    if ended.reason is None:
         # Steps across a jump of a function are not accurate, however short, or its derivatives lack the jump.
-        is_rough = rest["integration_error"] > LARGE_INTEGRATION_ERROR
         for i, comparison in find_comparisons(problem).items():
-            if is_rough or _lacks_curvature(evaluator, result, i):
-                ended = replace(ended, reason=Issue("switch", (problem.theta_names[i], comparison)))
-                break
-    return Estimate(
-        **vars(ended),
-        **_describe(problem),
-        theta=result.theta,
-        transition_times=tuple(times),
-        parameters={name: np.array(value) for name, value in parameters.items()},
-        gradient=result.gradient,
-        hessian=exact,
-        constraints=result.equalities,
-        history=tuple(history),
-        free_basis=result.free_basis,
-        hessian_kind="sharp" if is_sharp and hessian in ("auto", "exact") else hessian,
-        engine=evaluator.engine,
-        problem=problem,
-        evaluator=evaluator,
-        **rest,
-    )
+            if error > LARGE_INTEGRATION_ERROR or _lacks_curvature(evaluator, result, i):
+                return replace(ended, reason=Issue("switch", (problem.theta_names[i], comparison)))
+    return ended
+
+
+def _describe_solution(evaluator: Evaluator, result: Result, hessian: HessianKind) -> dict[str, Any]:
+    """Return the fields of an Estimate at the solution: the exact Hessian even if the optimizer used another one.
+
+    A model may be too sharp for an exact Hessian: see `Follower`.
+    """
+    times, parameters = evaluator.problem.split(result.theta)
+    is_other = hessian in ("gauss-newton", "none") and np.isfinite(result.cost)
+    return {
+        "theta": result.theta,
+        "transition_times": tuple(times),
+        "parameters": {name: np.array(value) for name, value in parameters.items()},
+        "gradient": result.gradient,
+        "hessian": evaluator(result.theta).hessian if is_other else result.hessian,
+        "constraints": result.equalities,
+        "free_basis": result.free_basis,
+        "engine": evaluator.engine,
+        "problem": evaluator.problem,
+        "evaluator": evaluator,
+    }
 
 
 def _lacks_curvature(evaluator: Evaluator, result: Result, i: int) -> bool:

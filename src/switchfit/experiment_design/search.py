@@ -47,7 +47,7 @@ from switchfit.problem.validation import (
     join_names,
     shorten,
 )
-from switchfit.runtime.json_records import to_json, write_document
+from switchfit.runtime.files import to_json, write_document
 from switchfit.runtime.presentation import Printed, draw_figure, format_line, join_first
 
 if TYPE_CHECKING:

@@ -50,17 +50,13 @@ class Evaluator:
         Points at which the meshes are refined; the problem's initial guess if left out.
     meshes : sequence of Mesh, optional
         Meshes to use instead of refined ones.
-    finer : float
-        Multiplies the number of cells of refined meshes.
     """
 
-    def __init__(
-        self, problem: Problem, *thetas: FloatArray, meshes: Sequence[Mesh] | None = None, finer: float = 1.0
-    ) -> None:
+    def __init__(self, problem: Problem, *thetas: FloatArray, meshes: Sequence[Mesh] | None = None) -> None:
         self.problem = problem
         if meshes is None:
             points = thetas or (problem.initial_theta,)
-            meshes = [refine_mesh_of_run(run, *points, finer=finer) for run in self.runs]
+            meshes = [refine_mesh_of_run(run, *points) for run in self.runs]
         self.meshes = list(meshes)
         padded = self._pad_meshes()
         self._set_arguments([run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)])
@@ -117,7 +113,7 @@ class Evaluator:
         `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
         whole = self._add_runs(self._evaluate_experiments(theta, side, method, matrix), len(theta))
-        return self._add_priors(whole, theta, gauss_newton=matrix == "gauss-newton")
+        return self._add_priors(whole, theta, matrix)
 
     def constrained(self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0) -> Evaluation[FloatArray]:
         """Return cost and constraints, with the Hessian of the Lagrangian for the multipliers, (m,) or ()."""
@@ -143,15 +139,13 @@ class Evaluator:
         constraints, jacobian = np.concatenate([one.constraints for one in results]), np.concatenate(slopes)
         return Evaluation(cost, gradient, hessian, constraints, jacobian, _join_errors(results))
 
-    def _add_priors(
-        self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
-    ) -> Evaluation[FloatArray]:
+    def _add_priors(self, found: Evaluation[Any], theta: FloatArray, matrix: Matrix = "exact") -> Evaluation[Any]:
         """Return an evaluation with the priors in cost, gradient and Hessian."""
         if self._priors is None:
             return found
-        J, g, h = self._priors.evaluate(theta, gauss_newton=gauss_newton)
-        cost, gradient, hessian = found.cost + float(J), found.gradient + g, found.hessian + np.diag(h)
-        return replace(found, cost=cost, gradient=gradient, hessian=hessian)
+        J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
+        hessian = found.hessian.plus_diagonal(h) if isinstance(found.hessian, Arrow) else found.hessian + np.diag(h)
+        return replace(found, cost=found.cost + float(J), gradient=found.gradient + g, hessian=hessian)
 
     def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> Evaluation[Arrow]:
         """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
@@ -164,11 +158,8 @@ class Evaluator:
             part = np.zeros((size, size))
             np.add.at(part, (slots[:, None], slots), one.hessian[own[:, None], own])
             parts.append(part)
-        arrow = Arrow.of_runs(self.layout, parts)
-        if self._priors is not None:
-            J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
-            total, gradient, arrow = total + float(J), gradient + g, arrow.plus_diagonal(h)
-        return Evaluation(total, gradient, arrow, row_errors=_join_errors(results))
+        whole = Evaluation(total, gradient, Arrow.of_runs(self.layout, parts), row_errors=_join_errors(results))
+        return self._add_priors(whole, theta, matrix)
 
     @cached_property
     def layout(self) -> ArrowLayout:
@@ -243,14 +234,12 @@ class Evaluator:
         if method == "adjoint" and not is_covered_by_paper(self.problem):
             raise ValueError("the paper's equations have no TransitionCost: choose another method.")
         found = []
-        for e, (engine, structure, (tau, p)) in enumerate(
-            zip(self.engines, self.structures, self._vectors(theta), strict=True)
-        ):
-            evaluate = partial(self._evaluate_by, method, e, p=p, side=side, matrix=matrix)
+        for e, (tau, p) in enumerate(self._vectors(theta)):
+            engine, evaluate = self.engines[e], partial(self._evaluate_by, method, e, p=p, side=side, matrix=matrix)
             if isinstance(engine, SplitEngine):
                 found.append(engine.derivatives(tau, p, side, matrix, evaluate))
             else:
-                found.append(evaluate(structure, tau))
+                found.append(evaluate(self.structures[e], tau))
         return found
 
     def _evaluate_by(
@@ -454,7 +443,7 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
     evaluator, at = place_on_guards(problem, problem.check_theta(theta))
-    guarded, rows = find_guarded_places(problem), guard_rows(problem)
+    guarded, rows = find_guards(problem)
     # lam = -C_g^-T J_g, gradient Z'J', Hessian Z' D^2 (J + lam . c) Z
     here = evaluator.constrained(at)
     Z = find_free_directions(problem, here.jacobian)
@@ -481,7 +470,6 @@ def place_on_guards(problem: Problem, theta: FloatArray) -> tuple[Evaluator, Flo
     ValueError
         Without guards, or if no transition times near `theta` meet them.
     """
-    find_guarded_places(problem)  # an error where there are no guards
     near = _solve_guards(Evaluator(problem, theta), theta)
     evaluator = Evaluator(problem, near)
     return evaluator, _solve_guards(evaluator, near)
@@ -499,8 +487,8 @@ def find_free_directions(problem: Problem, jacobian: FloatArray) -> FloatArray:
     jacobian : (m, d)
         Of all constraints.
     """
-    guarded, C = find_guarded_places(problem), jacobian[guard_rows(problem)]
-    Z = np.delete(np.eye(jacobian.shape[1]), guarded, axis=1)
+    guarded, rows = find_guards(problem)
+    C, Z = jacobian[rows], np.delete(np.eye(jacobian.shape[1]), guarded, axis=1)
     Z[guarded] = -np.linalg.solve(C[:, guarded], np.delete(C, guarded, axis=1))
     return Z
 
@@ -508,8 +496,7 @@ def find_free_directions(problem: Problem, jacobian: FloatArray) -> FloatArray:
 def _solve_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Move the guarded transition times of `theta` onto their guards, by Newton's method."""
     problem = evaluator.problem
-    guarded, rows = find_guarded_places(problem), guard_rows(problem)
-    theta = theta.copy()
+    guarded, rows = find_guards(problem)
     for _ in range(ITERATIONS):
         here = evaluator.constrained(theta)
         c, C = here.constraints[rows], here.jacobian[np.ix_(rows, guarded)]
@@ -541,24 +528,23 @@ def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:
     return float(min(1.0, ROOM * np.min(np.maximum(room[closing], 0.0) / -change[closing], initial=np.inf)))
 
 
-def find_guarded_places(problem: Problem) -> NDArray[np.intp]:
-    """Return the positions in theta of the guarded transition times, in the order of the guards."""
+def find_guards(problem: Problem) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the positions in theta of the guarded transition times, and those of their guards among the constraints.
+
+    Raises
+    ------
+    ValueError
+        Without guards, or if a guarded time is fixed.
+    """
     places = [problem.places[e][list(s.guarded)] for e, s in enumerate(problem.structures)]
+    first = np.cumsum([0, *problem.constraint_counts])
+    rows = [first[e] + np.arange(len(s.guarded)) for e, s in enumerate(problem.structures)]
     found = np.concatenate(places).astype(np.intp)
     if len(found) == 0:
         raise ValueError("This problem has no guards: give sf.HybridSystem(guards={(before, after): g}).")
     if np.any(found < 0):
         raise ValueError("A transition with a guard cannot have a fixed time: its guard says when it happens.")
-    return found
-
-
-def guard_rows(problem: Problem) -> NDArray[np.intp]:
-    """Return the positions of the guards among the constraints."""
-    rows, last = [], 0
-    for count, structure in zip(problem.constraint_counts, problem.structures, strict=True):
-        rows.append(last + np.arange(len(structure.guarded)))
-        last += count
-    return np.concatenate(rows).astype(np.intp)
+    return found, np.concatenate(rows).astype(np.intp)
 
 
 NO_VARIATION = 1e-9

@@ -5,7 +5,7 @@ How a fit ended, as data from which the report writes its message.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
@@ -140,7 +140,9 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
     smallest: float = np.nan
     flat: tuple[tuple[str, float], ...] = ()
     if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status needs them
-        smallest, flat = result.smallest_eigenvalue, _list_largest(result.curvature.spectrum.lowest, names)
+        smallest, direction = result.smallest_eigenvalue, result.curvature.spectrum.lowest
+        largest = [i for i in np.argsort(-np.abs(direction), kind="stable") if abs(direction[i]) > SMALL_WEIGHT]
+        flat = tuple((names[i], float(direction[i])) for i in largest[:NAMED])
     return Termination(
         status=result.status,
         cost=result.cost,
@@ -157,13 +159,6 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         reason=None if result.reason is None else _describe_failure(result, result.reason, problem),
         **find_unread(problem)._asdict(),
     )
-
-
-def _list_largest(direction: FloatArray, names: Sequence[str]) -> tuple[tuple[str, float], ...]:
-    """Return the unknowns with the largest components of a direction (d,) of unit length, and these components."""
-    parts = np.abs(direction)
-    largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
-    return tuple((names[i], float(direction[i])) for i in largest)
 
 
 def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:
@@ -460,18 +455,9 @@ class Fit(Termination):
         for e, (run, trajectory, times, places) in enumerate(each):
             modes = [mode for mode, _, _ in trajectory.mode_spans]
             for i, (time, place) in enumerate(zip(times.tolist(), places.tolist(), strict=True)):
-                found.append(
-                    Transition(
-                        experiment=e,
-                        run="" if single else run,
-                        name=f"{'' if single else f'{run}.'}tau_{i + 1}",
-                        time=time,
-                        unit=trajectory.time_unit,
-                        before=modes[i],
-                        after=modes[i + 1],
-                        index=place if place >= 0 else None,
-                    )
-                )
+                name, label = (f"tau_{i + 1}", "") if single else (f"{run}.tau_{i + 1}", run)
+                index = place if place >= 0 else None
+                found.append(Transition(e, label, name, time, trajectory.time_unit, modes[i], modes[i + 1], index))
         return found
 
     @property
@@ -729,20 +715,11 @@ def list_without_effect(fit: Fit) -> tuple[str, ...]:
     return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
 
 
-class ScaledSpectrum(NamedTuple):
-    """Eigenvalues (k,), ascending, and eigenvectors (d, k) of a Hessian scaled to unit curvature of each unknown.
-
-    `size` (d,) is the scaling: an eigenvector times it is a direction in theta.
-    """
-
-    values: FloatArray
-    vectors: FloatArray
-    size: FloatArray
-
-
 @one_thread()
-def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
-    """Return the scaled spectrum of a Hessian (d, d) on the directions Z (d, k), which need not be orthonormal.
+def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return eigenvalues (k,), ascending, and eigenvectors (d, k) of a Hessian (d, d) scaled to unit curvature of each
+    unknown, on the directions Z (d, k), which need not be orthonormal; and the scaling (d,): an eigenvector times it is
+    a direction in theta.
 
     Eigenvalues of the size of rounding, whose digits differ from processor to processor, are 0. NaN if the Hessian is
     not finite, or its numbers are near the limits of float64.
@@ -754,7 +731,7 @@ def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectru
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = basis.T @ (hessian * np.outer(size, size)) @ basis
     if not np.isfinite(scaled).all():
-        return ScaledSpectrum(np.full(len(scaled), np.nan), np.full(basis.shape, np.nan), size)
+        return np.full(len(scaled), np.nan), np.full(basis.shape, np.nan), size
     values, vectors = np.linalg.eigh(scaled)
     rounding = len(values) * np.finfo(float).eps * np.abs(values).max(initial=0.0)
-    return ScaledSpectrum(np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size)
+    return np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size

@@ -6,6 +6,15 @@ If a collapsed mode lies between two intervals of the same mode, as B in (A, B, 
 position: to the integration error, J is constant as its two transition times move together. Nor does the cost depend on
 a parameter that acts in collapsed modes alone. Such unknowns are *idle*: no data determine them, and the curvature of J
 along them is that of the integration error, of either sign.
+
+Faults of a problem's functions: where one has no finite value or derivative, and switches hidden inside one.
+
+Switches hidden inside a function: a parameter that changes the cost while its derivative is zero everywhere.
+
+``jnp.where(t < p["t_on"], a, b)`` makes the cost jump each time ``t_on`` passes a stage of the integrator. Between the
+jumps the cost is constant, so that its derivative is zero, correctly. An optimizer would leave such a parameter at its
+guess without any warning. If the parameter has another effect too, its derivative is that of the other effect alone:
+then the line search fails at a jump, and `switchfit.fit.result` says so.
 """
 
 from __future__ import annotations
@@ -15,14 +24,17 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.rows import stages
 from switchfit.engine.native.engine import NativeEngine
-from switchfit.engine.protocol import Evaluation, Matrix
+from switchfit.engine.protocol import Evaluation, Matrix, Simulation
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.faults import list_changes, refuse_hidden_switches
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
 from switchfit.optimize.algebra import EPS
 from switchfit.optimize.matrix import Arrow
@@ -32,9 +44,11 @@ from switchfit.optimize.state import Finding
 from switchfit.optimize.threads import with_own_threads
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment, drop_jumps
-from switchfit.problem.inspection import find_unread
+from switchfit.problem.functions import Function, use_float64
+from switchfit.problem.inspection import find_comparisons, find_undefined, find_unread
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.unknowns import Variables
+from switchfit.runtime.errors import HiddenSwitchError, Issue
 
 CHANGES = (0.1, -0.1)
 """Relative changes of a parameter to test its effect; if it is 0, relative to the range between its bounds."""
@@ -139,7 +153,7 @@ the horizon."""
 
 
 def minimize_cost(
-    evaluator: Evaluator,
+    source: Evaluator | Follower,
     theta: Any,
     hessian: HessianKind,
     tolerance: float,
@@ -147,17 +161,18 @@ def minimize_cost(
     callback: Callable[[IterationRecord], object] | None = None,
     constraints: LinearConstraints | None = None,
     multipliers: Sequence[float] | None = None,
-    follower: Follower | None = None,
 ) -> Result:
-    """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
+    """Run the optimizer once on the meshes of an evaluator; arguments as in `estimate`.
 
-    With a `follower` of the evaluator, meshes are made anew where they are too coarse: its own are then those of the
+    With a follower of one in its place, meshes are made anew where they are too coarse: its own are then those of the
     result.
 
     `constraints` are by default those of the problem. The arrow shape of the Hessian of several runs is used where that
     is faster, and never with guards or terminal constraints, whose `multipliers` may be known from a fit on other
     meshes.
     """
+    follower = source if isinstance(source, Follower) else None
+    evaluator = source.evaluator if isinstance(source, Follower) else source
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
@@ -169,7 +184,6 @@ def minimize_cost(
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
 
-    source = evaluator if follower is None else follower
     evaluate_theta: Callable[..., Evaluation[Any]] = source
     if by_blocks and hessian not in ("none", "descent-first"):
         evaluate_theta = source.arrow
@@ -359,3 +373,168 @@ def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:
     slopes = evaluator.problem.unknowns.variables.slopes(result.theta)[0]
     basis = np.linalg.qr(slopes[:, None] * result.free_basis)[0]
     return replace(result, hessian=here.hessian, curvature=replace(result.curvature, basis=basis))
+
+
+_Visit = tuple[str, Function, Sequence[FloatArray]]
+"""A function's role, the function, and arguments with which it is called: times, states and inputs of N points each."""
+
+
+def explain_nonfinite(evaluator: Evaluator, theta: FloatArray) -> Issue | None:
+    """Return the first function whose value or derivatives are not finite along the trajectory, and where.
+
+    The subjects of the issue are its role, the operation, the line, and the name of the run if there are several. None
+    if no function is found: a state may grow without bound.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    """
+    problem = evaluator.problem
+    runs = problem.run_names if len(problem.experiments) > 1 else [""]
+    with np.errstate(all="ignore"):
+        simulations = evaluator.simulate(theta)
+    for e, (run, simulation) in enumerate(zip(runs, simulations, strict=True)):
+        model = Model(evaluator.structures[e], evaluator.arguments[e])
+        p: Any = problem.vectors(theta, e)[1]
+        parameters = model.parameters(p)
+        for role, function, arguments in _list_visits(model, p, simulation):
+            found = find_undefined(function, arguments, parameters)
+            if found is not None:
+                point = _describe_point([argument[found.point] for argument in arguments])
+                figures = point | {"order": float(found.order), "valued": float(found.valued)}
+                return Issue("undefined", (role, found.operation, found.line, run), figures)
+    return None
+
+
+def _describe_point(given: list[Any]) -> dict[str, float | tuple[float, ...]]:
+    """Return the time and the state among the arguments of a function, as far as it has them."""
+    timed = bool(given) and given[0].ndim == 0
+    figures: dict[str, float | tuple[float, ...]] = {"t": float(given[0])} if timed else {}
+    return figures | ({"x": tuple(given[timed].tolist())} if len(given) > timed else {})
+
+
+def _list_visits(model: Model, p: Any, simulation: Simulation) -> Iterator[_Visit]:
+    """Yield the functions that J calls, with their arguments; samples whose delay is estimated are left out.
+
+    All modes get as many points, so that a check is compiled once: rows of other modes are replaced by one of their
+    own.
+    """
+    structure, roles = model.structure, model.structure.roles
+    names = {function: role for role, function in reversed(roles.items())}
+
+    def visit(function: Function | None, *arguments: Any) -> Iterator[_Visit]:
+        if function is not None:
+            yield names[function], function, arguments
+
+    yield from visit(structure.initial_state)
+    rows = simulation.segments
+    segment = np.repeat(np.arange(len(rows)), [own.stop - own.start for own in rows])
+    modes = np.array(structure.mode_of_segment)[segment]
+    for mode in dict.fromkeys(modes.tolist()):
+        own = np.where(modes == mode, np.arange(len(modes)), np.argmax(modes == mode))
+        stages = _list_stages(model, p, simulation, mode, own, own - segment[own])
+        yield from visit(structure.modes[mode], *stages)
+    for k, row in enumerate(own.stop - 1 for own in rows[:-1]):
+        for functions in (structure.guards, structure.transition_costs, structure.reset_maps):
+            yield from visit(functions[k], simulation.end[[row]], simulation.after[[row]])
+    for function in (*structure.running, *(observe for observe, _ in structure.references)):
+        yield from visit(function, simulation.start, simulation.before)
+    times = np.append(simulation.start[:1], simulation.end)
+    states = np.vstack([simulation.before[:1], simulation.after])
+    for sensor, samples in zip(structure.measurements, model.arguments.samples, strict=True):
+        seen = np.isin(times, samples.time) if sensor.delay is None else np.zeros(len(times), bool)
+        if seen.any():
+            yield from visit(sensor.observe, times[seen], states[seen])
+    for function in (*structure.terminal, *structure.terminal_constraints):
+        yield from visit(function, states[-1:])
+
+
+def _list_stages(model: Model, p: Any, simulation: Simulation, mode: int, rows: Any, cells: Any) -> list[FloatArray]:
+    """Return times, states and inputs at which some rows, in some cells, evaluate their mode, in the order of time.
+
+    Those of implicit steps are taken to be the start and the end of the row.
+    """
+    tableau = model.tableaus[mode]
+
+    def evaluate(start: Any, end: Any, before: Any, after: Any, origin: Any, coefficients: Any) -> list[Any]:
+        piece, times, states = Piece(origin, coefficients), [start, end], [before, after]
+        if not tableau.coupled:
+            field = model.field(mode, piece)
+            times, states, _ = stages(tableau, lambda t, x: field(t, x, p), start, end, before)
+        points = [(t, x, *model.inputs(t, piece)) for t, x in zip(times, states, strict=True)]
+        return [jnp.stack(each) for each in zip(*points, strict=True)]
+
+    given = (simulation.start, simulation.end, simulation.before, simulation.after)
+    signals = np.asarray(model.arguments.nodes)[cells], np.asarray(model.arguments.signals)[cells]
+    with use_float64():
+        found = jax.jit(jax.vmap(evaluate))(*(values[rows] for values in given), *signals)
+    return [np.asarray(each).reshape(-1, *each.shape[2:]) for each in found]
+
+
+HIDDEN_CHANGES = (1e-3, 1e-2, 0.1, 0.5, -1e-3, -1e-2, -0.1, -0.5)
+"""Relative changes of a parameter that are tried; if it is 0, relative to the range between its bounds."""
+
+CHANGED = 1e-9
+"""Smallest relative change of the cost that is not rounding."""
+
+
+def refuse_hidden_switches(
+    evaluator: Evaluator, theta: FloatArray, gradient: FloatArray, matrix: Matrix = "none"
+) -> None:
+    """Raise HiddenSwitchError for a parameter whose derivative is exactly 0 although the cost depends on it.
+
+    The message names the place where a function compares with the parameter, if one is found in its trace.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    gradient : (d,)
+        Gradient at theta. If no entry is 0, nothing is evaluated.
+    matrix : {"exact", "gauss-newton", "none"}
+        What is evaluated beside the gradient: by what a fit has compiled already.
+    """
+    unknowns = evaluator.problem.unknowns
+    suspects = np.flatnonzero((gradient == 0.0) & ~unknowns.is_time).tolist()
+    if not suspects:
+        return
+    base = evaluator(theta, matrix=matrix).cost
+    hidden = [i for i in suspects if _is_hidden(evaluator, theta, i, base, matrix)]
+    if hidden:
+        shown = ", ".join(unknowns.names[i] for i in hidden)
+        seen = f"the cost changes with {shown}, but its derivative is zero at all points tried"
+        comparison = next(filter(None, map(find_comparisons(evaluator.problem).get, hidden)), None)
+        if comparison is None:
+            raise HiddenSwitchError(
+                f"{seen}, so that no fit can estimate it: let the model depend on it smoothly, or fix it."
+            )
+        raise HiddenSwitchError(
+            f"{seen}: {comparison}, and derivatives do not include such a switch. If it is a time, make it a "
+            "transition time: a mode for each side of it, both in mode_sequence, and its guess in transition_times. If "
+            "it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or fix "
+            "it."
+        )
+
+
+def list_changes(problem: Problem, theta: FloatArray, i: int, changes: Sequence[float]) -> Iterator[FloatArray]:
+    """Yield theta with unknown i changed by parts of its size, or of the range between its bounds if it is 0."""
+    lower, upper = problem.unknowns.lower[i], problem.unknowns.upper[i]
+    size = abs(theta[i]) or (upper - lower if np.isfinite(upper - lower) else 1.0)
+    for change in changes:
+        moved = theta.copy()
+        moved[i] = np.clip(theta[i] + change * size, lower, upper)
+        yield moved
+
+
+def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float, matrix: Matrix) -> bool:
+    """Return whether the cost changes with unknown i while its derivative is 0 at the changed values too."""
+    differs = False
+    for moved in list_changes(evaluator.problem, theta, i, HIDDEN_CHANGES):
+        there = evaluator(moved, matrix=matrix)
+        if not np.isfinite(there.cost):
+            continue
+        if there.gradient[i] != 0.0:
+            return False
+        differs = differs or abs(there.cost - base) > CHANGED * max(abs(base), abs(there.cost))
+    return differs

@@ -227,8 +227,13 @@ def simulate(
     mesh = refine_mesh_of_run(run, checked)
     mesh = mesh if asked is None else mesh.insert(asked)
     simulation = engine_of(run, run.build_arguments(mesh), mesh).simulate(*run.vectors(checked), tangents=False)
-    trajectory = _build_trajectory(problem, experiment, simulation)
-    return trajectory if asked is None else _select_times(trajectory, asked)
+    found = _build_trajectory(problem, experiment, simulation)
+    if asked is None:
+        return found
+    # The first of two nodes at one time; a free tf that rounding has put before the last time is the last node.
+    k = np.minimum(np.searchsorted(found.times, asked), len(found.times) - 1)
+    segments = np.searchsorted(k, found.segments)
+    return replace(found, times=found.times[k], states=found.states[k], modes=found.modes[k], segments=segments)
 
 
 def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike | Literal["samples"]) -> FloatArray:
@@ -248,30 +253,13 @@ def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike |
     asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
         raise ValueError(f"times must be finite numbers of shape (K,), or 'samples'; got shape {asked.shape}.")
-    wrong = np.diff(asked) <= 0
+    wrong = np.append(False, np.diff(asked) <= 0) | (asked < t0) | (asked > tf)
     if wrong.any():
-        k = int(wrong.argmax())
-        raise ValueError(f"times must increase strictly; got {asked[k + 1]} after {asked[k]}.")
-    outside = (asked < t0) | (asked > tf)
-    if outside.any():
         unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
         ends = f"[{show_time(experiment, t0)}, {show_time(experiment, tf)}]{unit}"
-        raise ValueError(f"times must lie inside [t0, tf] = {ends}; got {show_time(experiment, asked[outside][0])}.")
+        first = show_time(experiment, asked[wrong][0])
+        raise ValueError(f"times must increase strictly inside [t0, tf] = {ends}; got {first}.")
     return asked
-
-
-def _select_times(trajectory: Trajectory, asked: FloatArray) -> Trajectory:
-    """Return a trajectory at some of its nodes (K,); at a transition, just before it."""
-    # The first of two nodes at one time; a free tf that rounding has put before the last time is the last node.
-    places = np.minimum(np.searchsorted(trajectory.times, asked), len(trajectory.times) - 1)
-    segments = np.searchsorted(places, trajectory.segments)
-    return replace(
-        trajectory,
-        times=trajectory.times[places],
-        states=trajectory.states[places],
-        modes=trajectory.modes[places],
-        segments=segments,
-    )
 
 
 def compare(

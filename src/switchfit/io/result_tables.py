@@ -22,8 +22,7 @@ from switchfit.report.frames import ERROR
 from switchfit.report.sentences import write_reason
 from switchfit.runtime.frames import describe_frame
 from switchfit.runtime.presentation import format_count
-from switchfit.uncertainty.answers import UNLIKELY
-from switchfit.uncertainty.residuals import ChannelQuality, measure_quality
+from switchfit.uncertainty.residuals import UNLIKELY, ChannelQuality, measure_quality
 
 
 def list_unknowns(estimate: Estimate) -> list[dict[str, Any]]:

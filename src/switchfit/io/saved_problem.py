@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import Provenance, load_saved
+from switchfit.estimation.estimator import Estimate, Provenance, load_saved
 from switchfit.io.problem_file import load_problem
 from switchfit.io.problem_file.building import ProblemFile, digest_file
 from switchfit.problem.data import Measurements
@@ -110,7 +109,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     InputError
         If the problem cannot be built again, or its data are no longer those that were fitted.
     """
-    given = check_provenance(path, load_saved(path).provenance)
+    given = check_provenance(path, load_saved(path)[2])
     loaded, where = rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):

@@ -38,8 +38,8 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.runtime import special
-from switchfit.uncertainty.answers import NEARLY_ALL
 from switchfit.uncertainty.residuals import explain_all
+from switchfit.uncertainty.verdict import NEARLY_ALL
 
 CriterionName = Literal["bic", "mbic", "aicc", "cost"]
 CRITERIA: tuple[CriterionName, ...] = ("bic", "mbic", "aicc", "cost")

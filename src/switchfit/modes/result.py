@@ -25,7 +25,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
-from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
+from switchfit.runtime.files import from_json, read_document, to_json, write_document
 from switchfit.runtime.presentation import Displayed, Printed, draw_figure, format_line
 from switchfit.strategy.library import Library
 from switchfit.strategy.other_run import fix_unknowns

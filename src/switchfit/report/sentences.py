@@ -18,8 +18,8 @@ from switchfit.problem.inspection import name_whole_parameters
 from switchfit.problem.unknowns import Constraint
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import format_count, format_text, join_first
-from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY
-from switchfit.uncertainty.verdict import Verdict
+from switchfit.uncertainty.residuals import NO_RESIDUALS, UNLIKELY
+from switchfit.uncertainty.verdict import LEVELS, NEARLY_ALL, Verdict
 
 ALLOWED = "Standard errors allow for the correlation of the residuals."
 """Below a table whose standard errors are corrected."""

@@ -460,7 +460,7 @@ def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> Axes:
     limit = 1.96 / np.sqrt(max(len(channel.values), 1))
     ax.axhspan(-limit, limit, color=SHADE, alpha=0.15, linewidth=0)
     ax.axhline(0.0, color=TRANSITION, linewidth=THIN)
-    lags = np.arange(1, channel.lags + 1)
+    lags = np.arange(1, len(channel.autocorrelation) + 1)
     ax.vlines(lags, 0.0, channel.autocorrelation, color=FIT, linewidth=LINE)
     ax.plot(lags, channel.autocorrelation, "o", color=FIT, markersize=4)
     reach = max(1.3 * float(np.max(np.abs(channel.autocorrelation), initial=0.0)), 2 * limit)

@@ -1,13 +1,33 @@
-"""Write files atomically, say why one cannot be read, and set damaged files aside."""
+"""Write files atomically, say why one cannot be read, and set damaged files aside.
+
+Dataclasses as JSON that can be read without switchfit, and loaded without losing a bit.
+
+- numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
+  they are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``;
+- an array of float64 is a list, or a list of rows; any other, and an empty one, is
+  ``{"dtype": ..., "shape": ..., "values": [...]}``;
+- a status is its name; other dataclasses are objects with their fields.
+
+`from_json` checks what is read against the types of the dataclass's fields.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import json
 import os
 import secrets
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache
 from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.runtime.errors import InputError
 
@@ -46,11 +66,11 @@ def write_atomically(content: str | bytes, path: Path, *, sync: bool = True) -> 
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
-@contextlib.contextmanager
+@contextmanager
 def explain_read_errors(path: Path, what: str = "file", inside: str = "a file") -> Iterator[None]:
     """Return a context that turns an OSError into an InputError with the reason.
 
@@ -90,6 +110,193 @@ def set_aside(path: Path, reason: str, remedy: str) -> None:
     while target.exists():
         number += 1
         target = path.with_name(f"{path.name}.damaged-{number}")
-    with contextlib.suppress(FileNotFoundError):  # another process has renamed it already
+    with suppress(FileNotFoundError):  # another process has renamed it already
         path.rename(target)
     warnings.warn(f"{path} is damaged: {reason}. It is now {target.name}. {remedy}", stacklevel=2)
+
+
+NUMBERS = ("NaN", "Infinity", "-Infinity")
+"""Strings that stand for numbers."""
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def write_document(content: dict[str, Any], path: Path) -> None:
+    """Write JSON to a file, whole or not at all.
+
+    Parameters
+    ----------
+    content : dict
+    path : Path
+    """
+    write_atomically(_lay_out(content) + "\n", path)
+
+
+def read_document(path: Path, what: str, form: str, version: int) -> dict[str, Any]:
+    """Return the JSON object in a file, with its "format" and its "version" checked.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be, with its article, for messages.
+    form : str
+        The "format" that it must have.
+    version : int
+        The one that can be read.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    ValueError
+        If it is not valid JSON, of another format or of another version.
+    """
+    try:
+        content = json.loads(path.read_bytes().decode())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
+    if not isinstance(content, dict) or content.get("format") != form:
+        raise ValueError(f'{path} is not {what}: it has no entry "format": "{form}" at its top.')
+    if (given := content.get("version")) != version:
+        raise ValueError(
+            f"{path} is {what} of version {given!r}; this switchfit reads version {version}. Read it with the "
+            "switchfit that wrote it."
+        )
+    return content
+
+
+def _lay_out(value: Any, indent: str = "") -> str:
+    """Return JSON with one entry of an object or one row of an array on a line."""
+    deeper = indent + "  "
+    if isinstance(value, dict) and value:
+        entries = [f"{json.dumps(name)}: {_lay_out(entry, deeper)}" for name, entry in value.items()]
+    elif isinstance(value, list) and any(isinstance(entry, (dict, list)) for entry in value):
+        entries = [_lay_out(entry, deeper) for entry in value]
+    else:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    return f"{opening}\n{deeper}" + f",\n{deeper}".join(entries) + f"\n{indent}{closing}"
+
+
+# --- to JSON ----------------------------------------------------------------------------------------------------------
+
+
+def to_json(record: Any, kind: type) -> Any:
+    """Return a dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None.
+
+    Parameters
+    ----------
+    record : object
+    kind : type
+        Of the record, or a dataclass with some of its fields.
+    """
+    from pydantic_core import to_json as encode  # imported here, since that takes longer than a small fit
+
+    values = {f.name: getattr(record, f.name) for f in fields(kind)}
+    named = {name: value.name if isinstance(value, Enum) else value for name, value in values.items()}
+    return json.loads(encode(named, inf_nan_mode="strings", fallback=_encode_array))
+
+
+def _encode_array(value: Any) -> Any:
+    """Return an array as a list, or with its dtype and shape; TypeError for anything else."""
+    if not isinstance(value, np.ndarray):
+        raise TypeError(f"a {type(value).__name__} cannot be saved.")
+    if value.dtype == np.float64 and value.size > 0:
+        return value.tolist()
+    return {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.ravel().tolist()}
+
+
+# --- from JSON --------------------------------------------------------------------------------------------------------
+
+
+def from_json(kind: Any, content: Any, where: str) -> Any:
+    """Return a dataclass from JSON.
+
+    Parameters
+    ----------
+    kind : type
+    content : object
+    where : str
+        Name of the content, for the message.
+
+    Raises
+    ------
+    ValueError
+        If an entry is missing, unknown or of another type.
+    """
+    try:
+        return _read(kind, content)
+    except Exception as error:  # whatever is wrong with it
+        raise ValueError(f"{where} is not what was written") from error
+
+
+def _read(kind: Any, content: Any) -> Any:
+    """Return what a type stands for: a dataclass, or one of the types of its fields; an error of any kind if wrong."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (UnionType, Union):
+        return _read_either(inner, content)
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = _get_hints(kind)
+        if hints.keys() != content.keys():
+            raise KeyError
+        return kind(**{name: _read(hint, content[name]) for name, hint in hints.items()})
+    if origin is tuple and isinstance(content, list):
+        kinds = inner[:1] * len(content) if inner[-1] is Ellipsis else inner
+        return tuple(_read(*pair) for pair in zip(kinds, content, strict=True))
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return {name: _read(inner[1], entry) for name, entry in content.items()}
+    if (dtype := find_dtype(kind)) is not None:
+        return _read_array(dtype, content)
+    if origin is Literal:
+        return inner[inner.index(content)]
+    if issubclass(kind, Enum):
+        return kind[content]
+    if kind is float and (type(content) is int or content in NUMBERS):
+        return float(content)
+    if type(content) is not kind:
+        raise TypeError
+    return content
+
+
+def _read_either(kinds: tuple[Any, ...], content: Any) -> Any:
+    """Return the content as the first of several types that it can be."""
+    if content is None and NoneType in kinds:
+        return None
+    for kind in kinds:
+        with suppress(Exception):
+            return _read(kind, content)
+    raise TypeError
+
+
+@cache
+def _get_hints(kind: Any) -> dict[str, Any]:
+    """Return the types of the fields of a dataclass by their names."""
+    hints = get_type_hints(kind)
+    return {f.name: hints[f.name] for f in fields(kind)}
+
+
+def find_dtype(kind: Any) -> np.dtype[Any] | None:
+    """Return the dtype of an annotation that stands for an array; None for any other.
+
+    Parameters
+    ----------
+    kind : type
+        ``NDArray[...]``: a name for ``np.ndarray[...]``, or from NumPy 2.5 on an alias with an origin of its own.
+    """
+    if get_origin(kind) not in (np.ndarray, NDArray):
+        return None
+    last = get_args(kind)[-1]
+    return np.dtype((get_args(last) or (last,))[0])
+
+
+def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
+    """Return an array of the declared type from a list of numbers, or from its dtype, shape and values."""
+    if isinstance(value, dict):
+        array = np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])
+    else:
+        array = np.array(value, dtype=np.float64)
+    if array.dtype.kind != declared.kind:
+        raise TypeError
+    return array

@@ -39,9 +39,9 @@ from switchfit.strategy.starts import (
     try_shorter_horizons,
     try_starts,
 )
-from switchfit.uncertainty.answers import NEARLY_ALL, UNLIKELY, compare_with_sigma
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
-from switchfit.uncertainty.verdict import find_without_effect
+from switchfit.uncertainty.residuals import UNLIKELY, compare_with_sigma
+from switchfit.uncertainty.verdict import NEARLY_ALL, find_without_effect
 
 MORE_STARTS = "next: more starts"
 """Step that a verdict advises where the fit may be better elsewhere."""

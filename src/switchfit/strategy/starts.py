@@ -129,10 +129,8 @@ def fit_briefly(
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             meshes = evaluator or Evaluator(problem, theta)
-            follower = _TimedFollower(meshes) if constraints is None else None
-            result = minimize_cost(
-                meshes, theta, "auto", TOLERANCE, iterations, _callback.get(), constraints, follower=follower
-            )
+            source = _TimedFollower(meshes) if constraints is None else meshes
+            result = minimize_cost(source, theta, "auto", TOLERANCE, iterations, _callback.get(), constraints)
     except HiddenSwitchError:  # every fit would be wrong
         raise
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):

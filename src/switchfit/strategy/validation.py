@@ -45,7 +45,6 @@ from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first, validate_on
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
-from switchfit.uncertainty.answers import CLEARLY_OFF, HALF, UNLIKELY, Level
 from switchfit.uncertainty.prediction import (
     Prediction,
     Sensitivity,
@@ -54,7 +53,10 @@ from switchfit.uncertainty.prediction import (
     compute_sensitivity,
 )
 from switchfit.uncertainty.residuals import (
+    CLEARLY_OFF,
     FEWEST,
+    HALF,
+    UNLIKELY,
     ResidualDiagnostics,
     diagnose_runs,
     explain_all,
@@ -62,7 +64,7 @@ from switchfit.uncertainty.residuals import (
     list_channels,
     measure_widening,
 )
-from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
+from switchfit.uncertainty.verdict import Finding, Level, Verdict, build_verdict
 
 NEGLIGIBLE = 1e-10
 """Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
@@ -504,7 +506,8 @@ def _correlate_inputs(problem: Problem, diagnostics: ResidualDiagnostics) -> lis
         width = values.shape[1]
         names = run.inputs.names or (("u",) if width == 1 else tuple(f"u{k + 1}" for k in range(width)))
         for name, u in zip(names, values.T, strict=True):
-            found.append(InputCorrelation(label, name, correlate(channel.values, u, channel.lags), channel.lags))
+            lags = len(channel.autocorrelation)
+            found.append(InputCorrelation(label, name, correlate(channel.values, u, lags), lags))
     return found
 
 

@@ -27,8 +27,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
-from switchfit.fit.faults import refuse_hidden_switches
 from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum
+from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.fit.trajectory import compare, replace_values
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray, Measurements
@@ -117,17 +117,13 @@ class DerivativeCheck(Printed):
     @property
     def failures(self) -> tuple[Issue, ...]:
         """What failed; empty if nothing did. Where J is not finite, nothing can be said about its derivatives."""
-        return tuple(self._find_failures())
-
-    def _find_failures(self) -> Iterator[Issue]:
         if not np.isfinite(self.remainders).all():
-            yield Issue("cost not finite")
-            return
-        if not are_orders_right(self.observed_orders):
-            yield Issue("derivatives of another cost")
+            return (Issue("cost not finite"),)
+        found = [] if are_orders_right(self.observed_orders) else [Issue("derivatives of another cost")]
         largest = max(self.gradient_gap, self.hessian_gap)
         if largest > LARGEST_GAP and not self.stiff:  # False if not checked: NaN
-            yield Issue("derivative gap", figures={"gap": largest})
+            found.append(Issue("derivative gap", figures={"gap": largest}))
+        return tuple(found)
 
 
 def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, paper: bool = True) -> DerivativeCheck:
@@ -185,7 +181,10 @@ def compare_derivatives(evaluator: Evaluator, theta: FloatArray, *, paper: bool)
     direction = np.random.default_rng(0).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
     largest = _find_room(evaluator, at, direction)
     steps: FloatArray = largest * 0.5 ** np.arange(8.0)
-    remainders = np.array([_compute_remainders(evaluator, base, at, h, direction) for h in steps])
+    zeroth = np.array([evaluator(at + h * direction).cost for h in steps]) - base.cost
+    first = zeroth - steps * (base.gradient @ direction)
+    second = first - 0.5 * steps**2 * (direction @ base.hessian @ direction)
+    remainders = np.abs(np.stack([zeroth, first, second], axis=1))
     rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
@@ -271,15 +270,6 @@ def _list_breaks(evaluator: Evaluator, theta: FloatArray) -> list[FloatArray]:
     return found
 
 
-def _compute_remainders(
-    evaluator: Evaluator, base: Evaluation, theta: FloatArray, h: float, direction: FloatArray
-) -> tuple[float, float, float]:
-    zeroth = evaluator(theta + h * direction).cost - base.cost
-    first = zeroth - h * base.gradient @ direction
-    second = first - 0.5 * h**2 * direction @ base.hessian @ direction
-    return abs(zeroth), abs(float(first)), abs(float(second))
-
-
 WEAK = 0.05
 """Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
 MOST = 3
@@ -289,6 +279,7 @@ NAMED = 0.2
 UNDETERMINED = 1e-10
 """Scaled eigenvalues below this are zero."""
 HALVINGS = 20
+Cost = Callable[[FloatArray], float]
 Meaning = Literal["noise", "1 % of J", "1 % of variation"]
 """Meaning of a rise of J: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured values
 by 1 % of their variation."""
@@ -362,8 +353,6 @@ class Identifiability(Printed):
         J there, to which a rise is compared; NaN if it is not compared.
     eigenvalues : (k,)
         Eigenvalues, ascending, of the Hessian scaled to unit curvature of each unknown, on the free directions.
-    vectors : (d, k)
-        Their eigenvectors in scaled unknowns.
     without : tuple of str
         Unknowns on which the cost does not depend at all, to second order.
     held : tuple of str
@@ -399,7 +388,6 @@ class Identifiability(Printed):
     where: Literal["solution", "first guess"]
     cost: float
     eigenvalues: FloatArray = field(default_factory=lambda: np.zeros(0))
-    vectors: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     without: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
     directions: tuple[Direction, ...] = ()
@@ -480,8 +468,7 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         scale = fit.variance_scale if fit.freedom > 0 else 1.0
         # The likelihood ratio 2 (J - J_0) / scale is at the square of the quantile there.
         rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
-    subject = fit.theta_names, fit.theta_units, fit.is_time
-    about = Identifiability(*subject, rise, meaning, "solution", fit.cost)
+    about = Identifiability(fit.theta_names, fit.theta_units, fit.is_time, rise, meaning, "solution", fit.cost)
     about = replace(about, idle=fit.idle, unread=fit.unread, absent=fit.absent)
     cost = None if evaluator is None else _limit_cost(evaluator, fit.theta)
     return analyse(about, fit.hessian, fit.free_basis, fit.theta, cost)
@@ -516,7 +503,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     return analyse(about, hessian, np.eye(len(theta)), theta, _limit_cost(evaluator, theta))
 
 
-def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Callable[[FloatArray], float]:
+def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Cost:
     """Return J as a function of theta, NaN where bounds or the order of times are violated; not so at the centre, which
     may be on a constraint up to rounding.
     """
@@ -530,11 +517,7 @@ def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Callable[[FloatArra
 
 
 def analyse(
-    about: Identifiability,
-    hessian: FloatArray,
-    basis: FloatArray,
-    theta: FloatArray,
-    cost: Callable[[FloatArray], float] | None,
+    about: Identifiability, hessian: FloatArray, basis: FloatArray, theta: FloatArray, cost: Cost | None
 ) -> Identifiability:
     """Return the badly determined directions of a Hessian, tested with the cost it belongs to.
 
@@ -552,12 +535,12 @@ def analyse(
     names = about.theta_names
     free = np.abs(basis).max(1, initial=0.0) > 1e-9
     held = tuple(n for n, f in zip(names, free, strict=True) if not f)
+    about = replace(about, held=held, tried=cost is not None)
     if not free.any() or not np.isfinite(hessian).all():
-        return replace(about, vectors=np.zeros((len(names), 0)), held=held, tried=cost is not None)
+        return about
     flat = np.all(hessian == 0.0, axis=1).tolist()
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
-    spectrum = compute_scaled_spectrum(hessian, basis)
-    values, vectors = spectrum.values, spectrum.vectors
+    values, vectors, size = compute_scaled_spectrum(hessian, basis)
     # Unknowns on which the cost does not depend at all are reported separately.
     dead = np.array([n in without for n in names])
     kept = [k for k in range(len(values)) if not np.sum(vectors[dead, k] ** 2) > 0.5]
@@ -568,26 +551,14 @@ def analyse(
         v = vectors[:, k]
         # An eigenvector has no sign of its own: the largest entry is made positive.
         v = v * np.sign(v[np.argmax(np.abs(v))])
-        change, rises = _try_direction(spectrum.size * v, float(values[k]), theta, cost, about.rise)
+        change, rises = _try_direction(size * v, float(values[k]), theta, cost, about.rise)
         strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
         directions.append(Direction(float(values[k]), v, change, rises, tuple(names[i] for i in strong)))
-    return replace(
-        about,
-        eigenvalues=values,
-        vectors=vectors,
-        without=without,
-        held=held,
-        directions=tuple(directions),
-        tried=cost is not None,
-    )
+    return replace(about, eigenvalues=values, without=without, directions=tuple(directions))
 
 
 def _try_direction(
-    direction: FloatArray,
-    eigenvalue: float,
-    theta: FloatArray,
-    cost: Callable[[FloatArray], float] | None,
-    rise: float,
+    direction: FloatArray, eigenvalue: float, theta: FloatArray, cost: Cost | None, rise: float
 ) -> tuple[FloatArray, tuple[float, float]]:
     """Return the change along a direction (d,) at which J should rise by `rise`, and its actual rises on both sides."""
     known = theta != 0

@@ -36,13 +36,13 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Mesh, merge_stiffness
+from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import select_visible
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, influence
+from switchfit.problem.data import FloatArray, influence
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import count_times, show_time
 from switchfit.problem.parameter import Parameter, unit_suffix
@@ -172,12 +172,12 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     Parameters
     ----------
     problem : Problem
-        With Measurements; no delay of it is a parameter.
+        With Measurements and no reference signals; no delay of it is a parameter.
     sensitivities : sequence of Sensitivity, one per experiment
     """
     columns: list[tuple[NDArray[Any], ...]] = []
     for e, (experiment, found) in enumerate(zip(problem.experiments, sensitivities, strict=True)):
-        first = sum(q for _, q in problem.structures[e].references)
+        first = 0
         for k, item in enumerate(experiment.measurements):
             points, there = found.at(item.seen_times), ~np.isnan(item.values)
             channels = slice(first, first + item.values.shape[1])
@@ -230,11 +230,11 @@ class Prediction(Tabular):
     times : (K,) array, in `time_unit`
     states, state_errors : (K, n)
     outputs, output_errors : (K, q)
-        Outputs of the reference signals, then of the Measurements; their standard errors, as those of the states from
-        the corrected covariance where residuals are correlated.
+        Outputs of the Measurements; their standard errors, as those of the states from the corrected covariance where
+        residuals are correlated.
     noise : (K, q)
         Standard deviation of one sample: sigma (that of the sample nearest in time, if it varies); if sigma is unknown,
-        the root of the residual variance; NaN for reference signals.
+        the root of the residual variance.
     state_names, state_units, output_names : tuple of str
     time_unit : str
         Unit of the experiment's times.
@@ -447,12 +447,11 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         points = estimate.sensitivities[experiment].nodes
     else:
         asked = _check_times(times, problem, experiment)
-        mesh = evaluator.meshes[experiment]
         if asked.max() > fit.trajectories[experiment].times[-1]:
-            _require_covariance(estimate)
-            points = _simulate_beyond(problem, experiment, fit.theta, mesh, asked)
+            points = _simulate_beyond(problem, experiment, fit.theta, asked)
         else:
-            points = compute_sensitivity(problem, experiment, fit.theta, mesh.insert(asked)).at(asked)
+            mesh = evaluator.meshes[experiment].insert(asked)
+            points = compute_sensitivity(problem, experiment, fit.theta, mesh).at(asked)
     return build_prediction(estimate, problem, experiment, points)
 
 
@@ -499,11 +498,8 @@ def _require_covariance(fit: Any) -> FloatArray:
     return np.asarray(fit.corrected_covariance)
 
 
-def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, times: FloatArray) -> Points:
-    """Return states and outputs at times (K,), some of them after tf, with their derivatives in theta.
-
-    Up to tf the mesh is that of the fit; after it, it is refined anew.
-    """
+def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, times: FloatArray) -> Points:
+    """Return states and outputs at times (K,), some of them after tf, with their derivatives in theta."""
     experiment = problem.experiments[e]
     tf, last = experiment.end, float(times.max())
     if isinstance(experiment.tf, Parameter):
@@ -520,11 +516,7 @@ def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, ti
         ) from error
     runs = [longer if k == e else run for k, run in enumerate(problem.experiments)]
     extended = replace(problem, experiments=runs)
-    refined = refine_mesh(extended, e, theta)
-    after = refined.times[refined.times > tf]
-    stiffness = merge_stiffness(refined.stiffness, mesh.stiffness)
-    whole = Mesh.from_times(np.concatenate([mesh.times, after, times]), stiffness)
-    return compute_sensitivity(extended, e, theta, whole).at(times)
+    return compute_sensitivity(extended, e, theta, refine_mesh(extended, e, theta).insert(times)).at(times)
 
 
 def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -535,16 +527,14 @@ def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArra
 
 def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     """Return the standard deviation of one sample of each output at each time: (K, q)."""
-    columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
-    compared = [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
-    for item, comparison in zip(compared, fit.comparisons[e], strict=True):
-        if isinstance(item, Measurements):
-            # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
-            unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
-            sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
-            halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
-            columns.append(sigma[np.searchsorted(halfway, times)])
-    return np.concatenate([np.zeros((len(times), 0)), *columns], axis=1)
+    columns = [np.zeros((len(times), 0))]
+    # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
+    unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
+    for item, comparison in zip(problem.experiments[e].measurements, fit.comparisons[e], strict=True):
+        sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
+        halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
+        columns.append(sigma[np.searchsorted(halfway, times)])
+    return np.concatenate(columns, axis=1)
 
 
 def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:

@@ -145,9 +145,8 @@ class Profile(Tabular, Displayed):
         self.value, self.standard_error = float(fit.theta[k]), float(fit.standard_errors[k])
         runs = [e for e, place in list_transitions(evaluator.problem) if place == k]  # that of a transition time
         self.sample_times = list_sample_times(evaluator.problem, fit.theta, runs[0]) if runs else np.zeros(0)
-        self._evaluator, self._constraints = evaluator.halved, evaluator.problem.constraints
-        self._scale = fit.variance_scale
-        self._follower = Follower(self._evaluator)
+        self._constraints, self._scale = evaluator.problem.constraints, fit.variance_scale
+        self._follower = Follower(evaluator.halved)
         self._starts = {side: self._describe(fit.theta, self._follower(fit.theta, side), True) for side in (-1, 1)}
         self._centre = self._starts[1]
         self.points, self.fits = [self._centre], 0
@@ -242,10 +241,7 @@ class Profile(Tabular, Displayed):
         """
         threshold = self.fit.quantile(self.level if level is None else level)
         threshold *= self.widening if as_flag(corrected, "corrected") else 1.0
-        try:
-            return self._find_regions(threshold)
-        except KeyboardInterrupt:
-            return [(np.nan, np.nan)]
+        return self._find_regions(threshold)
 
     def interval(self, level: float | None = None, *, corrected: bool = False) -> tuple[float, float]:
         """Return the likelihood-ratio confidence interval that contains the estimate: (low, high).
@@ -310,9 +306,9 @@ class Profile(Tabular, Displayed):
         return size if point.value > self.value else -size
 
     def _list_side(self, side: int) -> list[Point]:
-        """Return the points of one side from the estimate outwards, the estimate first."""
-        chosen = [q for q in self.points if side * (q.value - self.value) >= 0]
-        return sorted(chosen, key=lambda q: side * q.value)
+        """Return the points of one side from the estimate outwards, the estimate first, with its derivatives there."""
+        beyond = [q for q in self.points if side * (q.value - self.value) > 0]
+        return [self._starts[side], *beyond[::side]]
 
     # --- adding points
 
@@ -351,15 +347,7 @@ class Profile(Tabular, Displayed):
         self.fits += 1
         try:
             begin = nearest_feasible(held, np.clip(start, lower, upper))
-            result = minimize_cost(
-                self._evaluator,
-                begin,
-                "exact",
-                self.fit.tolerance,
-                ITERATIONS,
-                constraints=held,
-                follower=self._follower,
-            )
+            result = minimize_cost(self._follower, begin, "exact", self.fit.tolerance, ITERATIONS, constraints=held)
         except ValueError:  # infeasible by rounding
             return None
         if result.status is Status.INTERRUPTED or self._should_stop():
@@ -427,24 +415,24 @@ class Profile(Tabular, Displayed):
     def _choose_step(self, side: int, last: Point, spacing: float) -> float:
         """Return the step after which zeta should have risen by the spacing, by the derivatives."""
         points = self._list_side(side)
-        here = last if len(points) > 1 else self._starts[side]
         # zeta^2 = 2 (J_p - J_0) / scale, so that zeta + spacing is reached where slope x + curvature x^2 / 2 has risen
         # by this.
-        rise = 0.5 * self._scale * (self._measure_zeta(here.cost) + spacing) ** 2 - (here.cost - self._centre.cost)
-        step = float(find_first_root(np.array(rise), np.array(side * here.slope), np.array(here.curvature)))
+        rise = 0.5 * self._scale * (self._measure_zeta(last.cost) + spacing) ** 2 - (last.cost - self._centre.cost)
+        step = float(find_first_root(np.array(rise), np.array(side * last.slope), np.array(last.curvature)))
         if len(points) > 1:
             return min(step, LONGEST_GROWTH * abs(last.value - points[-2].value))
-        return step if np.isfinite(step) else 1e-2 * self._size
+        # 1 % of the feasible range, or of the value.
+        span = self.limits[1] - self.limits[-1]
+        return step if np.isfinite(step) else 1e-2 * float(span if np.isfinite(span) else abs(self.value) or 1.0)
 
     def _add_next(self, side: int, last: Point, step: float, most: float) -> Point | None:
         """Return the next point outwards; the step is halved while a fit fails or zeta is above `most`."""
         limit = self.limits[side]
-        near = last if last is not self._centre else self._starts[side]
         for attempt in range(1, HALVINGS + 1):
             value = last.value + side * step
             if side * (value - limit) > -1e-3 * step:
                 value = limit
-            new = self._add(value, near)
+            new = self._add(value, last)
             if new is not None and new.converged and (attempt == HALVINGS or self._measure_zeta(new.cost) <= most):
                 return new
             self.points = [q for q in self.points if q is not new]
@@ -478,12 +466,6 @@ class Profile(Tabular, Displayed):
             self._insert(found)
             outer = found
 
-    @property
-    def _size(self) -> float:
-        """Typical size of the unknown: its feasible range, or its value."""
-        span = self.limits[1] - self.limits[-1]
-        return float(span if np.isfinite(span) else abs(self.value) or 1.0)
-
     # --- crossings of the threshold
 
     def _find_crossing(self, a: Point, b: Point, threshold: float) -> float:
@@ -512,19 +494,14 @@ class Profile(Tabular, Displayed):
         """Return all intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
         for side in (-1, 1):
             self._follow(side, threshold)
-        points = list(self.points)
-        inside = [abs(self._compute_zeta(q)) <= threshold for q in points]
-        low = self._get_open_end(-1) if inside[0] else None
-        found: list[tuple[float, float]] = []
-        for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
-            if a_in != b_in:
-                edge = self._find_crossing(a, b, threshold)
-                if b_in:
-                    low = edge
-                elif low is not None:
-                    found.append((low, edge))
-                    low = None
-        return found if low is None else [*found, (low, self._get_open_end(1))]
+        inside = [abs(self._compute_zeta(q)) <= threshold for q in self.points]
+        pairs = zip(pairwise(self.points), pairwise(inside), strict=True)
+        edges = [self._find_crossing(a, b, threshold) for (a, b), (here, there) in pairs if here != there]
+        if inside[0]:
+            edges.insert(0, self._get_open_end(-1))
+        if inside[-1]:
+            edges.append(self._get_open_end(1))
+        return list(zip(edges[::2], edges[1::2], strict=True))
 
     def _get_open_end(self, side: int) -> float:
         """Return the end of a region on a side where the threshold was not crossed."""
@@ -586,21 +563,6 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
     evaluator = estimate.evaluator_at_solution()
-    check_has_profile(fit)
-    found = Profile(fit, evaluator, name, level)
-    with show_progress(callback, f"Profile of {name}") as report:
-        # Of as many fits as a profile usually takes.
-        found._should_stop = lambda: bool(report(found.fits, max(2 * (STEPS + LOOK_AHEAD + 2), found.fits)))
-        try:
-            found._find_regions(fit.quantile(level))
-        except KeyboardInterrupt:
-            found._interrupted = True
-    found._should_stop = lambda: False
-    return found
-
-
-def check_has_profile(fit: Fit) -> None:
-    """Raise ValueError unless a fit is a minimum with a noise model, as profiles and regions need."""
     if not fit.status.successful:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.constraints:
@@ -614,3 +576,13 @@ def check_has_profile(fit: Fit) -> None:
         raise ValueError(
             f"sigma is unknown and {fit.samples} values are too few to estimate it along with the unknowns."
         )
+    found = Profile(fit, evaluator, name, level)
+    with show_progress(callback, f"Profile of {name}") as report:
+        # Of as many fits as a profile usually takes.
+        found._should_stop = lambda: bool(report(found.fits, max(2 * (STEPS + LOOK_AHEAD + 2), found.fits)))
+        try:
+            found._find_regions(fit.quantile(level))
+        except KeyboardInterrupt:
+            found._interrupted = True
+    found._should_stop = lambda: False
+    return found

@@ -33,9 +33,11 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import NO_VARIATION
 from switchfit.fit.result import Fit
@@ -45,7 +47,25 @@ from switchfit.problem.dates import Origin
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Printed, format_line, join_first
-from switchfit.uncertainty.answers import HALF, NO_RESIDUALS, SERIOUS, UNLIKELY, compare_with_sigma
+
+UNLIKELY = 1e-3
+"""Probability below which what is left is not noise: one false alarm in a thousand fits. It is shared among the
+channels of a fit, and among the fits of many."""
+
+CLEARLY_OFF = 0.1
+"""How far the reduced chi-square must be from 1 as well: with 10,000 samples chi-square rejects a sigma that is 2 %
+off, which no instrument is known to."""
+
+SERIOUS = 1.2
+"""Factor by which standard errors may be too small, and a typical residual beside a robust loss too large: a 95 %
+interval that is too narrow by this factor covers 90 %, and a seventh of all values, if they are outliers, raise the
+median of the absolute residuals by it."""
+
+HALF = 0.5
+"""Share of the variance below which a model explains less than it leaves."""
+
+NO_RESIDUALS = 1e-10
+"""Unexplained share that is rounding and tolerance: nothing is read from residuals of that size."""
 
 FEWEST = 20
 """Smallest number of residuals for the tests: with fewer, their statistics are far from chi-square."""
@@ -57,29 +77,28 @@ class ChannelResiduals:
 
     Attributes
     ----------
-    experiment : int, from 0
     name : str
     times, values : (n,), (n,)
         Sample times and standardized residuals of the samples that are not missing.
-    time_unit : str
-        Unit of the experiment's times.
     sigma_known : bool
     mean : float
         Mean of the standardized residuals; 1 / sqrt(n) is its standard deviation if they are white.
     rms : float
         Root mean square of the standardized residuals: near 1 if sigma is right, 1 if it is unknown.
-    lags : int
-    autocorrelation : (lags,)
-        At lags 1, 2, ...
+    autocorrelation : (h,)
+        At lags 1, 2, ..., h.
     whiteness, normality : float
         Probabilities of Ljung and Box's and of Jarque and Bera's statistic, or a larger one, if the residuals are
         white and normal; NaN for fewer than 20.
-    skewness, kurtosis : float
-        0 and 3 for a normal distribution.
+    kurtosis : float
+        3 for a normal distribution.
     effective : float
         Effective sample size.
     outliers : int
         Number of residuals beyond four standard deviations; 0.001 are expected in 16 samples.
+    experiment : int, from 0
+    time_unit : str
+        Unit of the experiment's times.
     origin : Origin or None
         The date at which times are 0; None where they are no dates.
 
@@ -98,22 +117,20 @@ class ChannelResiduals:
     ('thermometer', 24, True)
     """
 
-    experiment: int
     name: str
     times: FloatArray
     values: FloatArray
-    time_unit: str
     sigma_known: bool
     mean: float
     rms: float
-    lags: int
     autocorrelation: FloatArray
     whiteness: float
     normality: float
-    skewness: float
     kurtosis: float
     effective: float
     outliers: int
+    experiment: int = 0
+    time_unit: str = "s"
     origin: Origin | None = None
 
     def __repr__(self) -> str:
@@ -122,7 +139,7 @@ class ChannelResiduals:
     @property
     def correlation(self) -> float:
         """Correlation of neighboring residuals, at lag 1; 0 if there are too few residuals."""
-        return float(self.autocorrelation[0]) if self.lags else 0.0
+        return float(self.autocorrelation[0]) if len(self.autocorrelation) else 0.0
 
     @property
     def white(self) -> bool:
@@ -222,6 +239,22 @@ class ResidualDiagnostics(Printed):
         return found
 
 
+def find_residual_issues(fit: Fit) -> Iterator[Issue]:
+    """Find residuals of a fit that are not white, normal noise of the size of sigma.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    variance = fit.residual_variance
+    if fit.sigma_known and np.isfinite(variance):
+        probability, is_size = compare_with_sigma(2 * fit.cost, fit.freedom)
+        if probability < UNLIKELY or not is_size:
+            yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})
+    if fit.sigma_known is not None:
+        yield from diagnose(fit).issues
+
+
 def diagnose(fit: Fit) -> ResidualDiagnostics:
     """Test the residuals of a fit, channel by channel.
 
@@ -254,8 +287,8 @@ def diagnose_runs(
     channels, labels = [], []
     for label, e, comparison, k in list_channels(runs, names):
         if comparison.kind == "measurements":
-            run = trajectories[e]
-            channels.append(diagnose_channel(comparison, k, e, run.time_unit, run.origin, unknowns=unknowns))
+            found, run = diagnose_channel(comparison, k, unknowns=unknowns), trajectories[e]
+            channels.append(replace(found, experiment=e, time_unit=run.time_unit, origin=run.origin))
             labels.append(label)
     return ResidualDiagnostics(tuple(channels), tuple(labels))
 
@@ -286,17 +319,6 @@ def correct_errors(fit: Fit) -> FloatArray:
     fit : Fit
     """
     return np.asarray(measure_widening(fit) * fit.standard_errors)
-
-
-def correct_covariance(fit: Fit) -> FloatArray:
-    """Return the covariance of a fit with its standard errors widened as by `correct_errors`: (d, d).
-
-    Parameters
-    ----------
-    fit : Fit
-    """
-    factors = measure_widening(fit)
-    return np.asarray(factors[:, None] * fit.covariance * factors)
 
 
 def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
@@ -359,15 +381,7 @@ def measure_widening(fit: Fit) -> FloatArray:
     return each
 
 
-def diagnose_channel(
-    comparison: Comparison,
-    k: int,
-    experiment: int = 0,
-    time_unit: str = "s",
-    origin: Origin | None = None,
-    *,
-    unknowns: float = 0.0,
-) -> ChannelResiduals:
+def diagnose_channel(comparison: Comparison, k: int, *, unknowns: float = 0.0) -> ChannelResiduals:
     """Test one channel of a comparison.
 
     Parameters
@@ -375,17 +389,12 @@ def diagnose_channel(
     comparison : Comparison
     k : int
         Index of the channel, from 0.
-    experiment : int, optional
-    time_unit : str, optional
-    origin : Origin, optional
-        They are stored in the result.
     unknowns : float
         As in `diagnose_runs`.
     """
     raw = comparison.residuals[:, k]
     there = np.isfinite(raw)
-    known = comparison.sigma is not None
-    size = comparison.sigma[there, k] if comparison.sigma is not None else np.sqrt(np.mean(raw[there] ** 2))
+    size = np.sqrt(np.mean(raw[there] ** 2)) if comparison.sigma is None else comparison.sigma[there, k]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.nan_to_num(raw[there] / size)
     n = len(z)
@@ -393,34 +402,26 @@ def diagnose_channel(
     r = compute_autocorrelation(z, lags)
     spread = z - z.mean()
     variance = float(np.mean(spread**2))
-    skewness, kurtosis = 0.0, 3.0
-    if variance > 0:
-        skewness = float(np.mean(spread**3)) / variance**1.5
-        kurtosis = float(np.mean(spread**4)) / variance**2
+    kurtosis = float(np.mean(spread**4)) / variance**2 if variance > 0 else 3.0
     whiteness = normality = np.nan
     if n >= FEWEST and variance > 0:
         # Ljung and Box, then Jarque and Bera.
         Q = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
         whiteness = float(special.chdtrc(lags, Q))
+        skewness = float(np.mean(spread**3)) / variance**1.5
         normality = float(special.chdtrc(2, n / 6 * (skewness**2 + (kurtosis - 3) ** 2 / 4)))
     # The lags are those of residuals, whose correlation the fit has lowered; the samples are worth n (1 - r) / (1 + r).
     first = correct_correlation(float(r[0]), n, unknowns * n) if lags else 0.0
-    root = np.sqrt(np.mean(z**2))
     return ChannelResiduals(
-        experiment=experiment,
         name=comparison.names[k],
         times=comparison.times[there],
         values=z,
-        time_unit=time_unit,
-        origin=origin,
-        sigma_known=known,
+        sigma_known=comparison.sigma is not None,
         mean=float(z.mean()),
-        rms=float(root),
-        lags=lags,
+        rms=float(np.sqrt(np.mean(z**2))),
         autocorrelation=r,
         whiteness=whiteness,
         normality=normality,
-        skewness=skewness,
         kurtosis=kurtosis,
         effective=min(n, n * (1 - first) / (1 + first)),
         outliers=int(np.sum(np.abs(spread) > 4 * np.sqrt(variance))) if variance > 0 else 0,
@@ -464,6 +465,23 @@ def compute_autocorrelation(z: FloatArray, lags: int) -> FloatArray:
     if square == 0:
         return np.zeros(lags)
     return np.array([float(z[k:] @ z[:-k]) / square for k in range(1, lags + 1)])
+
+
+def compare_with_sigma(chi_square: Any, freedom: Any, tests: int = 1) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the probability of chi-square, or of a larger one, and whether it is not far too small: sigma is then no
+    measure of the noise. The probability of one that is not clearly too large is 1; that of each of several tests is
+    multiplied by their number.
+
+    Parameters
+    ----------
+    chi_square, freedom : (R,)
+    tests : int
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        above, below = special.chdtrc(freedom, chi_square), special.chdtr(freedom, chi_square)
+        ratio = np.asarray(chi_square) / freedom
+    probability = np.where(ratio > 1 + CLEARLY_OFF, np.minimum(1.0, tests * above), 1.0)
+    return probability, ~((tests * below < UNLIKELY) & (ratio < 1 - CLEARLY_OFF))
 
 
 @dataclass(frozen=True)
@@ -562,8 +580,9 @@ def measure_quality(fit: Fit) -> Quality:
         squares, spread, _ = _sum_squares(comparison, k)
         if not np.isfinite(squares):
             continue
-        explained = 1 - squares / spread if spread > 0 else np.nan
-        tests = {}
+        explained, chi_square, tests = 1 - squares / spread if spread > 0 else np.nan, np.nan, {}
+        if residuals is not None and residuals.sigma_known and comparison.downweighted is None:
+            chi_square = float(residuals.values @ residuals.values)
         if residuals is not None and not 1 - explained < NO_RESIDUALS:
             tests = _test_residuals(comparison, k, residuals, is_given)
         channels.append(
@@ -573,7 +592,7 @@ def measure_quality(fit: Fit) -> Quality:
                 kind=comparison.kind,
                 count=int(np.isfinite(comparison.measured[:, k]).sum()),
                 explained=explained,
-                chi_square=_compute_chi_square(comparison, k),
+                chi_square=chi_square,
                 tests=tests,
                 size=residuals.rms if is_given and residuals is not None else 1.0,
                 widening=1.0 if residuals is None else residuals.widening,
@@ -699,12 +718,3 @@ def _compute_weights(comparison: Comparison) -> FloatArray:
         return np.ones(len(comparison.times))
     steps = np.diff(comparison.times)
     return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
-
-
-def _compute_chi_square(comparison: Comparison, k: int) -> float:
-    """Return the sum of the squared residuals over sigma; NaN if sigma is unknown or a loss is robust."""
-    if comparison.sigma is None or comparison.downweighted is not None:
-        return np.nan
-    residual = comparison.residuals[:, k]
-    there = np.isfinite(residual)
-    return float(np.sum((residual[there] / comparison.sigma[there, k]) ** 2))

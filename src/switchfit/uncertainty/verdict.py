@@ -1,7 +1,17 @@
 """The verdict on a fit: good, doubtful or bad, why, and what to do next, as data; the report makes the sentence of it.
 
-`switchfit.uncertainty.answers` has the rules and the thresholds, for any number of fits. Here is what they are applied
-to in a single one, and what the user is advised to do.
+Three questions, each answered by one number with one threshold:
+
+1. Did it converge, on a mesh that is fine enough? The relative integration error of J, `FINE`.
+2. Is it the best that was found, and who looked? The number of ends that are lower, 0. Where nothing says what the
+   noise is, the share of other starts that ended at the same J too, `AGREEING`.
+3. Does the model explain the data? The probability of what is left if it is noise, `UNLIKELY`; where that cannot be
+   told, the share of the variance that is explained, `MOSTLY`.
+
+No to the first or second is bad, and so is a model that explains less than it leaves (`HALF`), unless what is left is
+noise. What is left and is no noise is doubtful: a wrong end, a wrong model, a wrong sigma and outliers all do that. So
+is whatever the data do not determine. A wrong answer that is called good is the worst defect of such a rule, a right
+one that is called bad the second.
 
 Warnings about the numbers of a fit, as data; the report writes the sentences.
 """
@@ -10,30 +20,154 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.fit.result import NAMED, Fit, disagreement, list_without_effect
 from switchfit.optimize import Status
 from switchfit.problem.inspection import name_whole_parameters
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Printed
-from switchfit.uncertainty.answers import (
-    AGREEING,
-    BARELY_DETERMINED,
-    LEVELS,
-    NEARLY_ALL,
-    NO_RESIDUALS,
-    UNLIKELY,
-    Doubt,
-    Level,
-    Numbers,
-    compare_with_sigma,
-    find_doubts,
-)
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate, analyse_solution, certify
-from switchfit.uncertainty.residuals import Quality, diagnose, measure_quality
+from switchfit.uncertainty.residuals import HALF, NO_RESIDUALS, UNLIKELY, Quality, find_residual_issues, measure_quality
+
+Level = Literal["good", "doubtful", "bad"]
+LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
+
+FINE = 1e-3
+"""Integration error of J, relative, up to which a minimum is that of the data: chi-square is off by less than 1 in a
+thousand samples then. Above it, the minimum may be that of the mesh."""
+
+AGREEING = 0.1
+"""Share of other starts that end in the same minimum below which it is doubtful that there is no better one, unless
+what is left of the data is noise."""
+
+MOSTLY = 0.9
+"""Share below which a fit is doubtful where no test tells whether what is left is noise: fewer than 20 values without a
+sigma, and fits of many. A tenth of the variance is to be seen in a figure."""
+
+NEARLY_ALL = 0.999
+"""Share from which a reference signal is followed, whose noise cannot be told from a misfit, and from which a model
+with correlated residuals is no more than slightly wrong: they are 3 % of the signal. Wrong ends of the test bed reach
+0.99893 of references and 0.99884 of data; real logs that are fitted rightly and leave no noise have more."""
+
+BARELY_DETERMINED = 1e-6
+"""Smallest eigenvalue of the Hessian, scaled to unit curvature, below which a direction is not determined: correlations
+of 0.999999 have it."""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers about R fits from which they are judged: arrays (R,), or one number where it is that of all of them.
+
+    Attributes
+    ----------
+    converged : (R,) bool
+    error
+        Integration error of J, or of a constraint, relative.
+    lower, tried, agreeing
+        How many other starts ended lower, were tried, and ended at the same J.
+    explained
+        Share of the variance of the data; NaN without data, or if they do not vary.
+    probability
+        Of what is left of the data, or of more, if it is noise; NaN where no test tells.
+    known : bool
+        Whether the size of the noise is known: sigma is, and is not far too large.
+    freedom
+        Values less unknowns; infinite where residuals are of no use.
+    collapsed, at_bounds : int
+        How many modes have collapsed, and how many unknowns are at bounds.
+    smallest
+        Smallest eigenvalue of the scaled Hessian; infinite if nothing is free.
+    references : bool
+        Whether there are reference signals among the data.
+    """
+
+    converged: NDArray[np.bool_]
+    error: Any = 0.0
+    lower: Any = 0
+    tried: Any = 0
+    agreeing: Any = 0
+    explained: Any = np.nan
+    probability: Any = np.nan
+    known: Any = False
+    freedom: Any = np.inf
+    collapsed: Any = 0
+    at_bounds: Any = 0
+    smallest: Any = np.inf
+    references: bool = False
+
+
+class Doubt(NamedTuple):
+    """One thing that speaks against some of R fits.
+
+    Attributes
+    ----------
+    kind : str
+        As of the reasons of a verdict.
+    level : {"doubtful", "bad"}
+    which : (R,) bool
+    """
+
+    kind: str
+    level: Level
+    which: NDArray[np.bool_]
+
+
+def find_doubts(fits: Numbers) -> list[Doubt]:
+    """Return what speaks against fits, in order of weight.
+
+    Parameters
+    ----------
+    fits : Numbers
+    """
+    found = [doubt for doubt in _list_doubts(fits) if doubt.which.any()]
+    return sorted(found, key=lambda doubt: -LEVELS.index(doubt.level))  # stable
+
+
+def _list_doubts(fits: Numbers) -> Iterator[Doubt]:
+    ended = fits.converged
+    explained, probability, known = np.broadcast_arrays(fits.explained, fits.probability, fits.known, ended)[:3]
+    tested, noise = ~np.isnan(probability), probability >= UNLIKELY
+    share = np.where(tested & np.isnan(explained), noise, explained)  # of data that are 0 throughout
+    exact = 1 - share < NO_RESIDUALS
+    noise = noise | exact
+    few = ended & (fits.freedom <= 0)
+    judged = ended & ~few
+    yield Doubt("not converged", "bad", ~ended)
+    yield Doubt("integration error", "bad", ended & np.logical_not(fits.error <= FINE))
+    yield Doubt("other starts are better", "bad", (fits.lower > 0) & ~exact)  # nothing is better than 0
+    confirmed = noise & (known | exact | ((fits.agreeing >= 2) & (share >= NEARLY_ALL)))
+    lonely = (fits.lower == 0) & (fits.agreeing < AGREEING * fits.tried)
+    yield Doubt("few starts agree", "doubtful", lonely & ~confirmed)
+    unexplained = judged & (share < HALF) & ~noise
+    no_noise = judged & (share >= HALF) & tested & ~noise
+    wanted = np.where(noise, HALF, MOSTLY) if not fits.references else NEARLY_ALL
+    little = judged & (share < wanted) & ~known & ~unexplained & ~no_noise
+    yield Doubt("unexplained", "bad", unexplained)
+    yield Doubt("no noise", "doubtful", no_noise)
+    yield Doubt("little explained", "doubtful", little)
+    yield Doubt("too few samples", "doubtful", few)
+    yield Doubt("a mode collapsed", "doubtful", ended & (fits.collapsed > 0))
+    yield Doubt("at bounds", "doubtful", ended & (fits.at_bounds > 0))
+    yield Doubt("not determined", "doubtful", ended & (fits.smallest < BARELY_DETERMINED))
+
+
+def find_levels(doubts: list[Doubt], count: int) -> NDArray[np.str_]:
+    """Return "good", "doubtful" or "bad" for each of so many fits: (R,).
+
+    Parameters
+    ----------
+    doubts : list of Doubt
+    count : int
+    """
+    places = np.zeros(count, dtype=int)
+    for doubt in doubts:
+        places[doubt.which] = np.maximum(places[doubt.which], LEVELS.index(doubt.level))
+    return np.array(LEVELS)[places]
+
 
 UNSEEN = 100.0
 """Factor between the standard errors of the two Hessians above which the Gauss-Newton matrix counts as singular, as for
@@ -43,27 +177,30 @@ DIFFERENT = 1.2
 given: a 95 % interval that is too narrow by this factor covers 90 %, one that is too wide 98 %."""
 
 
-def find_issues(fit: Fit) -> list[Issue]:
-    """Return the warnings about a fit, in the order of the report.
+def find_issues(fit: Fit) -> Iterator[Issue]:
+    """Yield the warnings about a fit, in the order of the report.
 
     Parameters
     ----------
     fit : Fit
     """
-    sources = (
-        _find_short_modes,
-        _find_bounds,
-        _find_idle,
-        _find_kinks,
-        find_without_effect,
-        _find_undetermined,
-        _find_missing_errors,
-        _check_noise,
-        _check_residuals,
-        _compare_covariances,
-        _check_integration,
-    )
-    return [issue for source in sources for issue in source(fit)]
+    yield from _find_short_modes(fit)
+    yield from _find_bounds(fit)
+    is_time = dict(zip(fit.theta_names, fit.is_time.tolist(), strict=True))
+    for kind, wanted in (("idle times", True), ("idle parameters", False)):
+        if names := tuple(name for name in fit.idle if is_time[name] is wanted):
+            yield Issue(kind, names)
+    yield from _find_kinks(fit)
+    yield from find_without_effect(fit)
+    smallest, names = _find_weakest(fit)
+    if abs(smallest) < BARELY_DETERMINED:
+        yield Issue("not determined", names, {"eigenvalue": smallest})
+    yield from _find_missing_errors(fit, smallest)
+    if fit.status.successful:
+        yield from find_residual_issues(fit)
+        yield from _compare_covariances(fit)
+    if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
+        yield Issue("large integration error", (fit.integration_error_of,), {"error": fit.integration_error})
 
 
 def _find_short_modes(fit: Fit) -> Iterator[Issue]:
@@ -79,14 +216,6 @@ def _find_bounds(fit: Fit) -> Iterator[Issue]:
     for constraint in fit.active:
         if constraint.position is None and constraint.unknown not in fit.idle:
             yield Issue(constraint.kind, (constraint.unknown,), {"value": constraint.value})
-
-
-def _find_idle(fit: Fit) -> Iterator[Issue]:
-    """Find unknowns on which the cost does not depend, because a mode has collapsed."""
-    is_time = dict(zip(fit.theta_names, fit.is_time.tolist(), strict=True))
-    for kind, wanted in (("idle times", True), ("idle parameters", False)):
-        if names := tuple(name for name in fit.idle if is_time[name] is wanted):
-            yield Issue(kind, names)
 
 
 def _find_kinks(fit: Fit) -> Iterator[Issue]:
@@ -111,13 +240,6 @@ def find_without_effect(fit: Fit) -> Iterator[Issue]:
         yield Issue("without effect", others)
 
 
-def _find_undetermined(fit: Fit) -> Iterator[Issue]:
-    """Find a direction along which the cost hardly changes, of the unknowns on which it depends."""
-    smallest, names = _find_weakest(fit)
-    if abs(smallest) < BARELY_DETERMINED:
-        yield Issue("not determined", names, {"eigenvalue": smallest})
-
-
 def _find_weakest(fit: Fit) -> tuple[float, tuple[str, ...]]:
     """Return the smallest eigenvalue of the scaled Hessian of the free unknowns with an effect, infinite if there are
     none, and the unknowns with the largest components in its direction.
@@ -128,55 +250,32 @@ def _find_weakest(fit: Fit) -> tuple[float, tuple[str, ...]]:
     return (float(found.eigenvalues[0]), found.directions[0].names[:NAMED]) if found.directions else (np.inf, ())
 
 
-def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
-    """Find the reason why a fit has no standard errors."""
-    without = list_without_effect(fit)
-    missing = ~np.isfinite(fit.standard_errors) & ~np.isin(fit.theta_names, without)
+def _find_missing_errors(fit: Fit, smallest: float) -> Iterator[Issue]:
+    """Find the reason why a fit has no standard errors; `smallest`: of the eigenvalues of its scaled Hessian."""
+    missing = ~np.isfinite(fit.standard_errors) & ~np.isin(fit.theta_names, list_without_effect(fit))
+    unknowns = fit.free_basis.shape[1]
     if not missing.any():
         return
-    k = fit.free_basis.shape[1]
     if not np.isfinite(fit.hessian).all():
         yield Issue("no errors: not finite")
     elif fit.sigma_known is None:
-        if not any(fit.comparisons):  # a cost of the trajectory alone never has standard errors
-            return
-        yield Issue("no errors: no noise model")
-    elif fit.sigma_known is False and fit.samples <= k:
-        yield Issue("no errors: too few samples", figures={"samples": float(fit.samples), "unknowns": float(k)})
+        if any(fit.comparisons):  # a cost of the trajectory alone never has standard errors
+            yield Issue("no errors: no noise model")
+    elif fit.sigma_known is False and fit.samples <= unknowns:
+        figures = {"samples": float(fit.samples), "unknowns": float(unknowns)}
+        yield Issue("no errors: too few samples", figures=figures)
     else:
         names = () if missing.all() else tuple(np.array(fit.theta_names, dtype=object)[missing].tolist())
-        yield Issue("no errors: not positive definite", names, {"eigenvalue": _find_weakest(fit)[0]})
-
-
-def _check_noise(fit: Fit) -> Iterator[Issue]:
-    """Test whether a known sigma contradicts the residuals: 2 J should be chi-square distributed."""
-    variance = fit.residual_variance
-    if not (fit.status.successful and fit.sigma_known and np.isfinite(variance)):
-        return
-    probability, is_size = compare_with_sigma(2 * fit.cost, fit.freedom)
-    if probability < UNLIKELY or not is_size:
-        yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})
-
-
-def _check_residuals(fit: Fit) -> Iterator[Issue]:
-    """Find residuals that are not white, normal noise."""
-    if fit.status.successful and fit.sigma_known is not None:
-        yield from diagnose(fit).issues
+        yield Issue("no errors: not positive definite", names, {"eigenvalue": smallest})
 
 
 def _compare_covariances(fit: Fit) -> Iterator[Issue]:
     """Test whether the exact Hessian and the Gauss-Newton matrix give different standard errors."""
-    found = disagreement(fit) if fit.status.successful else None
+    found = disagreement(fit)
     if found is not None and found.factor > DIFFERENT:
         kind = "known to second order" if found.factor > UNSEEN else "covariances differ"
         figures = {"factor": found.factor, "exact": found.exact, "Gauss-Newton": found.gauss_newton}
         yield Issue(kind, (found.name,), figures)
-
-
-def _check_integration(fit: Fit) -> Iterator[Issue]:
-    """Test whether the integration is accurate enough."""
-    if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
-        yield Issue("large integration error", (fit.integration_error_of,), {"error": fit.integration_error})
 
 
 @dataclass(frozen=True)

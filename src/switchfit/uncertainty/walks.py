@@ -28,7 +28,7 @@ at any level.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 
 MOST_HALVINGS = 3
@@ -71,6 +71,9 @@ class Derivatives(NamedTuple):
     cost: FloatArray
     gradient: FloatArray
     hessian: FloatArray
+
+
+Evaluate = Callable[[NDArray[np.intp], FloatArray], Derivatives]
 
 
 class Walks(NamedTuple):
@@ -123,8 +126,7 @@ def list_sample_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray
         With delays that are parameters.
     e : int, from 0
     """
-    items = [item for item in problem.experiments[e].data if isinstance(item, Measurements)]
-    known = [item.seen_times for item in items if not isinstance(item.delay, str)]
+    known = [item.seen_times for item in problem.experiments[e].measurements if not isinstance(item.delay, str)]
     return np.unique(np.concatenate([problem.late_times(theta, e), *known]))
 
 
@@ -207,23 +209,15 @@ def join_walks(ways: Sequence[Walks]) -> Walks:
     return Walks(*map(np.concatenate, zip(*ways, strict=True)))
 
 
-def trace_walks(
-    walks: Walks,
-    start: Derivatives,
-    smooth: NDArray[np.bool_],
-    evaluate: Callable[[NDArray[np.intp], FloatArray], Derivatives],
-    most: int,
-) -> FloatArray:
+def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -> FloatArray:
     """Go all ways up to their thresholds: pieces (W, `most`, 5), outwards, NaN behind the last, which has no end of its
     own: it holds up to the limit.
 
     Parameters
     ----------
     walks : Walks
-    start : Derivatives
-        Where they begin.
-    smooth : (W,) bool
-        Whether J has one derivative there; if not, that to the side of the way is evaluated.
+    cost : (W,)
+        J where they begin.
     evaluate : callable
         ``evaluate(which, thetas)`` returns the derivatives of some ways (n,) at thetas (n, d), to their sides.
     most : int
@@ -234,13 +228,9 @@ def trace_walks(
     passed, halvings, repeats = np.zeros((3, count), dtype=int)
     theta = walks.theta.copy()
     going = np.arange(count)
-    # One piece a turn for all ways that go on. `at` has derivatives where each stands; `new` says which are to be
-    # evaluated.
-    new, at = ~smooth, Derivatives(*(each.copy() for each in start))
+    # One piece a turn for all ways that go on.
     while going.size:
-        if new.any():
-            for known, found in zip(at, evaluate(going[new], theta[going[new]]), strict=True):
-                known[new] = found
+        at = evaluate(going, theta[going])
         # Ways whose derivatives are not finite end here; what they have so far is kept.
         sound = np.all(np.abs(at.gradient) < LARGEST, axis=1) & np.isfinite(at.hessian).all(axis=(1, 2))
         going, at = going[sound], Derivatives(*(each[sound] for each in at))
@@ -253,17 +243,18 @@ def trace_walks(
         # Another Newton step of the others first, where the one just found would lower J by more than the piece may be
         # wrong.
         repeat = ~lost & (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
-        piece = np.column_stack(
-            [value, own.stops[each, passed[going]], height - start.cost[going], own.side * slope, curvature]
-        )
+        rise, steepness = height - cost[going], own.side * slope
+        ahead = find_first_root(own.threshold - rise, steepness, curvature)
+        reach = np.where(rise >= own.threshold, 0.0, ahead)  # how far it is to the threshold
+        piece = np.column_stack([value, own.stops[each, passed[going]], rise, steepness, curvature])
         # A piece ends at the next stop, or halfway to the threshold where it is not to be trusted as far as that.
-        halfway = _find_halfway(piece, pieces[going, kept[going] - 1], own.threshold, own.side)
+        halfway = _find_halfway(piece, pieces[going, kept[going] - 1], reach, own.threshold, own.side)
         cut = ~repeat & (halvings[going] < MOST_HALVINGS) & ~np.isnan(halfway)
         piece[cut, 1] = halfway[cut]
         passed[going] += ~repeat & ~cut
         halvings[going] += cut
         repeats[going] = np.where(repeat, repeats[going] + 1, 0)
-        ended = _is_end_inside(piece, own.threshold, own.side) | np.isnan(own.stops[each, passed[going]])
+        ended = (reach <= own.side * (piece[:, 1] - value)) | np.isnan(own.stops[each, passed[going]])
         last = lost | (~repeat & ((~cut & ended) | (kept[going] == most - 1)))
         piece[last, 1] = own.limit[last]
         done = ~repeat & ~lost
@@ -275,8 +266,6 @@ def trace_walks(
         moved[each, own.place] = there
         theta[going] = moved
         going = going[~last]
-        new = np.ones(going.size, dtype=bool)
-        at = Derivatives(*(found[~last] for found in at))
     return pieces
 
 
@@ -311,29 +300,21 @@ def _solve_each(matrices: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _find_halfway(
-    pieces: FloatArray, before: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]
+    pieces: FloatArray, before: FloatArray, reach: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]
 ) -> FloatArray:
     """Return where pieces (n, 5) are cut off, halfway to where they reach the threshold; NaN if they hold to the end.
 
     A piece holds if it begins near the threshold, if it ends before it is halfway there, or if the piece before it, of
     NaN for the first one, was right about the rise here: errors of parabolas grow with the third power of their length.
     """
-    start, stop, rise, slope, curvature = pieces.T
+    start, stop, rise, _, _ = pieces.T
     begun, met, height, steepness, bend = before.T
-    reach = find_first_root(thresholds - rise, slope, curvature)
     length = sides * (met - begun)
     error = rise - (height + steepness * length + 0.5 * bend * length**2)
     with np.errstate(invalid="ignore"):  # a piece that never reaches it
         right = np.abs(error) * reach**3 <= RIGHT * thresholds * length**3
         holds = (rise >= NEAR_END**2 * thresholds) | (0.5 * reach >= sides * (stop - start)) | right
         return np.where(holds, np.nan, start + 0.5 * sides * reach)
-
-
-def _is_end_inside(pieces: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which pieces (n, 5) begin above the threshold, or reach it before they end."""
-    start, stop, rise, slope, curvature = pieces.T
-    reach = np.where(rise >= thresholds, 0.0, find_first_root(thresholds - rise, slope, curvature))
-    return np.asarray(reach <= sides * (stop - start))
 
 
 def find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
@@ -411,8 +392,9 @@ def trace_profiles(
         return nothing
     if any(mesh.has_layers for mesh in evaluator.meshes):
         return nothing
-    movable, kinks = _find_movable(fit), {kink.unknown for kink in fit.kinks}
-    at, places = fit.theta[None], []
+    # Unknowns that are free one by one, and have an effect on J.
+    movable = (np.sum(fit.free_basis**2, axis=1) > 1 - 1e-9) & fit.hessian.any(axis=1)
+    kinks, at, places = {kink.unknown for kink in fit.kinks}, fit.theta[None], []
     ways: list[Walks] = []
     for e, k in list_transitions(problem):
         samples = stack_sample_times(problem, at, e)
@@ -428,11 +410,8 @@ def trace_profiles(
         found = [follower(theta, side) for theta, side in zip(thetas, walks.side[which].tolist(), strict=True)]
         return Derivatives(*(np.array([getattr(one, name) for one in found]) for name in Derivatives._fields))
 
-    count = len(walks.place)
-    start = Derivatives(*(np.array([each] * count) for each in (fit.cost, fit.gradient, fit.hessian)))
-    smooth = np.zeros(count, dtype=bool)
     most = MOST_PIECES + MOST_HALVINGS + 1
-    pieces = trace_walks(walks, start, smooth, evaluate, most).reshape(-1, 2, most, PIECE)
+    pieces = trace_walks(walks, np.full(len(walks.place), fit.cost), evaluate, most).reshape(-1, 2, most, PIECE)
     known = ~np.isnan(pieces[..., 0])
     complete = known[:, :, 0].all(axis=1)
     return pieces[complete, :, : int(known.sum(axis=2).max())], np.array(places)[complete]
@@ -459,12 +438,6 @@ def is_any_near(samples: FloatArray, values: FloatArray, errors: FloatArray) -> 
     with np.errstate(invalid="ignore"):
         near = np.abs(samples - values[:, None]) <= NEAR * errors[:, None]
     return np.asarray((errors > 0) & near.any(axis=1))
-
-
-def _find_movable(fit: Fit) -> Any:
-    """Return which unknowns are free one by one, and have an effect on J: (d,) of bool."""
-    Z = fit.free_basis
-    return (np.sum(Z * Z, axis=1) > 1 - 1e-9) & fit.hessian.any(axis=1)
 
 
 def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArray:

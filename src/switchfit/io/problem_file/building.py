@@ -13,7 +13,7 @@ from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any
 
-from switchfit.estimation.saved import FileDigest, Provenance, describe_platform, find_versions, make_relative
+from switchfit.estimation.estimator import FileDigest, Provenance, describe_platform, find_versions, make_relative
 from switchfit.io.logs import find_logs
 from switchfit.io.problem_file.experiments import (
     Runs,

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import make_relative
+from switchfit.estimation.estimator import Estimate, make_relative
 from switchfit.io.first_problem import write_table
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.user_files import replace_files

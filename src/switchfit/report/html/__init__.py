@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 
-from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import Provenance, describe_python_problem
+from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
 from switchfit.report.sentences import join_words
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.presentation import format_page
