@@ -334,9 +334,8 @@ def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
     psi, _, Omega_p = adjoints
     Dp_x, f, ell = d
     first = psi @ f.Dp + ell.Dp  # (9)
-    second = (
-        f.Dp.T @ Omega_p + contract(psi, f.DpDp) + contract(psi, f.D1Dp @ Dp_x) + ell.DpDp + ell.D1Dp @ Dp_x
-    )  # (14)
+    of_f = f.Dp.T @ Omega_p + contract(psi, f.DpDp) + contract(psi, f.D1Dp @ Dp_x)
+    second = of_f + ell.DpDp + ell.D1Dp @ Dp_x  # (14)
     return Quadratures(first, second)
 
 
