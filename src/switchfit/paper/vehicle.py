@@ -35,8 +35,6 @@ COLUMN, PAGE = 3.5, 7.16
 DARK, RED, BLUE, LIGHT = "#222222", "#b2182b", "#4a7fb5", "#b5b5b5"
 SYMBOLS = {"tau_1": r"$\tau_1$", "tau_2": r"$\tau_2$", "mu": r"$\mu$"}
 
-
-TITLE = "The vehicle (Fig. 2)"
 #: Length and width of a wheel as drawn (m).
 WHEEL = (0.22, 0.08)
 #: Heading as drawn (degrees), and length of the longest force (m).
@@ -72,7 +70,7 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
+def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> None:
     """Set labels at a size for one column, a thin frame, and the letter of the panel."""
     ax.set_xlabel(xlabel, fontsize=8)
     ax.set_ylabel(ylabel, fontsize=8)
@@ -80,7 +78,6 @@ def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
     ax.spines[["top", "right"]].set_visible(False)
     if letter:
         ax.set_title(letter, loc="left", fontsize=8)
-    return ax
 
 
 def conditions(found: Found) -> str:
@@ -252,13 +249,13 @@ def summary(fit: Estimate) -> dict[str, Any]:
     }
 
 
-def compute(quick: bool, folder: Path, say: Say) -> Found:
+def compute_vehicle(quick: bool, folder: Path, say: Say) -> Found:
     """Return the lengths (m) and the forces in slip (N) of the model."""
     settings = inspect.signature(skid_steer).parameters
     return {name: settings[name].default for name in ("B_l", "B_w", "a", "b")} | {"forces": list(SLIP_FORCES)}
 
 
-def draw(found: Found) -> dict[str, Figure]:
+def draw_vehicle(found: Found) -> dict[str, Figure]:
     """Draw the vehicle in slip, turning to the left: wheels with their forces, friction against the lateral speed."""
     from matplotlib.patches import Rectangle
     from matplotlib.transforms import Affine2D
@@ -299,8 +296,3 @@ def draw(found: Found) -> dict[str, Figure]:
     ax.tick_params(labelsize=7)
     ax.legend(frameon=False, fontsize=6.5, loc="lower right")
     return {"fig2-vehicle": figure}
-
-
-def rows(found: Found) -> list[Row]:
-    """Return no lines."""
-    return []
