@@ -29,7 +29,7 @@ KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
     f"engine/native/{name}.py" for name in ("kernels", "segments", "templates", "elimination", "llvm")
 )
 BEAM, FITTER, MODE_POOL = "strategy/beam.py", "modes/fitter.py", "modes/hunt.py"
-ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design/criterion.py"
+ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design.py"
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]

@@ -10,10 +10,11 @@ import pytest
 from models import STILL, charge, curve, decay, first_state
 
 import switchfit as sf
-from switchfit.experiment_design.criterion import (
+from switchfit.experiment_design import (
     Candidates,
     Criterion,
     Nominal,
+    _build_criterion,
     _describe,
     choose_samples,
     differentiate_criterion,
@@ -21,7 +22,6 @@ from switchfit.experiment_design.criterion import (
     simulate_values,
     stack_inputs,
 )
-from switchfit.experiment_design.search import _build_criterion
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import heater_problem
 from switchfit.problem.functions import use_float64
@@ -227,7 +227,7 @@ def test_no_exchange_of_one_sample_is_better():
         def rate(F):
             return -np.linalg.slogdet(F)[1]
 
-        value, taken = choose_samples(candidates, [np.array([2, 3])], rate)
+        value, taken = choose_samples(candidates, np.array([2, 3]), rate)
         np.testing.assert_array_equal(np.bincount(sensor, taken), [2, 3])
         for out, into in product(np.flatnonzero(taken), np.flatnonzero(~taken)):
             if sensor[out] == sensor[into]:
