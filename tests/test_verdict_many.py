@@ -9,8 +9,8 @@ import pytest
 from test_batch import ROOM, TIMES, TRUTH
 
 import switchfit as sf
+from switchfit.batch.fits import FAR_AWAY, _count_collapsed, measure_distances
 from switchfit.batch.program import CHUNK
-from switchfit.batch.verdict import FAR_AWAY, _count_collapsed, measure_distances
 from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")

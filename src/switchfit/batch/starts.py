@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.fits import Fits, judge_failed_starts
 from switchfit.batch.program import Limits, describe_failure
-from switchfit.batch.study import Study
-from switchfit.batch.verdict import judge_failed_starts
+from switchfit.batch.study import LongRun, Study, repeat
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
