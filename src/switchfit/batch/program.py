@@ -139,6 +139,8 @@ class Inputs(NamedTuple):
     variables : Variables
         Those that the optimiser has in place of theta.
     lower, upper : (d,), bounds of theta
+    constraints : Constraints
+        On the variables.
     """
 
     arguments: tuple[Arguments, ...]
@@ -148,15 +150,22 @@ class Inputs(NamedTuple):
     variables: Variables
     lower: Any
     upper: Any
+    constraints: Constraints
 
     @classmethod
     def of(cls, evaluator: Evaluator, layout: Layout) -> Inputs:
         """Return those of a problem on the meshes of an evaluator."""
-        unknowns, natively = evaluator.problem.unknowns, layout.natively
-        times = tuple(experiment.initial_times_with_jumps for experiment in evaluator.problem.experiments)
-        sequences = tuple(places_in_library(structure) if natively else {} for structure in evaluator.structures)
-        of_theta = unknowns.priors, unknowns.variables, unknowns.lower, unknowns.upper
-        return cls(tuple(evaluator.arguments), times, sequences, *of_theta)
+        problem, unknowns, variables = (
+            evaluator.problem,
+            evaluator.problem.unknowns,
+            evaluator.problem.unknowns.variables,
+        )
+        times = tuple(experiment.initial_times_with_jumps for experiment in problem.experiments)
+        sequences = tuple(places_in_library(each) if layout.natively else {} for each in evaluator.structures)
+        limits: list[Any] = [variables.inward(unknowns.lower), variables.inward(unknowns.upper)]
+        rows: list[Any] = [unknowns.A, unknowns.b, *limits, variables.sizes_inward(problem.sizes)]
+        of_theta = unknowns.priors, variables, unknowns.lower, unknowns.upper
+        return cls(tuple(evaluator.arguments), times, sequences, *of_theta, Constraints(*rows))
 
     def find_theta(self, z: Any) -> Any:
         """Return theta (d,) at z, the variables of the optimiser."""
@@ -434,16 +443,11 @@ class Batch:
 
     def _run_program(self, starts: FloatArray) -> Outcome:
         """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""
-        problem, limits = self.evaluator.problem, self.limits
-        unknowns, variables = problem.unknowns, problem.unknowns.variables
-        bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
-        numbers: list[Any] = [unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes)]
-        constraints = Constraints(*numbers)
         # What it does not settle has as many iterations left for the optimiser that finishes it.
-        limits = limits._replace(max_iterations=limits.max_iterations // 2)
-        padded = pad_fits(variables.inward(starts), self.layout.size)
+        limits = self.limits._replace(max_iterations=self.limits.max_iterations // 2)
+        inward = self.evaluator.problem.unknowns.variables.inward(starts)
         try:
-            found = self._run(_minimize_fits, constraints, limits, padded, len(starts))
+            found = self._run(_minimize_fits, limits, pad_fits(inward, self.layout.size), len(starts))
         except Exception as error:
             # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
@@ -502,7 +506,6 @@ class Batch:
 def _minimize_fits(
     inputs: Inputs,
     values: tuple[jax.Array, ...],
-    constraints: Constraints,
     limits: Limits,
     starts: jax.Array,
     count: jax.Array,
@@ -510,7 +513,6 @@ def _minimize_fits(
     layout: Layout,
 ) -> Outcome:
     """Return the outcomes of the first `count` fits."""
-
     variables = inputs.variables
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
@@ -521,7 +523,7 @@ def _minimize_fits(
             return J, *variables.derivatives_inward(theta, g, H, jnp)
 
         breakpoints = _list_breakpoints(layout, replace_leaves(inputs.arguments, layout.varying, own))
-        found = minimize_traced(evaluate, start, constraints, breakpoints, **limits._asdict())
+        found = minimize_traced(evaluate, start, inputs.constraints, breakpoints, **limits._asdict())
         theta = inputs.find_theta(found.theta)
         left = variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
         gradient, hessian = variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
@@ -595,12 +597,9 @@ def describe_failure(error: BaseException) -> str:
 
 def describe_error(error: BaseException) -> str:
     """Return kind and text of an error on one line; of an error in a callback, those of the original error."""
-    text = str(error)
-    if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
-        raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
-        text = raised[-1] if raised else text
-    else:
-        text = f"{type(error).__name__}: {text}"
+    # JAX hands on what a callback raised as text, whose last such line says what it was.
+    raised = [line for line in str(error).splitlines() if RAISED.match(line)]
+    text = raised[-1] if raised else f"{type(error).__name__}: {error}"
     return " ".join(text.split())[:LONGEST_ERROR]
 
 
