@@ -195,7 +195,7 @@ LIMITS = Limits(1e-7, 200)
 
 
 def work_of(problem, truth, start, noise=None, seed=3):
-    return module.build_study(problem, 1, truth, start, noise, seed, LIMITS)[0]
+    return module.build_study(problem, truth, start, noise, seed, LIMITS)[0]
 
 
 def reference_room():

@@ -171,7 +171,7 @@ def test_a_kink_has_an_interval_with_jax_too():
 
 def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
     problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
-    work, _ = simulated.build_study(problem, 200, truth, truth, None, 0, Limits(1e-7, 200))
+    work, _ = simulated.build_study(problem, truth, truth, None, 0, Limits(1e-7, 200))
     before = [program._cache_size() for program in (_minimize_fits, _evaluate_fits)]
     whole, *parts = (work(runs) for runs in (range(128), range(50), range(50, 128)))
     after = [program._cache_size() for program in (_minimize_fits, _evaluate_fits)]

@@ -41,12 +41,7 @@ MANY = 8
 
 
 def run_chunks(
-    work: Any,
-    count: int,
-    *,
-    client: Any = None,
-    folder: str | Path | None = None,
-    progress: Progress = lambda *done: None,
+    work: Any, count: int, *, client: Any = None, folder: Path | None = None, progress: Progress = lambda *done: None
 ) -> tuple[NDArray[np.intp], Arrays]:
     """Do all runs 0 .. count - 1, in chunks.
 
@@ -78,7 +73,7 @@ def run_chunks(
         If the folder holds the chunks of something else.
     """
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
-    store = None if folder is None else _Store(Path(folder), work.fingerprint())
+    store = None if folder is None else _Store(folder, work.fingerprint())
     stored = {chunk: store.load(chunk) if store else None for chunk in chunks}
     results = {chunk: arrays for chunk, arrays in stored.items() if arrays is not None}
     missing = [chunk for chunk in chunks if chunk not in results]

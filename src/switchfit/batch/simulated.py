@@ -33,6 +33,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -217,7 +218,7 @@ def monte_carlo(
     begin = None if start is None else problem.check_theta(start, "start")
     truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
     begin = truth if begin is None else begin
-    study, error = build_study(problem, runs, truth, begin, noise, seed, how.limits)
+    study, error = build_study(problem, truth, begin, noise, seed, how.limits)
     return MonteCarlo(**repeat(problem, study, runs, "Monte Carlo", how), truth=truth, integration_error=error)
 
 
@@ -238,13 +239,13 @@ def _check_noise(noise: Noise) -> Noise:
 
 
 def build_study(
-    problem: Problem, runs: int, truth: FloatArray, begin: FloatArray, noise: Noise, seed: int, limits: Limits
+    problem: Problem, truth: FloatArray, begin: FloatArray, noise: Noise, seed: int, limits: Limits
 ) -> tuple[SimulatedStudy, float]:
     """Return fits of simulated data, to be done by `repeat`, and the integration error at the truth.
 
     Parameters
     ----------
-    problem, runs, noise, seed : as of `monte_carlo`
+    problem, noise, seed : as of `monte_carlo`
     truth, begin : (d,)
         Where the data are simulated, and where every fit begins.
     limits : Limits
@@ -262,8 +263,8 @@ def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     """Return what data would be without noise."""
     runs, places = [], []
     for e, experiment in enumerate(problem.experiments):
-        items = {k: _sample(item, experiment) for k, item in enumerate(experiment.data)}
-        items = {k: item for k, item in items.items() if item is not None}
+        sampled_items = ((k, _sample(item, experiment)) for k, item in enumerate(experiment.data))
+        items = {k: item for k, item in sampled_items if item is not None}
         if not items:
             raise ValueError("monte_carlo needs Measurements or a ReferenceSignal made from samples to simulate.")
         runs.append(replace(experiment, data=list(items.values())))
@@ -387,22 +388,18 @@ class SimulatedStudy(Study):
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
         (leaves, places), changed = self.leaves, dict[int, Any]()
         for e, experiment in enumerate(self.problem.experiments):
-            measured = channel = 0
+            samples, signals, channel = iter(places[e].samples), places[e].signals, 0
             for k, item in enumerate(experiment.data):
                 if isinstance(item, Measurements):
-                    leaf = places[e].samples[measured].value
-                    padded = np.zeros((len(values[e, k]), *leaves[leaf].shape))
-                    padded[:, : len(item.times)] = np.where(np.isnan(item.values), 0.0, values[e, k])
-                    changed[leaf] = padded
-                    measured += 1
+                    leaf = next(samples).value
+                    changed[leaf] = np.zeros((len(values[e, k]), *leaves[leaf].shape))
+                    changed[leaf][:, : len(item.times)] = np.where(np.isnan(item.values), 0.0, values[e, k])
                 elif isinstance(item, ReferenceSignal):
                     q = item.signal.channels
                     if (e, k) in values:
-                        leaf = places[e].signals
-                        R = len(values[e, k])
-                        if leaf not in changed:
-                            changed[leaf] = np.repeat(np.asarray(leaves[leaf])[None], R, axis=0)
-                        changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
+                        every = np.repeat(np.asarray(leaves[signals])[None], len(values[e, k]), axis=0)
+                        cells = _find_cells(item, values[e, k], self.meshes[e])
+                        changed.setdefault(signals, every)[..., channel : channel + q] = cells
                     channel += q
         return changed
 
@@ -590,8 +587,7 @@ def bootstrap(
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
     _check_data(problem)
-    size = 1
-    resampled = np.ones(len(estimate.theta), dtype=bool)
+    size, resampled = 1, np.ones(len(estimate.theta), dtype=bool)
     if resample == "runs":
         if len(problem.experiments) < 2:
             raise ValueError("resample='runs' needs two experiments or more; this problem has one. Take 'residuals'.")
@@ -600,8 +596,8 @@ def bootstrap(
         resampled[np.concatenate([where[where >= 0] for where in problem.unknowns.times])] = False
     else:
         draw = _Draw(estimate, problem, resample, block)
+        study, _ = build_study(problem, estimate.theta, estimate.theta, draw, seed, how.limits)
         size = draw.block
-        study, _ = build_study(problem, runs, estimate.theta, estimate.theta, draw, seed, how.limits)
     acceleration = _compute_acceleration(estimate, by_run=resample == "runs")
     return Bootstrap(
         **repeat(problem, study, runs, "Bootstrap", how),
@@ -615,12 +611,9 @@ def bootstrap(
 
 
 def _check_data(problem: Problem) -> None:
-    for experiment in problem.experiments:
-        for item in experiment.data:
-            if not isinstance(item, Measurements):
-                raise ValueError(
-                    f"a bootstrap resamples Measurements; this problem has a {type(item).__name__} as well."
-                )
+    for item in (item for experiment in problem.experiments for item in experiment.data):
+        if not isinstance(item, Measurements):
+            raise ValueError(f"a bootstrap resamples Measurements; this problem has a {type(item).__name__} as well.")
     if not problem.is_least_squares and problem.has_plain_samples:
         raise ValueError(
             "a bootstrap takes least squares alone: no sigma and no delay that is a parameter, no robust loss and no "
@@ -650,24 +643,20 @@ class _Draw:
     """The noise of one run: as `monte_carlo` takes it."""
 
     def __init__(self, estimate: Estimate, problem: Problem, resample: str, block: int | None) -> None:
-        self.resample = resample
+        self.resample, self.block = resample, 1
         inflation = np.sqrt(estimate.samples / max(estimate.freedom, 1))
-        self.items: list[Measurements] = []
+        self.items = [item for experiment in problem.experiments for item in experiment.data]
         self.pools: list[FloatArray] = []
-        for experiment, comparisons in zip(problem.experiments, estimate.comparisons, strict=True):
-            for item, comparison in zip(experiment.data, comparisons, strict=True):
-                residuals = inflation * comparison.residuals / _get_sigma(item)
-                centred = residuals if resample == "wild" else residuals - np.nanmean(residuals, axis=0)
-                self.items.append(item)
-                self.pools.append(centred)
-        self.block = 1
+        for item, comparison in zip(self.items, chain.from_iterable(estimate.comparisons), strict=True):
+            residuals = inflation * comparison.residuals / _get_sigma(item)
+            self.pools.append(residuals if resample == "wild" else residuals - np.nanmean(residuals, axis=0))
         if resample == "blocks":
-            longest = max(len(item.times) for item in self.items)
-            self.block = self._length() if block is None else as_count(block, "block")
+            longest = max(map(len, self.pools))
+            self.block = self._length(longest) if block is None else as_count(block, "block")
             if not 1 <= self.block <= longest:
                 raise ValueError(f"block must lie between 1 and the {longest} samples there are; got {block}.")
 
-    def _length(self) -> int:
+    def _length(self, longest: int) -> int:
         """Return the length of a block, by the channel with the largest correlation of neighbours."""
         lengths = [1.0]
         for pool in self.pools:
@@ -676,22 +665,19 @@ class _Draw:
                 if len(known) > 2:
                     r = min(float(compute_autocorrelation(known, 1)[0]), 0.99)
                     lengths.append((np.sqrt(6) * r / (1 - r**2)) ** (2 / 3) * len(known) ** (1 / 3) if r > 0 else 1.0)
-        return max(1, min(round(max(lengths)), max(len(pool) for pool in self.pools) // 2))
+        return max(1, min(round(max(lengths)), longest // 2))
 
     def __call__(self, rng: np.random.Generator, clean: FloatArray, item: Any) -> FloatArray:
-        pool = self.pools[next(k for k, own in enumerate(self.items) if own is item)]
+        pool = next(pool for own, pool in zip(self.items, self.pools, strict=True) if own is item)
         K = len(pool)
         if self.resample == "wild":
             drawn = np.nan_to_num(pool) * rng.choice([-1.0, 1.0], size=(K, 1))
         else:
-            blocks = -(-K // self.block)
-            first = rng.integers(K, size=(blocks, 1))
-            rows = ((first + np.arange(self.block)) % K).ravel()[:K]
-            drawn = pool[rows]
+            first = rng.integers(K, size=(-(-K // self.block), 1))
+            drawn = pool[((first + np.arange(self.block)) % K).ravel()[:K]]
             # Where a moment was drawn at which a channel has no value, that channel draws by itself.
             for k, channel in enumerate(drawn.T):
-                missing = np.isnan(channel)
-                known = pool[np.isfinite(pool[:, k]), k]
+                missing, known = np.isnan(channel), pool[np.isfinite(pool[:, k]), k]
                 if missing.any():
                     drawn[missing, k] = rng.choice(known, size=int(missing.sum())) if len(known) else 0.0
         return clean + drawn * _get_sigma(item)

@@ -331,7 +331,7 @@ class LongRun(NamedTuple):
 
     limits: Limits
     client: Any
-    folder: str | Path | None
+    folder: Path | None
     callback: Callable[[int, int], object] | None
     began: float
 
@@ -341,8 +341,7 @@ class LongRun(NamedTuple):
         limits = Limits(*check_settings(tolerance, max_iterations))
         if client is not None and not hasattr(client, "submit"):
             raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
-        if folder is not None:
-            as_path(folder, "folder")
+        folder = None if folder is None else as_path(folder, "folder")
         if callback is not None:
             as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
         return cls(limits, client, folder, callback, time.perf_counter())
