@@ -390,7 +390,7 @@ AT_END = 1e-9
 
 
 def describe_ends(
-    problem: Problem, theta: FloatArray, cost: FloatArray, variation: FloatArray | float
+    problem: Problem, theta: FloatArray, cost: FloatArray, variation: FloatArray
 ) -> dict[str, NDArray[Any]]:
     """Return the fields `samples`, `explained`, `collapsed` and `at_bounds` of `Fits`, (R,) each.
 
@@ -400,24 +400,21 @@ def describe_ends(
         Its bounds, modes and horizons; its data may differ from those that were fitted.
     theta : (R, d)
     cost : (R,)
-    variation : float or (R,)
+    variation : (R,)
         Sum of `switchfit.fit.evaluator.measure_variation` over the experiments.
     """
     unknowns, priors = problem.unknowns, problem.unknowns.priors
     squares = cost - np.array([priors.evaluate(each)[0] for each in theta]) if priors.any else cost
-    total = np.broadcast_to(np.asarray(variation, dtype=float), cost.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
-        explained = np.where(total == 0, np.where(squares <= 0, 1.0, 0.0), 1 - squares / total)
-    free = ~unknowns.is_time
-    near = AT_END * np.maximum(np.abs(theta), 1e-300)
-    with np.errstate(invalid="ignore"):
+        explained = np.where(variation == 0, squares <= 0, 1 - squares / variation)
+        near = AT_END * np.abs(theta)
         held = (theta <= unknowns.lower + near) | (theta >= unknowns.upper - near)
         collapsed = sum(map(partial(_count_collapsed, problem), problem.experiments, problem.ends_of_modes(theta)))
     return {
         "samples": np.full(len(cost), count_samples(problem)),
-        "explained": np.where(np.isnan(total) | np.isnan(cost), np.nan, explained),
+        "explained": np.where(np.isnan(variation) | np.isnan(cost), np.nan, explained),
         "collapsed": np.asarray(collapsed, dtype=np.int64),
-        "at_bounds": np.sum(held & free & ~np.isnan(theta), axis=1).astype(np.int64),
+        "at_bounds": np.sum(held & ~unknowns.is_time, axis=1),
     }
 
 
@@ -479,17 +476,19 @@ def find_doubts(fits: Mapping[str, NDArray[Any]], sigma_known: bool | None, prio
         Fields of `Fits`: `status`, `cost`, `hessian`, `free`, `samples`, `explained`, `collapsed`, `at_bounds`.
     sigma_known, priors : as of `Fits`
     """
-    status, explained = fits["status"], fits["explained"]
-    collapsed = np.where(status == Status.COLLAPSED.name, 1, fits["collapsed"])
-    numbers = Numbers(has_converged(status), explained=explained, collapsed=collapsed, references=sigma_known is None)
-    has_shares = bool(np.isfinite(explained).any())
-    if has_shares or sigma_known is not None:
-        smallest = _find_smallest(fits["hessian"], fits["free"], status)
-        numbers = replace(numbers, at_bounds=fits["at_bounds"], smallest=smallest)
-    if has_shares and sigma_known is not None:
-        numbers = replace(numbers, freedom=fits["samples"] + priors - fits["free"])
+    status, explained, freedom = fits["status"], fits["explained"], fits["samples"] + priors - fits["free"]
+    has_noise, has_shares = sigma_known is not None, bool(np.isfinite(explained).any())
+    numbers = Numbers(
+        has_converged(status),
+        explained=explained,
+        freedom=freedom if has_noise and has_shares else np.inf,
+        collapsed=np.where(status == Status.COLLAPSED.name, 1, fits["collapsed"]),
+        at_bounds=fits["at_bounds"] if has_noise or has_shares else 0,
+        smallest=_find_smallest(fits["hessian"], fits["free"], status),
+        references=not has_noise,
+    )
     if has_shares and sigma_known:
-        probability, known = compare_with_sigma(2 * fits["cost"], numbers.freedom, tests=len(status))
+        probability, known = compare_with_sigma(2 * fits["cost"], freedom, tests=len(status))
         numbers = replace(numbers, probability=probability, known=known)
     return answers.find_doubts(numbers)
 
@@ -519,7 +518,6 @@ def judge_study(
     fits: Fits,
     *,
     truth: FloatArray | None = None,
-    intervals: FloatArray | None = None,
     error: float = 0.0,
     origin: Verdict | None = None,
     considered: NDArray[np.bool_] | None = None,
@@ -531,8 +529,6 @@ def judge_study(
     fits : Fits
     truth : (d,), optional
         What all of them should find.
-    intervals : (R, d, 2), optional
-        Of each fit, at `LEVEL`.
     error : float
         Integration error of J, relative.
     origin : Verdict, optional
@@ -562,8 +558,8 @@ def judge_study(
             found.append(Finding("doubtful", _count(fits, doubt), (step,)))
         elif doubt.kind in EXPLAINED_BADLY and origin is None and np.any(doubt.which & ~elsewhere):
             found.append(Finding("doubtful", _count(fits, doubt), ("check sigma",)))
-    if truth is not None and intervals is not None:
-        found += _check_coverage(fits, truth, intervals, ended & ~elsewhere)
+    if truth is not None:
+        found += _check_coverage(fits, truth, ended & ~elsewhere)
     if not error <= FINE:
         found.append(Finding("bad", Issue("integration error", ("J",), {"error": error}), ("smaller rtol",)))
     found += _find_stop(fits)
@@ -615,11 +611,9 @@ def _find_smallest(H: FloatArray, free: NDArray[np.int64], status: NDArray[np.st
     return found
 
 
-def _check_coverage(
-    fits: Fits, truth: FloatArray, intervals: FloatArray, counted: NDArray[np.bool_]
-) -> Iterator[Finding]:
+def _check_coverage(fits: Fits, truth: FloatArray, counted: NDArray[np.bool_]) -> Iterator[Finding]:
     """Find unknowns whose intervals hold the truth less often than they should."""
-    low, high = np.moveaxis(intervals[counted], 2, 0)
+    low, high = np.moveaxis(fits.confidence_intervals(LEVEL)[counted], 2, 0)
     known = ~np.isnan(low).all(axis=0) if len(low) else np.zeros(low.shape[1], dtype=bool)
     if not known.any():
         return

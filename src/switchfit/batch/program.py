@@ -78,7 +78,6 @@ class Layout:
     """What the compiled program depends on: structures, and where in theta each experiment's unknowns stand."""
 
     structures: tuple[Structure, ...]  # where machine code evaluates J, what their sequences have in common alone
-    transitions: tuple[int, ...]
     places: tuple[tuple[int, ...], ...]  # of the N transition times and M parameters, -1 where fixed
     varying: tuple[int, ...]
     lockstep: bool
@@ -116,7 +115,6 @@ def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = (), *, on_gpu
     natively = not on_gpu and problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
     return Layout(
         tuple(structure.library for structure in structures) if natively else structures,
-        tuple(structure.N for structure in structures),
         tuple(tuple(int(k) for k in places) for places in problem.places),
         varying=varying,
         lockstep=not natively and has_gpu(),
@@ -180,8 +178,8 @@ class Inputs(NamedTuple):
         arguments, d = replace_leaves(self.arguments, layout.varying, own), theta.shape[0]
         J, g, curvature = self.priors.evaluate(theta, jnp)
         H, extended = jnp.diag(curvature), jnp.append(theta, 0.0)
-        for group in _group_experiments(layout, arguments, self.sequences):
-            structure, N = layout.structures[group[0]], layout.transitions[group[0]]
+        for group in _group_experiments(layout, arguments, self):
+            structure, N = layout.structures[group[0]], len(self.times[group[0]])
             where = np.array([layout.places[e] for e in group])
             where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
             fixed = jnp.stack([self.times[e] for e in group])
@@ -213,15 +211,14 @@ def replace_leaves(
     return tuple(jax.tree.unflatten(tree, leaves))
 
 
-def _group_experiments(
-    layout: Layout, arguments: tuple[Arguments, ...], sequences: Sequence[Mapping[str, Any]]
-) -> list[list[int]]:
+def _group_experiments(layout: Layout, arguments: tuple[Arguments, ...], inputs: Inputs) -> list[list[int]]:
     """Return groups of experiments with the same structure and array shapes, which one loop can evaluate."""
     groups: dict[Any, list[int]] = {}
-    given = zip(layout.structures, layout.transitions, arguments, sequences, strict=True)
-    for e, (structure, N, own, sequence) in enumerate(given):
-        shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(own))
-        groups.setdefault((structure, N, shapes, tuple(sorted(sequence))), []).append(e)
+    for e, (structure, *own) in enumerate(
+        zip(layout.structures, arguments, inputs.times, inputs.sequences, strict=True)
+    ):
+        leaves, tree = jax.tree.flatten(own)
+        groups.setdefault((structure, tree, tuple(map(np.shape, leaves))), []).append(e)
     return list(groups.values())
 
 
@@ -522,7 +519,7 @@ def _minimize_fits(
             J, g, H = inputs.evaluate(layout, own, theta, side)
             return J, *variables.derivatives_inward(theta, g, H, jnp)
 
-        breakpoints = _list_breakpoints(layout, replace_leaves(inputs.arguments, layout.varying, own))
+        breakpoints = _list_breakpoints(layout, inputs.times, replace_leaves(inputs.arguments, layout.varying, own))
         found = minimize_traced(evaluate, start, inputs.constraints, breakpoints, **limits._asdict())
         theta = inputs.find_theta(found.theta)
         left = variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
@@ -562,12 +559,12 @@ def _evaluate_fits(
     return lax.fori_loop(0, count, one, empty)
 
 
-def _list_breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
+def _list_breakpoints(layout: Layout, times: tuple[Any, ...], arguments: tuple[Arguments, ...]) -> Breakpoints:
     """Return the nodes of each free transition time; these are not scaled."""
     nodes = {
         place: own.nodes
-        for own, N, places in zip(arguments, layout.transitions, layout.places, strict=True)
-        for place in places[:N]
+        for own, tau, places in zip(arguments, times, layout.places, strict=True)
+        for place in places[: len(tau)]
         if place >= 0
     }
     if not nodes:

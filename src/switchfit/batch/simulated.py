@@ -40,7 +40,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.fits import LEVEL, Fits, judge_study
+from switchfit.batch.fits import Fits, judge_study
 from switchfit.batch.program import Limits, Varying
 from switchfit.batch.study import LongRun, Study, repeat
 from switchfit.discretization.mesh import Mesh, split_by_cell
@@ -97,8 +97,7 @@ class MonteCarlo(Fits):
         """Whether to believe the study: how many fits converged, in the same minimum as the others, whether chi-square
         confirms them, and whether their 95 % intervals hold the truth. Print it for a line.
         """
-        intervals = self.confidence_intervals(LEVEL)
-        return judge_study(self, truth=self.truth, intervals=intervals, error=self.integration_error)
+        return judge_study(self, truth=self.truth, error=self.integration_error)
 
     @property
     def errors(self) -> FloatArray:
