@@ -6,7 +6,6 @@ Run all parts: figures, ``results.json``, and the table that compares the paper'
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
@@ -25,8 +24,8 @@ class Part(NamedTuple):
     Attributes
     ----------
     title : str
-    compute : callable ``(quick, folder, say)``
-        Returns results as plain numbers and lists, and keeps what its long studies have done in the folder.
+    compute : callable ``(quick, say)``
+        Returns results as plain numbers and lists.
     draw : callable
         Returns figures drawn from these results alone, by the names of their files.
     list_rows : callable
@@ -34,7 +33,7 @@ class Part(NamedTuple):
     """
 
     title: str
-    compute: Callable[[bool, Path, Say], Found]
+    compute: Callable[[bool, Say], Found]
     draw: Callable[[Found], dict[str, Figure]] = lambda found: {}
     list_rows: Callable[[Found], list[Row]] = lambda found: []
 
@@ -80,41 +79,26 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = l
         For an unknown part.
     OSError
         If a file cannot be written.
-
-    Notes
-    -----
-    Finished parts are stored in a hidden folder in `out` until the run is complete. After an interruption (by
-    KeyboardInterrupt), the same call resumes.
     """
     if only is not None and only not in PARTS:
         raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
     names = list(PARTS) if only is None else [only]
-    unfinished = out / f".unfinished-{version('switchfit')}-{'quick' if quick else 'full'}-{only or 'all'}"
-    unfinished.mkdir(parents=True, exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
     is_kept = only is not None and (out / RESULTS).exists()
     results: dict[str, Any] = json.loads((out / RESULTS).read_bytes()) if is_kept else {}
     for number, name in enumerate(names, start=1):
-        part, place = PARTS[name], f"[{number}/{len(names)}] {PARTS[name].title}"
-        kept = unfinished / f"{name}.json"
-        if kept.exists():
-            entry = json.loads(kept.read_bytes())
-            say(f"{place}: done before the interruption")
-        else:
-            began = time.perf_counter()
-            found = part.compute(quick, unfinished / name, lambda text, place=place: say(f"{place}: {text}"))
-            entry = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
-            write_atomically(json.dumps(entry), kept)
-        results[name] = entry
-        for title, figure in part.draw(entry["found"]).items():
+        part, place, began = PARTS[name], f"[{number}/{len(names)}] {PARTS[name].title}", time.perf_counter()
+        found = part.compute(quick, lambda text, place=place: say(f"{place}: {text}"))
+        results[name] = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
+        for title, figure in part.draw(found).items():
             for kind in ("pdf", "png"):
                 content = BytesIO()
                 figure.savefig(content, dpi=200, format=kind)
                 write_atomically(content.getvalue(), out / f"{title}.{kind}")
-    results = {name: results[name] for name in PARTS if name in results}
-    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items())  # one a part
-    write_atomically(f"{{\n{lines}\n}}\n", out / RESULTS)
-    write_atomically(table(results), out / TABLE)
-    shutil.rmtree(unfinished)
+        results = {name: results[name] for name in PARTS if name in results}
+        lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items())  # one a part
+        write_atomically(f"{{\n{lines}\n}}\n", out / RESULTS)
+        write_atomically(table(results), out / TABLE)
     return results
 
 

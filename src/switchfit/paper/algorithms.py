@@ -11,7 +11,6 @@ involving the matrix exponential, IEEE Trans. Automat. Control 23 (1978) 395-404
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -50,7 +49,7 @@ def fit_kinds(problem: Problem, kinds: Sequence[HessianKind], say: Say) -> dict[
     return found
 
 
-def compute_convergence(quick: bool, folder: Path, say: Say) -> Found:
+def compute_convergence(quick: bool, say: Say) -> Found:
     """Fit with every algorithm, to 1e-7."""
     problem = vehicle.build_simulated_problem()
     found: Found = {
@@ -194,7 +193,7 @@ def _cost(theta: Any) -> Any:
     return J
 
 
-def compute_lti(quick: bool, folder: Path, say: Say) -> Found:
+def compute_lti(quick: bool, say: Say) -> Found:
     """Return derivatives against the closed form, and the three algorithms."""
     here = build_oscillator()
     say("derivatives")

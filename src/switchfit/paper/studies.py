@@ -13,7 +13,6 @@ depends on the unknowns.
 from __future__ import annotations
 
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,7 +47,7 @@ def build_problem(method: str, sigma: float) -> Problem:
     return vehicle.fit_positions(path, TIMES, vehicle.START, sigma or 1.0, HORIZON)
 
 
-def compute_noise(quick: bool, folder: Path, say: Say) -> Found:
+def compute_noise(quick: bool, say: Say) -> Found:
     """Run a Monte Carlo study at every level of noise, with both methods, from the paper's start."""
     levels, runs = (QUICK_LEVELS, QUICK_NOISE_RUNS) if quick else (LEVELS, NOISE_RUNS)
     found: Found = {"sigma": list(levels), "runs": runs, "ways": {}}
@@ -63,7 +62,6 @@ def compute_noise(quick: bool, folder: Path, say: Say) -> Found:
                 start=vehicle.START,
                 noise=sigma,
                 seed=level,
-                folder=folder / f"{method.split()[0]}-{sigma:g}",
             )
             noise_free = np.array(rows[0]["median"] if rows else TRUTH)
             rows.append(_level(vehicle.complete(study), sigma, noise_free))
@@ -199,7 +197,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def compute_starts(quick: bool, folder: Path, say: Say) -> Found:
+def compute_starts(quick: bool, say: Say) -> Found:
     """Fit from starts all over the bounds, with three methods."""
     problem = vehicle.build_simulated_problem()
     starts = draw_starts(QUICK_COUNT if quick else COUNT)
@@ -272,13 +270,13 @@ SIGMA, RATE = 0.1, 10
 NEAR = 1e-4
 
 
-def compute_horizons(quick: bool, folder: Path, say: Say) -> Found:
+def compute_horizons(quick: bool, say: Say) -> Found:
     """Fit the same problem on horizons of different lengths."""
     runs, starts = (QUICK_HORIZON_RUNS, QUICK_HORIZON_STARTS) if quick else (HORIZON_RUNS, HORIZON_STARTS)
     found: Found = {"runs": runs, "starts": starts, "horizons": []}
     for tf in QUICK_ENDS if quick else ENDS:
         say(f"0 to {tf:g} s")
-        found["horizons"].append(_horizon(tf, runs, starts, folder))
+        found["horizons"].append(_horizon(tf, runs, starts))
     found["samples"] = _sample_sets()
     return found
 
@@ -301,7 +299,7 @@ def _sample_sets() -> list[Found]:
     return found
 
 
-def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
+def _horizon(tf: float, runs: int, starts: int) -> Found:
     """Return accuracy and conditioning with noisy positions; convergence of the noise-free fit of Fig. 4 from many
     starts.
     """
@@ -311,12 +309,10 @@ def _horizon(tf: float, runs: int, starts: int, folder: Path) -> Found:
     truth = tuple(TRUTH[NAMES.index(name)] for name in names)
     noisy = vehicle.fit_positions(path, times, truth, SIGMA, tf)
     hessian, seed = evaluate(noisy).hessian, round(10 * tf)
-    study = vehicle.complete(monte_carlo(noisy, runs, theta=truth, seed=seed, folder=folder / f"noise-{tf:g}"))
+    study = vehicle.complete(monte_carlo(noisy, runs, theta=truth, seed=seed))
     here = slice(0, np.searchsorted(path.times, tf - 1e-9) + 1)  # without the second of two nodes at tf
     exact = vehicle.stick_slip(ReferenceSignal.from_samples(path.times[here], path.states[here]), truth, tf=tf)
-    search = vehicle.complete(
-        multistart(exact, _spread_starts(len(names), tf, starts), folder=folder / f"starts-{tf:g}")
-    )
+    search = vehicle.complete(multistart(exact, _spread_starts(len(names), tf, starts)))
     arrived = search.success & np.all(np.abs(search.theta / truth - 1) < NEAR, axis=1)
     return {
         "tf": tf,

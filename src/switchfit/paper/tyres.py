@@ -7,7 +7,6 @@ Figure 6: five trials with the paper's torques, with simulated logs, since the o
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ ROUNDING = 1e-15
 RAMPS = ((0.6, 0.6), (0.6, 1.5), (0.6, 2.5), (0.6, 3.4), (1.5, 3.4), (3.4, 3.4), (3.4, 0.6))
 
 
-def compute_magic(quick: bool, folder: Path, say: Say) -> Found:
+def compute_magic(quick: bool, say: Say) -> Found:
     """Return the log, both fits of it, and the Hessian in the 16 coefficients at the truth."""
     say("simulating the vehicle on tyres")
     speeds = vehicle.wheel_speeds()
@@ -161,7 +160,7 @@ LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 
 
-def compute_trials(quick: bool, folder: Path, say: Say) -> Found:
+def compute_trials(quick: bool, say: Say) -> Found:
     """Fit five logs, each with both restick models."""
     found: Found = {"trials": []}
     for number, (force, differential) in enumerate(TRIALS, start=1):

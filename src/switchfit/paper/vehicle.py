@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -249,7 +248,7 @@ def summary(fit: Estimate) -> dict[str, Any]:
     }
 
 
-def compute_vehicle(quick: bool, folder: Path, say: Say) -> Found:
+def compute_vehicle(quick: bool, say: Say) -> Found:
     """Return the lengths (m) and the forces in slip (N) of the model."""
     settings = inspect.signature(skid_steer).parameters
     return {name: settings[name].default for name in ("B_l", "B_w", "a", "b")} | {"forces": list(SLIP_FORCES)}
