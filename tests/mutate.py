@@ -94,7 +94,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             "X_ij = f_im1.D1 @ minus.Phi_X[:, j]",
             "X_ij = misprinted[j] @ minus.Phi_X[:, j]",
         ),
-        "zero cross block, (3)": swap(PAPER, "        H = H.at[i, N:].set(row[N:]).at[N:, i].set(row[N:])\n", ""),
+        "zero cross block, (3)": swap(PAPER, ", cross], [cross.T,", ", 0 * cross], [0 * cross.T,"),
     },
     "rows": {
         "h' in the tangents of the stages": swap(

@@ -186,7 +186,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
     path = propagate(model, tau, p, side)
     transitions = [evaluate_transition(model, path, i, tau[i], p) for i in range(model.structure.N)]
     before, after = integrate_sensitivities(model, path, transitions, p)
-    start, opened, total = sweep_backward(model, path, transitions, Sensitivities(before.Dp_x, after.Dp_x), p)
+    start, opened, total = sweep_backward(model, path, transitions, before.Dp_x, after.Dp_x, p)
     total = add(total, add_initial_state(model, start, p))
 
     D_tau_J, rows_tau = [], []
@@ -206,12 +206,9 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
 
 def assemble(rows_tau: list[Array], DpDp_J: Array) -> Array:
     """Return the Hessian, equation (3), from rows (N + M,) of the tau block, zero for j > i, and the p block."""
-    N, D = len(rows_tau), len(rows_tau) + DpDp_J.shape[0]
-    H = jnp.zeros((D, D)).at[N:, N:].set(DpDp_J)
-    for i, row in enumerate(rows_tau):
-        H = H.at[i, : i + 1].set(row[: i + 1]).at[: i + 1, i].set(row[: i + 1])
-        H = H.at[i, N:].set(row[N:]).at[N:, i].set(row[N:])
-    return H
+    rows = jnp.array(rows_tau).reshape(len(rows_tau), len(rows_tau) + len(DpDp_J))
+    tau, cross = rows[:, : len(rows)], rows[:, len(rows) :]
+    return jnp.block([[tau + jnp.tril(tau, -1).T, cross], [cross.T, DpDp_J]])
 
 
 # Equations (11), (13), (16), (17), at a transition time
@@ -340,14 +337,13 @@ def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
 
 
 def sweep_backward(
-    model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
+    model: Model, path: Path, transitions: list[Transition], Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
     """Return the adjoints at t0, those at the start of each row (R, ...; at tau_i+ if it opens a segment), and (9),
     (14).
 
-    `Dp_x` holds D_p x at the start and at the end of each row, two (R, n, M) arrays.
+    `Dp_x_before` and `Dp_x_after` (R, n, M) are D_p x at the start and at the end of each row.
     """
-    Dp_x_before, Dp_x_after = Dp_x
     final, total = add_point_cost(model.terminal, path.after[-1], Dp_x_after[-1], p)
     jumps, late, sampled = add_sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
     total = add(total, sampled)
