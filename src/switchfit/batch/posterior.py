@@ -360,19 +360,14 @@ class LogPosterior:
                 known = jnp.isfinite(J)
                 return J, jnp.where(known, g, 0.0), jnp.where(known, H, 0.0)
 
-        @jax.custom_jvp
-        def differentiate(theta: Any) -> tuple[Any, Any]:
-            return evaluate(theta)[:2]
+        differentiate = jax.custom_jvp(lambda theta: evaluate(theta)[:2])
+        cost = jax.custom_jvp(lambda theta: evaluate(theta)[0])
 
         @differentiate.defjvp
         def push_gradient(primals: tuple[Any], tangents: tuple[Any]) -> Any:
             with use_float64():
                 J, g, H = evaluate(*primals)
                 return (J, g), (g @ tangents[0], H @ tangents[0])
-
-        @jax.custom_jvp
-        def cost(theta: Any) -> Any:
-            return evaluate(theta)[0]
 
         @cost.defjvp
         def push_cost(primals: tuple[Any], tangents: tuple[Any]) -> Any:

@@ -42,7 +42,6 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit, Kink, Termination, inverse_on, termination_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Result, Status
-from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, minimize_traced
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
@@ -456,23 +455,22 @@ class Batch:
         is_sharp = self.layout.natively and not all(map(Follower(self.evaluator).suits, outcome.theta[[0, -1]]))
         return Outcome.at_starts(starts, np) if is_sharp else outcome
 
-    def _fit_on_meshes(self, k: int, start: FloatArray, limits: Limits) -> Result:
-        """Fit the data of fit k, which the evaluator has, from a start."""
-        problem, varying = self.evaluator.problem, self.varying
+    def _fit_one(self, k: int, start: FloatArray, limits: Limits) -> Result:
+        """Fit the data of fit k from a start. Meshes follow, unless each fit has times of its own, with which no mesh
+        is made.
+        """
+        problem, varying, evaluator = self.evaluator.problem, self.varying, self._give_data(k)
 
         def build(meshes: Sequence[Mesh]) -> Evaluator:
             return Batch(problem, meshes, varying, limits)._give_data(k)
 
-        has_own_times = len(varying) == len(jax.tree.leaves(self._base))
-        follower = None if has_own_times else Follower(self.evaluator, build)
-        hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
-        return minimize_cost(self.evaluator, start, hessian, *limits, follower=follower)
+        if len(varying) == len(jax.tree.leaves(self._base)):
+            return minimize_cost(evaluator, start, "exact", *limits)
+        # A trust region takes fewer steps.
+        return minimize_cost(evaluator, start, "auto", *limits, follower=Follower(evaluator, build))
 
     def _finish_rest(self, outcome: Outcome, starts: FloatArray) -> Chunk:
-        """Return the outcomes as a chunk; fits that did not settle are done by `minimize`, one by one.
-
-        Meshes follow, unless each fit has times of its own, with which no mesh is made.
-        """
+        """Return the outcomes as a chunk; fits that did not settle are done by `minimize`, one by one."""
         problem, limits, chunk = self.evaluator.problem, self.limits, Chunk.of(outcome)
         settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
         # Held coordinates are left out of the covariance: rows of the identity in H, zero in its inverse.
@@ -486,10 +484,7 @@ class Batch:
         for k in np.flatnonzero(~settled).tolist():
             before = int(chunk.iterations[k])
             try:
-                self._give_data(k)
-                found = self._fit_on_meshes(
-                    k, starts[k], limits._replace(max_iterations=limits.max_iterations - before)
-                )
+                found = self._fit_one(k, starts[k], limits._replace(max_iterations=limits.max_iterations - before))
             except Exception as error:  # of any kind: the other fits go on
                 chunk.set_error(k, error)
                 chunk.free[k] = 0
@@ -602,16 +597,7 @@ def describe_error(error: BaseException) -> str:
 
 def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:
     """Return the termination of fit k, which ended at kinks."""
-    names, theta = problem.unknowns.names, outcome.theta[k]
-    kinks = tuple(
-        Kink(names[i], float(theta[i]), float(outcome.left[k, i]), float(outcome.gradient[k, i]))
-        for i in np.flatnonzero(outcome.held[k])
-    )
-    return Termination(
-        Status.CONVERGED_AT_KINK,
-        cost=float(outcome.cost[k]),
-        optimality=float(outcome.optimality[k]),
-        tolerance=tolerance,
-        iterations=int(outcome.iterations[k]),
-        kinks=kinks,
-    )
+    names, columns = problem.unknowns.names, (outcome.theta[k], outcome.left[k], outcome.gradient[k])
+    kinks = tuple(Kink(names[i], *(float(column[i]) for column in columns)) for i in np.flatnonzero(outcome.held[k]))
+    figures = {name: getattr(outcome, name)[k].item() for name in ("cost", "optimality", "iterations")}
+    return Termination(Status.CONVERGED_AT_KINK, tolerance=tolerance, kinks=kinks, **figures)
