@@ -114,13 +114,6 @@ def test_chi_square_is_shared_among_the_fits():
     assert replace(many, cost=np.r_[large, np.repeat(11.0, CHUNK - 1)], explained=explained).verdict.level == "good"
 
 
-def test_fits_that_did_not_converge_are_counted():
-    many = sf.estimate_many([room(seed=seed) for seed in range(4)], max_iterations=1)
-    assert many.verdict.level == "bad"
-    assert kinds(many) == ["many fits", "some not converged"]
-    assert "(MAX_ITERATIONS)" in str(many.verdict)
-
-
 def test_collapsed_modes_are_counted():
     """A log of a room that was never heated."""
     cold = 0.2 * np.exp(-0.8 * TIMES)

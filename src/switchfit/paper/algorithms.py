@@ -165,14 +165,11 @@ def _matrix(k: Any, c: Any) -> Any:
 
 def evaluate_exactly(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Return J, its gradient and its Hessian from matrix exponentials, for tau not after that of the truth."""
+    first = jax.jacfwd(_cost)
     with use_float64():
-        cost, gradient, hessian = _exact(jnp.asarray(theta))
-        return float(cost), np.asarray(gradient), np.asarray(hessian)
-
-
-@jax.jit
-def _exact(theta: Any) -> tuple[Any, Any, Any]:
-    return _cost(theta), jax.jacfwd(_cost)(theta), jax.jacfwd(jax.jacfwd(_cost))(theta)
+        given = jax.jit(lambda theta: (_cost(theta), first(theta), jax.jacfwd(first)(theta)))(jnp.asarray(theta))
+        cost, gradient, hessian = map(np.asarray, given)
+    return float(cost), gradient, hessian
 
 
 def _cost(theta: Any) -> Any:

@@ -126,17 +126,14 @@ def stick_slip(
 
 
 def simulate_drive(
-    theta: tuple[float, float, float] = TRUTH,
-    *,
-    tf: float = HORIZON,
-    stick_force: float = 15.0,
-    restick: Restick = "continuous",
-    step: float = 0.1,
+    theta: tuple[float, float, float] = TRUTH, *, tf: float = HORIZON, step: float = 0.1, **settings: Any
 ) -> Trajectory:
-    """Simulate equation (18) at given transition times and mu, with a node every `step` seconds."""
+    """Simulate equation (18) at given transition times and mu, with a node every `step` seconds; the settings are those
+    of `stick_slip`.
+    """
     times = step * np.arange(round(tf / step) + 1)
     nothing = Measurements(times, np.zeros((len(times), 6)))
-    return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
+    return simulate(stick_slip(nothing, theta, tf=tf, **settings))
 
 
 def build_simulated_problem() -> Problem:
