@@ -58,7 +58,7 @@ from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation import join_names, shorten
+from switchfit.problem.validation import as_count, as_names, as_positive, join_names, shorten
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.json_records import to_json, write_document
 from switchfit.runtime.presentation import Figure, Printed, draw_figure, format_line, join_first
@@ -692,7 +692,7 @@ def design(
     last = len(problem.experiments) - 1
     e = last if experiment is None else validation.as_index(experiment, "experiment", last + 1)
     nominal, kind = problem.check_theta(theta), validation.as_choice(criterion, "criterion", tuple(POWERS))
-    starts, seed = validation.as_count(starts, "starts"), validation.as_seed(seed)
+    starts, seed = as_count(starts, "starts"), validation.as_seed(seed)
     _check_data(problem)
     run, (chosen, scales) = problem.experiments[e], _find_chosen(problem, names)
     labels = name_sensors(run)
@@ -771,17 +771,13 @@ def _find_chosen(problem: Problem, names: Any) -> tuple[NDArray[np.intp], FloatA
     """Return the positions in theta of the unknowns that count, and their scales: (s,) each."""
     known, spans = list(problem.theta_names), problem.unknowns.parameters
     given = known if names is None else [names] if isinstance(names, str) else names
-    scaled = (
-        given
-        if isinstance(given, Mapping)
-        else dict.fromkeys(validation.as_names(given, "names", "names of unknowns"), 1.0)
-    )
+    scaled = given if isinstance(given, Mapping) else dict.fromkeys(as_names(given, "names", "names of unknowns"), 1.0)
     found: dict[int, float] = {}
     for name, scale in scaled.items():
         if name not in known and name not in spans:
             raise ValueError(f"names has {shorten(name)}, which is no unknown of the problem: {join_names(known)}.")
         places = [known.index(name)] if name in known else range(len(known))[spans[name]]
-        found |= dict.fromkeys(places, validation.as_positive(scale, f"scale of {name}"))
+        found |= dict.fromkeys(places, as_positive(scale, f"scale of {name}"))
     if not found:
         raise ValueError("names is empty: name the unknowns that count, or leave it out for all.")
     return np.array(list(found), dtype=np.intp), np.array(list(found.values()))
@@ -807,19 +803,13 @@ def _list_limits(
     whole = np.array([len(item.times) for item in run.data])
     for s, name in enumerate(labels):
         if counts.get(name) is not None:
-            whole[s] = min(whole[s], validation.as_count(counts[name], f"samples of {name}", at_least=1))
+            whole[s] = min(whole[s], as_count(counts[name], f"samples of {name}", at_least=1))
     if sensors is None:
         return [whole]
     if len(labels) > MOST_SENSORS:
         raise ValueError(f"sensors can be chosen among {MOST_SENSORS}; there are {len(labels)}.")
-    prices = np.array(
-        [validation.as_positive(costs[name], f"cost of {name}") if name in costs else 0.0 for name in labels]
-    )
-    most = (
-        validation.as_count(sensors, "sensors", at_least=1)
-        if budget is None
-        else validation.as_positive(budget, "budget")
-    )
+    prices = np.array([as_positive(costs[name], f"cost of {name}") if name in costs else 0.0 for name in labels])
+    most = as_count(sensors, "sensors", at_least=1) if budget is None else as_positive(budget, "budget")
     every = np.array(list(product((0, 1), repeat=len(labels))))
     allowed = every[every @ prices <= most]
     largest = [own for own in allowed if not any(np.all(other >= own) and np.any(other > own) for other in allowed)]
