@@ -41,12 +41,12 @@ ROOM = sf.HybridSystem({"on": heating, "off": decay}, [0.2])
 OTHER = sf.HybridSystem({"on": lambda t, x, p: 2.0 * heating(t, x, p), "off": decay}, [0.2])
 
 
-def room(data=None, guess=(1.7, 1.0), upper=5.0, **settings):
+def room(data=None, guess=(1.7, 1.0), upper=5.0, prior=None, **settings):
     """One transition and one parameter: a room that is heated, then cools."""
     if data is None:
         data = sf.Measurements(TIMES, np.zeros(24), sigma=0.01)
     run = sf.Experiment(data, ("on", "off"), guess[:1], 0.0, 6.0)
-    return sf.Problem(ROOM, run, {"k": sf.Parameter(guess[1], lower=0.1, upper=upper)}, **settings)
+    return sf.Problem(ROOM, run, {"k": sf.Parameter(guess[1], 0.1, upper, prior=prior)}, **settings)
 
 
 # The optimiser inside a program
