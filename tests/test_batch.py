@@ -554,16 +554,11 @@ def look_up(k):
     return np.zeros(np.shape(k), np.int32)
 
 
-@jax.custom_jvp
 def table(k):
     """k itself, by way of a function that JAX cannot see into and that raises an error above a limit."""
     shape = jax.ShapeDtypeStruct(k.shape, jnp.int32)
-    return k + jax.pure_callback(look_up, shape, k, vmap_method="expand_dims").astype(k.dtype)
-
-
-@table.defjvp
-def _(primals, tangents):
-    return table(*primals), tangents[0]
+    looked_up = jax.pure_callback(look_up, shape, jax.lax.stop_gradient(k), vmap_method="expand_dims")
+    return k + looked_up.astype(k.dtype)
 
 
 FAILING = sf.HybridSystem({"on": lambda t, x, p: p["h"] - table(p["k"]) * x}, [0.2])
