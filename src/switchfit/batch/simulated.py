@@ -249,7 +249,9 @@ def build_study(
         Where the data are simulated, and where every fit begins.
     limits : Limits
     """
-    study = SimulatedStudy(problem, [], begin[None], limits, seed, truth, noise, simulate_clean(problem, truth))
+    clean = simulate_clean(problem, truth)
+    drawn = noise if callable(noise) else _find_spreads(problem, truth, noise, clean)
+    study = SimulatedStudy(problem, [], begin[None], limits, seed, drawn, clean)
     study.meshes, error = _build_meshes(study.problem_of(0), truth, begin)
     return study, error
 
@@ -272,6 +274,27 @@ def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     evaluator = Evaluator(sampled, meshes=[mesh.divide() for mesh in Evaluator(sampled, truth).meshes])
     _, comparisons = compare(evaluator, truth)
     return dict(zip(places, (comparison.fitted for run in comparisons for comparison in run), strict=True))
+
+
+def _find_spreads(problem: Problem, truth: FloatArray, noise: Noise, clean: Values) -> Values:
+    """Return the standard deviations of the noise of all data, (K, q) each."""
+    found = {}
+    for (e, k), values in clean.items():
+        item, sigma = problem.experiments[e].data[k], noise
+        if sigma is None and isinstance(item, Measurements):
+            sigma = item.noise(problem.name_parameters(truth, e))
+        if sigma is None:
+            raise ValueError(
+                "noise must be given, since the data have no sigma from which to draw: a standard deviation, one for "
+                "each channel, or a function."
+            )
+        try:
+            found[e, k] = np.broadcast_to(np.asarray(sigma, dtype=float), values.shape)
+        except ValueError as error:
+            raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {values.shape}.") from error
+        if not np.all(np.isfinite(found[e, k]) & (found[e, k] >= 0)):
+            raise ValueError(f"noise must be zero or positive; got {shorten(sigma)}.")
+    return found
 
 
 def _sample(item: Any, experiment: Experiment) -> Measurements | None:
@@ -316,13 +339,12 @@ class SimulatedStudy(Study):
 
     Attributes
     ----------
-    truth : (d,)
-    noise : as of `monte_carlo`
+    noise : callable, or Values
+        The function of the user, or standard deviations.
     clean : Values
         As of `simulate_clean`.
     """
 
-    truth: FloatArray
     noise: Any
     clean: Values
 
@@ -334,7 +356,7 @@ class SimulatedStudy(Study):
                 noisy = self.noise(rng, clean.copy(), self.problem.experiments[e].data[k])
                 values = as_array(noisy, "what noise(rng, clean, item) returns")
             else:
-                values = clean + self._spreads[e, k] * rng.standard_normal(clean.shape)
+                values = clean + self.noise[e, k] * rng.standard_normal(clean.shape)
             is_finite = bool(np.isfinite(values).all())
             if values.shape != clean.shape or not is_finite:
                 raise ValueError(
@@ -343,30 +365,6 @@ class SimulatedStudy(Study):
                 )
             drawn[e, k] = values
         return drawn
-
-    @cached_property
-    def _spreads(self) -> Values:
-        """Standard deviations of the noise."""
-        experiments = self.problem.experiments
-        return {(e, k): self._find_spread(clean, experiments[e].data[k], e) for (e, k), clean in self.clean.items()}
-
-    def _find_spread(self, clean: FloatArray, item: Any, e: int) -> FloatArray:
-        """Return the standard deviation of the noise of each value of an item: (K, q)."""
-        sigma = self.noise
-        if sigma is None:
-            sigma = item.noise(self.problem.name_parameters(self.truth, e)) if isinstance(item, Measurements) else None
-            if sigma is None:
-                raise ValueError(
-                    "noise must be given, since the data have no sigma from which to draw: a standard deviation, one "
-                    "for each channel, or a function."
-                )
-        try:
-            spread = np.broadcast_to(sigma, clean.shape)
-        except ValueError as error:
-            raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {clean.shape}.") from error
-        if not (np.isfinite(spread).all() and (spread >= 0).all()):
-            raise ValueError(f"noise must be zero or positive; got {shorten(sigma)}.")
-        return spread
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
