@@ -40,7 +40,7 @@ from switchfit.problem.validation import as_level, as_path
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.json_records import find_dtype, from_json, to_json
+from switchfit.runtime.json_records import find_dtype, from_json, parse_document, to_json
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 from switchfit.uncertainty import answers
 from switchfit.uncertainty.answers import FINE, HALF, LEVELS, UNLIKELY, Doubt, Level, Numbers, compare_with_sigma
@@ -50,22 +50,6 @@ from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"
 VERSION = 2
-
-
-def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the arrays of a file and its header; ValueError if it was not written by `Fits.save` as it is."""
-    arrays, reason = read_arrays(path)
-    if arrays and reason:
-        raise ValueError(f"{path} is damaged: {reason}.")
-    try:
-        content = json.loads(arrays.pop("header").tobytes())
-        if content["format"] != FORMAT:
-            reason = f"its header has no format {FORMAT!r}"
-    except (KeyError, TypeError, ValueError, RecursionError):
-        reason = reason or "it has no header"
-    if reason:
-        raise ValueError(f"{path} does not hold saved fits ({reason}).")
-    return arrays, content
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
@@ -365,15 +349,13 @@ class Fits(Tabular, Displayed):
         ('Multistart', 'CONVERGED')
         """
         file = as_path(path, "path")
-        arrays, content = _read_archive(file)
-        version, name = content.get("version"), content.get("kind")
-        if version != VERSION:
-            raise ValueError(
-                f"{file} holds fits in version {version!r} of their format; this switchfit reads version {VERSION}. "
-                "Read it with the switchfit that wrote it."
-            )
+        arrays, reason = read_arrays(file)
+        if reason:
+            raise ValueError(f"{file} {'is damaged' if arrays else 'does not hold saved fits'}: {reason}.")
+        header = arrays.pop("header", np.zeros(0, np.uint8)).tobytes()
+        content = parse_document(header, file, "a file of saved fits", FORMAT, VERSION)
         kinds = {each.__name__: each for each in (cls, *cls.__subclasses__())}
-        if name not in kinds:
+        if (name := content.get("kind")) not in kinds:
             raise ValueError(
                 f"{file} holds the kind of fits {name!r}, not {cls.__name__}: sf.Fits.load reads every kind."
             )
