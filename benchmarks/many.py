@@ -70,7 +70,7 @@ def measure(runs: int, engine: str = "auto") -> dict[str, Any]:
         began = time.perf_counter()
         study = sf.monte_carlo(here, runs, theta=TRUTH, start=start)
         seconds = time.perf_counter() - began
-        work, _ = build_study(here, runs, TRUTH, start, None, 0, Limits(1e-7, 200))
+        work, _ = build_study(here, TRUTH, start, None, 0, Limits(1e-7, 200))
         few = min(SINGLE, runs)
         singles = [
             minimize_cost(Evaluator(work.problem_of(k), meshes=work.meshes), start, "exact", 1e-7, 200)

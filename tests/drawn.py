@@ -63,7 +63,8 @@ TESTS = {room: names.split() for room, names in NAMES.items()}
 def draw_mistakes(source: Path) -> Iterator[tuple[str, str, str, str, str]]:
     """Yield room, name, file, text and text with the mistake of each mistake that the rule draws."""
     for room in TESTS:
-        found = [each for path in sorted((source / room).glob("*.py")) for each in _list_mistakes(path)]
+        paths = sorted([*source.glob(f"{room}.py"), *(source / room).glob("*.py")])  # of a module or a folder
+        found = [each for path in paths for each in _list_mistakes(path)]
         by_hash = {key: mistake for key, *mistake in found}  # one of those that a line has twice
         for key in sorted(by_hash)[:PER_ROOM]:
             name, path, text, mistaken = by_hash[key]

@@ -28,7 +28,7 @@ KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
     f"engine/native/{name}.py" for name in ("kernels", "segments", "templates", "elimination", "llvm")
 )
 BEAM, FITTER, MODE_POOL = "strategy/beam.py", "modes/fitter.py", "modes/hunt.py"
-ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design/criterion.py"
+ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design.py"
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
@@ -74,26 +74,26 @@ def swap(path: str, *texts: str) -> Mistake:
 
 BY_HAND: dict[str, dict[str, Mistake]] = {
     "paper": {
-        "sign of X, (8)": swap(PAPER, "X = f_im1 - f_i  # (8)", "X = f_i - f_im1  # (8)"),
-        "coefficient of X_ii 2 -> 1, (13)": swap(PAPER, "- 2 * D1f_i @ f_im1", "- 1 * D1f_i @ f_im1"),
-        "dropped D ell X, (11)": swap(PAPER, "second = second - here.Dell @ X + psi", "second = second + psi"),
-        "dropped psi . D1^2 f, (12)": swap(PAPER, " - contract(psi, d.D1D1f) - d.D1f.T", " - d.D1f.T"),
-        "dropped DpD1 f, (15)": swap(PAPER, "d.D1D1f @ d.Dp_x + d.DpD1f)", "d.D1D1f @ d.Dp_x)"),
-        "dropped Dp f jump, (17)": swap(PAPER, " + here.Dpf_im1 - here.Dpf_i  # (17)", "  # (17)"),
-        "dropped D2 f jump, (13)": swap(PAPER, " + D2f_im1 - D2f_i  # (13)", "  # (13)"),
-        "dropped D1Dp f Dp_x, (14)": swap(PAPER, " + contract(psi, d.D1Dpf @ d.Dp_x)", ""),
+        "sign of X, (8)": swap(PAPER, "X = f_im1.value - f_i.value  # (8)", "X = f_i.value - f_im1.value  # (8)"),
+        "coefficient of X_ii 2 -> 1, (13)": swap(PAPER, "- 2 * f_i.D1 @ f_im1.value", "- 1 * f_i.D1 @ f_im1.value"),
+        "dropped D ell X, (11)": swap(PAPER, "second = second - Dell @ X + psi", "second = second + psi"),
+        "dropped psi . D1^2 f, (12)": swap(PAPER, " - contract(psi, f.D1D1) - f.D1.T", " - f.D1.T"),
+        "dropped DpD1 f, (15)": swap(PAPER, "f.D1D1 @ Dp_x + f.DpD1)", "f.D1D1 @ Dp_x)"),
+        "dropped Dp f jump, (17)": swap(PAPER, " + here.f_im1.Dp - here.f_i.Dp  # (17)", "  # (17)"),
+        "dropped D2 f jump, (13)": swap(PAPER, " + f_im1.D2 - f_i.D2  # (13)", "  # (13)"),
+        "dropped D1Dp f Dp_x, (14)": swap(PAPER, " + contract(psi, f.D1Dp @ Dp_x)", ""),
         "tau_j for tau_i, (13), the misprint": swap(
             PAPER,
             "compute_tau_tau(i, here, adjoints, minus, plus)",
             "compute_tau_tau(i, here, adjoints, minus, plus, "
-            "[evaluate_transition(model, path, i, tau[j], p).D1f_im1 for j in range(i)])",
+            "[evaluate_transition(model, path, i, tau[j], p).f_im1.D1 for j in range(i)])",
             "def compute_tau_tau("
             "i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities)",
             "def compute_tau_tau(i, here, adjoints, minus, plus, misprinted)",
-            "X_ij = D1f_im1 @ minus.Phi_X[:, j]",
+            "X_ij = f_im1.D1 @ minus.Phi_X[:, j]",
             "X_ij = misprinted[j] @ minus.Phi_X[:, j]",
         ),
-        "zero cross block, (3)": swap(PAPER, "        H = H.at[i, N:].set(row[N:]).at[N:, i].set(row[N:])\n", ""),
+        "zero cross block, (3)": swap(PAPER, ", cross], [cross.T,", ", 0 * cross], [0 * cross.T,"),
     },
     "rows": {
         "h' in the tangents of the stages": swap(

@@ -42,12 +42,12 @@ ROOM = sf.HybridSystem({"on": heating, "off": decay}, [0.2])
 OTHER = sf.HybridSystem({"on": lambda t, x, p: 2.0 * heating(t, x, p), "off": decay}, [0.2])
 
 
-def room(data=None, guess=(1.7, 1.0), upper=5.0, **settings):
+def room(data=None, guess=(1.7, 1.0), upper=5.0, prior=None, **settings):
     """One transition and one parameter: a room that is heated, then cools."""
     if data is None:
         data = sf.Measurements(TIMES, np.zeros(24), sigma=0.01)
     run = sf.Experiment(data, ("on", "off"), guess[:1], 0.0, 6.0)
-    return sf.Problem(ROOM, run, {"k": sf.Parameter(guess[1], lower=0.1, upper=upper)}, **settings)
+    return sf.Problem(ROOM, run, {"k": sf.Parameter(guess[1], 0.1, upper, prior=prior)}, **settings)
 
 
 # The optimiser inside a program
@@ -192,7 +192,7 @@ LIMITS = Limits(1e-7, 200)
 
 
 def work_of(problem, truth, start, noise=None, seed=3):
-    return module.build_study(problem, 1, truth, start, noise, seed, LIMITS)[0]
+    return module.build_study(problem, truth, start, noise, seed, LIMITS)[0]
 
 
 def reference_room():
@@ -248,11 +248,10 @@ def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
 
 def test_fits_that_do_not_converge_are_listed():
     study = sf.monte_carlo(room(), 5, theta=TRUTH, start=[1.7, 1.0], max_iterations=1)
-    assert not study.success.any()
     assert [run for run, _ in study.failures] == list(range(5))
     assert "Stopped after 1 iteration " in study.failures[0][1]
-    assert "not converged" in str(study)
-    assert "Fewer than two" in str(study)
+    assert study.verdict.level == "bad"
+    assert all(said in str(study) for said in ("not converged", "(MAX_ITERATIONS)", "Fewer than two"))
     assert study.plot().axes[0].get_title() == "Fewer than two fits converged: no statistics."
 
 
@@ -411,22 +410,17 @@ def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
-    folder, seen = tmp_path / "study", []
-    settings = {"theta": TRUTH, "folder": folder, "seed": 5}
-    partial = sf.monte_carlo(room(), 4 * CHUNK, **settings, callback=lambda done, total: seen.append(done) or True)
+    settings, seen = {"theta": TRUTH, "seed": 5}, []
+    kept = settings | {"folder": tmp_path / "study"}
+    partial = sf.monte_carlo(room(), 4 * CHUNK, **kept, callback=lambda done, total: seen.append(done) or True)
     assert len(partial) < 4 * CHUNK
     assert "STOPPED" in str(partial)
     assert partial.verdict.reasons[-1].kind == "stopped"
-    assert seen == [CHUNK]
-    kept = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
-    whole = sf.monte_carlo(room(), 4 * CHUNK, **settings, callback=lambda done, total: seen.append(done))
-    assert seen[1] == len(kept) * CHUNK
-    assert seen[-1] == 4 * CHUNK
-    assert all(path.stat().st_mtime_ns == time for path, time in kept.items())
-    at_once = sf.monte_carlo(room(), 4 * CHUNK, theta=TRUTH, seed=5)
-    np.testing.assert_array_equal(whole.theta, at_once.theta)
+    done = len(list(kept["folder"].iterdir())) * CHUNK
+    whole = sf.monte_carlo(room(), 4 * CHUNK, **kept, callback=lambda done, total: seen.append(done))
+    assert (*seen[:2], seen[-1]) == (CHUNK, done, 4 * CHUNK)
+    np.testing.assert_array_equal(whole.theta, sf.monte_carlo(room(), 4 * CHUNK, **settings).theta)
     np.testing.assert_array_equal(whole.runs, np.arange(4 * CHUNK))
-    assert len(list(folder.iterdir())) == 4
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
@@ -557,16 +551,11 @@ def look_up(k):
     return np.zeros(np.shape(k), np.int32)
 
 
-@jax.custom_jvp
 def table(k):
     """k itself, by way of a function that JAX cannot see into and that raises an error above a limit."""
     shape = jax.ShapeDtypeStruct(k.shape, jnp.int32)
-    return k + jax.pure_callback(look_up, shape, k, vmap_method="expand_dims").astype(k.dtype)
-
-
-@table.defjvp
-def _(primals, tangents):
-    return table(*primals), tangents[0]
+    looked_up = jax.pure_callback(look_up, shape, jax.lax.stop_gradient(k), vmap_method="expand_dims")
+    return k + looked_up.astype(k.dtype)
 
 
 FAILING = sf.HybridSystem({"on": lambda t, x, p: p["h"] - table(p["k"]) * x}, [0.2])
@@ -612,15 +601,13 @@ def test_a_run_whose_noise_raises_an_error_is_listed():
         return values if lucky < 0.8 else np.full_like(values, np.nan)
 
     study = sf.monte_carlo(room(), 40, theta=TRUTH, noise=noise, seed=0)
-    assert len(study) == 40
     failed = study.status == "ERROR"
     assert 4 <= failed.sum() <= 36
     np.testing.assert_array_equal(study.success, ~failed)
+    np.testing.assert_array_equal(np.isnan(study.cost), failed)
     said = " ".join(message for _, message in study.failures)
     assert "ArithmeticError: no noise today" in said
     assert "noise must give finite values of shape (24, 1); got shape (24, 1), not all finite" in said
-    assert np.isfinite(study.theta[~failed]).all()
-    assert np.isnan(study.cost[failed]).all()
 
 
 def test_a_log_that_raises_an_error_is_listed(monkeypatch, tmp_path):
@@ -745,30 +732,20 @@ def test_the_truth_of_a_study_lies_on_its_guard_however_coarse_the_mesh_of_the_g
 # Guards: far starts end where near ones do
 
 
-COLLAPSE = 10
-"""A start from which the guards pull transitions together, so that a direct fit loses modes."""
-
-
-@pytest.fixture(scope="module")
-def case():
-    """A ball with eight bounces; their times are known to 30 ms, and restitution, height and speed roughly."""
-    return ball_on_guards(16)
-
-
-def test_all_starts_near_the_truth_find_the_restitution(case):
+def test_starts_near_and_far_find_the_restitution_of_a_ball():
+    """A ball with eight bounces; their times are known to 30 ms, and restitution, height and speed roughly. From start
+    10 the guards pull transitions together, so that a direct fit loses modes.
+    """
+    case = ball_on_guards(16)
     found = sf.multistart(case.problem, case.starts)
     assert found.success.all()
     assert found.clusters.tolist() == [0] * 16
     assert found.verdict.level == "good"
     assert "the lowest J was found from 15 of 15 other starts" in str(found.verdict)
     assert found.best.parameters["e"] == pytest.approx(FALL[0], abs=4 * found.best.standard_errors[8])
-
-
-def test_a_study_from_a_far_start_finds_the_truth(case):
-    best = sf.estimate(case.problem, strategy="local", start=case.starts[0])
-    study = sf.monte_carlo(case.problem, 6, theta=best.theta, start=case.starts[COLLAPSE])
+    study = sf.monte_carlo(case.problem, 6, theta=found.best.theta, start=case.starts[10])
     assert study.verdict.level == "good"
-    np.testing.assert_allclose(study.theta[:, 8], best.theta[8], atol=0.002)
+    np.testing.assert_allclose(study.theta[:, 8], found.best.theta[8], atol=0.002)
 
 
 # --- starts that cannot be integrated ---------------------------------------------------------------------------------

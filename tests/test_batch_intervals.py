@@ -24,6 +24,11 @@ def measured(tau, seed, times=TIMES):
     return (clean + SIGMA * np.random.default_rng(seed).standard_normal(len(times)))[:, None]
 
 
+def charged(tau, seed, rate_known=False):
+    """A log whose rate is unknown too."""
+    return build_problem(measured(tau, seed), tau, rate_known=rate_known)
+
+
 def check_same(problems, level, *, rtol=1e-4):
     """Each interval of the batch is that of a single fit, measured by its length; returns the batch."""
     many = sf.estimate_many(problems)
@@ -41,7 +46,7 @@ def check_same(problems, level, *, rtol=1e-4):
 @pytest.mark.parametrize("rate_known", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize("level", [pytest.param(0.68, marks=pytest.mark.slow), 0.95])
 def test_intervals_are_those_of_single_fits(tau, rate_known, level):
-    problems = [build_problem(measured(tau, seed), tau, rate_known=rate_known) for seed in range(16)]
+    problems = [charged(tau, seed, rate_known) for seed in range(16)]
     many = check_same(problems, level)
     if tau == 2.0:
         assert (many.status == "CONVERGED_AT_KINK").any()
@@ -57,7 +62,7 @@ def test_pieces_end_where_the_profile_likelihood_does(tau):
     """
     gaps = []
     for seed in range(4):
-        fit = sf.estimate(build_problem(measured(tau, seed), tau, rate_known=False), strategy="local")
+        fit = sf.estimate(charged(tau, seed), strategy="local")
         profile = np.array(fit.profile("tau_1").interval())
         gaps.append(np.abs(fit.confidence_intervals()[0] - profile) / np.ptp(profile))
     assert np.max(gaps) < 0.025
@@ -84,11 +89,6 @@ def test_a_way_ends_where_the_others_are_not_determined():
     assert np.isfinite(right[:, 0]).sum() == 1
     assert find_ends(left, np.array(2.0), -1) == pytest.approx(-2.0, abs=1e-6)
     assert left[1, 1] == -9.0
-
-
-def charged(tau, seed):
-    """A log whose rate is unknown too."""
-    return build_problem(measured(tau, seed), tau, rate_known=False)
 
 
 def unknown_sigma(seed):
@@ -137,7 +137,7 @@ def test_an_interval_grows_with_its_level_beyond_the_pieces_too():
 
 
 def test_an_unknown_that_a_bound_holds_has_no_interval():
-    problem = build_problem(measured(2.05, 0), 2.05, rate_known=False)
+    problem = charged(2.05, 0)
     low = replace(problem, parameters={"k": sf.Parameter(4.0, lower=0.5, upper=5.0)})
     many = sf.estimate_many([low])
     assert many.at_bounds.tolist() == [1]
@@ -148,7 +148,7 @@ def test_an_unknown_that_a_bound_holds_has_no_interval():
 @pytest.mark.parametrize("tau", [2.0, 2.01])
 def test_a_study_covers_the_truth_on_and_beside_a_sample(tau):
     """As single fits do (benchmarks/coverage.py); with one parabola each 77 % of these intervals hold the truth."""
-    study = sf.monte_carlo(build_problem(measured(tau, 0), tau, rate_known=True), 600, theta=[tau])
+    study = sf.monte_carlo(charged(tau, 0, True), 600, theta=[tau])
     assert 0.92 < study.coverage()[0] < 0.97
     symmetric = np.abs(study.theta[:, 0] - tau) < 1.96 * study.standard_errors[:, 0]
     assert symmetric.mean() < 0.84
@@ -158,7 +158,7 @@ def test_a_study_covers_the_truth_on_and_beside_a_sample(tau):
 @pytest.mark.slow
 def test_a_kink_has_an_interval_with_jax_too():
     """Where an evaluation would have to be compiled first, the others keep one parabola."""
-    problems = [replace(build_problem(measured(2.0, s), 2.0, rate_known=True), engine="jax") for s in range(12)]
+    problems = [replace(charged(2.0, s, True), engine="jax") for s in range(12)]
     many = sf.estimate_many(problems)
     at_kink = many.status == "CONVERGED_AT_KINK"
     assert at_kink.any()
@@ -169,8 +169,8 @@ def test_a_kink_has_an_interval_with_jax_too():
 
 
 def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
-    problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
-    work, _ = simulated.build_study(problem, 200, truth, truth, None, 0, Limits(1e-7, 200))
+    problem, truth = charged(2.0, 3, True), np.array([2.0])
+    work, _ = simulated.build_study(problem, truth, truth, None, 0, Limits(1e-7, 200))
     before = [program._cache_size() for program in (_minimize_fits, _evaluate_fits)]
     whole, *parts = (work(runs) for runs in (range(128), range(50), range(50, 128)))
     after = [program._cache_size() for program in (_minimize_fits, _evaluate_fits)]
@@ -182,7 +182,7 @@ def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
 
 def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
     """The model of the first one raises an error there: it has the interval of one parabola."""
-    problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
+    problem = charged(2.0, 3, True)
     plain = sf.monte_carlo(problem, 8, theta=[2.0], seed=1)
 
     def raise_error(theta, side):

@@ -12,7 +12,7 @@ from models import RAMP, STILL, curve
 
 import switchfit as sf
 from switchfit.batch.program import CHUNK, Limits
-from switchfit.batch.resampling import StudyOfRuns
+from switchfit.batch.simulated import StudyOfRuns
 
 TIMES = np.linspace(0.1, 4.0, 40)
 

@@ -11,7 +11,7 @@ import pytest
 
 import switchfit as sf
 from benchmarks.modes.truths import random_modes, three_modes
-from switchfit.batch.posterior import link_times
+from switchfit.batch.posterior import limit_unknowns
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
 from switchfit.modes import result
@@ -366,8 +366,8 @@ def test_a_problem_may_have_a_shortest_duration_for_each_mode():
         sf.Problem(SYSTEM, run, FREE, min_duration={"turn": -1.0})
     with pytest.raises(ValueError, match="the guess gives mode 2"):
         sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 5.0})
-    links = link_times(sf.Problem(SYSTEM, run, FREE, min_duration={"rise": 1.0, "turn": 3.5, "fall": 0.5}))
-    assert [(link.gap, link.low, link.high) for link in links] == [(1.0, 1.0, 4.0), (3.5, -np.inf, 7.5)]
+    limits = limit_unknowns(sf.Problem(SYSTEM, run, FREE, min_duration={"rise": 1.0, "turn": 3.5, "fall": 0.5}))
+    assert [each[:2].tolist() for each in limits[1:]] == [[1.0, 3.5], [1.0, -np.inf], [4.0, 7.5]]
 
 
 def make_unusual(kind):

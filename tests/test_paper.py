@@ -1,7 +1,6 @@
 """The paper's claims, each checked with fewer repetitions than `switchfit paper` makes."""
 
 import json
-import types
 from pathlib import Path
 from unittest.mock import MagicMock, Mock
 
@@ -10,17 +9,18 @@ import pytest
 from typer.testing import CliRunner
 
 from switchfit.cli import app
-from switchfit.paper import PARTS, convergence, horizon, lti, magic, noise, run, starts, table, trials, vehicle
+from switchfit.paper import PARTS, Part, algorithms, run, studies, table, tyres
 from switchfit.paper.vehicle import NAMES, TRUTH, Row, wheel_speeds
 
 COEFFICIENTS = ("eigenvalues", "undetermined", "worst")
 """What is found of the Hessian in the 16 coefficients of the Magic Formula."""
 
 
-def found_by(part, folder):
+def found_by(name):
     """What a part finds, as it comes back from the file; its table and figures have to work with that."""
-    found = json.loads(json.dumps(part.compute(True, folder, lambda text: None)))
-    for row in part.rows(found):
+    part = PARTS[name]
+    found = json.loads(json.dumps(part.compute(True, lambda text: None)))
+    for row in part.list_rows(found):
         assert "nan" not in " ".join(row)
         assert row.ours
     for figure in part.draw(found).values():
@@ -30,8 +30,8 @@ def found_by(part, folder):
 
 
 @pytest.mark.slow
-def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastest(tmp_path):
-    found = found_by(lti, tmp_path)
+def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastest():
+    found = found_by("lti")
     assert max(found["gaps"]) < 1e-8
     assert found["error"] < 1e-8
     steepest, block, exact = (found["fits"][kind]["iterations"] for kind in ("none", "block-diagonal", "exact"))
@@ -39,22 +39,22 @@ def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastes
     assert steepest > block > 3 * exact
     assert found["fits"]["exact"]["sufficient"]
     # J and DJ vanish at the truth, where D²J is positive definite: had a term of Van Loan's been lost, J would not.
-    cost, gradient, hessian = lti.exact(np.array(lti.TRUTH))
+    cost, gradient, hessian = algorithms.evaluate_exactly(np.array(algorithms.LTI_TRUTH))
     assert max(abs(cost), *np.abs(gradient)) < 1e-12
     assert np.linalg.eigvalsh(hessian)[0] > 0.1
 
 
 @pytest.mark.slow
-def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear(tmp_path):
-    found = found_by(convergence, tmp_path)
+def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear():
+    found = found_by("convergence")
     fits = found["fits"]
     assert all(fit["gradient_norm"] < 1e-7 for fit in fits.values())
     for fit in fits.values():
         np.testing.assert_allclose([fit["theta"][name] for name in NAMES], TRUTH, rtol=0, atol=1e-6)
     assert fits["exact"]["iterations"] <= 12
-    assert 1.7 < convergence.order(fits["exact"]["history"]) < 2.4
+    assert 1.7 < algorithms.order(fits["exact"]["history"]) < 2.4
     assert fits["block-diagonal"]["iterations"] > 20 * fits["exact"]["iterations"]
-    assert 0.9 < convergence.factor(fits["block-diagonal"]["history"]) < 1.0
+    assert 0.9 < algorithms.factor(fits["block-diagonal"]["history"]) < 1.0
     assert 500 < fits["none"]["iterations"] < 2000
     assert found["eigenvalues_at_start"][0] < 0 < found["descents"]
     assert fits["descent-first"]["iterations"] - found["descents"] <= 12
@@ -62,13 +62,13 @@ def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear(tmp_path):
 
 
 @pytest.mark.slow
-def test_magic_formula_reference_gives_values_like_the_paper(tmp_path, monkeypatch):
+def test_magic_formula_reference_gives_values_like_the_paper(monkeypatch):
     """What is found of the 16 coefficients, which takes long, is that of the documentation."""
     results = json.loads((Path(__file__).parent.parent / "docs" / "paper-results.json").read_text())
     kept = {name: results["magic-formula"]["found"][name] for name in COEFFICIENTS}
-    monkeypatch.setattr(magic, "_coefficients", lambda speeds, say: kept)
-    monkeypatch.setattr(magic, "RAMPS", ((0.6, 3.4),))
-    found = found_by(magic, tmp_path)
+    monkeypatch.setattr(tyres, "_coefficients", lambda speeds, say: kept)
+    monkeypatch.setattr(tyres, "RAMPS", ((0.6, 3.4),))
+    found = found_by("magic-formula")
     (slow,) = found["ramps"]
     assert abs(slow["theta"]["tau_2"] - 11.7) < 0.3  # later by the wheels' own delay
     literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
@@ -82,7 +82,7 @@ def test_magic_formula_reference_gives_values_like_the_paper(tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_sixteen_coefficients_do_not_work():
-    found = magic._coefficients(wheel_speeds(), lambda text: None)
+    found = tyres._coefficients(wheel_speeds(), lambda text: None)
     assert found.keys() == set(COEFFICIENTS)
     assert found["undetermined"] > 6
     assert len(found["eigenvalues"]) == 16
@@ -90,25 +90,25 @@ def test_sixteen_coefficients_do_not_work():
 
 
 @pytest.mark.slow
-def test_starts_end_at_the_truth_or_at_the_bound_of_mu_and_strategies_lead_away_from_there(tmp_path):
-    found = found_by(starts, tmp_path)
+def test_starts_end_at_the_truth_or_at_the_bound_of_mu_and_strategies_lead_away_from_there():
+    found = found_by("starts")
     for way, ends in found["ways"].items():
         assert sum(end["count"] for end in ends) == found["starts"]
         np.testing.assert_allclose(ends[0]["theta"], TRUTH, rtol=0, atol=1e-5)
         assert ends[0]["count"] >= (0.98 if way == "auto" else 0.8) * found["starts"]
 
 
-def test_drawing_shows_all_wheels(tmp_path):
-    found = vehicle.compute(True, tmp_path, lambda text: None)
-    (ax,) = vehicle.draw(found)["fig2-vehicle"].axes
+def test_drawing_shows_all_wheels():
+    found = found_by("vehicle")
+    (ax,) = PARTS["vehicle"].draw(found)["fig2-vehicle"].axes
     assert {f"$F_{n}$ = {force:g} N" for n, force in enumerate(found["forces"], 1)} <= {t.get_text() for t in ax.texts}
 
 
 @pytest.mark.slow
-def test_error_grows_with_noise_and_is_largest_for_mu(tmp_path, monkeypatch):
-    monkeypatch.setattr(noise, "QUICK_LEVELS", (0.0, 0.05, 0.25, 0.5))
-    found = found_by(noise, tmp_path)
-    filtered, direct = found["ways"][noise.FILTERED], found["ways"][noise.DIRECT]
+def test_error_grows_with_noise_and_is_largest_for_mu(monkeypatch):
+    monkeypatch.setattr(studies, "QUICK_LEVELS", (0.0, 0.05, 0.25, 0.5))
+    found = found_by("noise")
+    filtered, direct = found["ways"][studies.FILTERED], found["ways"][studies.DIRECT]
     for levels in (filtered, direct):
         rms = np.array([level["rms"] for level in levels])
         assert np.all(np.diff(rms, axis=0) > 0)
@@ -123,9 +123,9 @@ def test_error_grows_with_noise_and_is_largest_for_mu(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_trials_converge_in_fewer_than_fifteen_iterations_and_a_reset_explains_them_better(tmp_path, monkeypatch):
-    monkeypatch.setattr(trials, "TRIALS", trials.TRIALS[2:4])
-    found = found_by(trials, tmp_path)
+def test_trials_converge_in_fewer_than_fifteen_iterations_and_a_reset_explains_them_better(monkeypatch):
+    monkeypatch.setattr(tyres, "TRIALS", tyres.TRIALS[2:4])
+    found = found_by("trials")
     assert [trial["force"] for trial in found["trials"]] == [12.0, 15.0]
     for trial in found["trials"]:
         for fit in trial["fits"].values():
@@ -137,9 +137,9 @@ def test_trials_converge_in_fewer_than_fifteen_iterations_and_a_reset_explains_t
 
 
 @pytest.mark.slow
-def test_a_longer_horizon_is_more_accurate_but_does_not_always_widen_the_region_of_starts(tmp_path, monkeypatch):
-    monkeypatch.setattr(horizon, "QUICK_ENDS", (8.0, 15.0, 26.0))
-    found = found_by(horizon, tmp_path)
+def test_a_longer_horizon_is_more_accurate_but_does_not_always_widen_the_region_of_starts(monkeypatch):
+    monkeypatch.setattr(studies, "QUICK_ENDS", (8.0, 15.0, 26.0))
+    found = found_by("horizon")
     levels = found["horizons"]
     assert levels[0]["names"] == ["tau_1", "mu"]
     assert all(level["names"] == list(NAMES) for level in levels[1:])
@@ -156,45 +156,32 @@ def test_a_longer_horizon_is_more_accurate_but_does_not_always_widen_the_region_
     assert min(arrived) > 0.2
 
 
-def parts_that_find(monkeypatch, **computes):
-    """Put parts that find what the given functions return in place of the paper's."""
-
+def test_an_interrupted_run_leaves_the_parts_that_are_done_and_one_part_alone_the_others(tmp_path, monkeypatch):
     def build(name, compute):
-        return types.SimpleNamespace(
-            TITLE=f"part {name}",
-            compute=lambda quick, folder, say: compute(),
-            draw=lambda found: {},
-            rows=lambda found: [Row(name, "1 | 2", str(found["value"]))],
-        )
+        def list_rows(found):
+            return [Row(name, "1 | 2", str(found["value"]))]
 
-    parts = {name: build(name, compute) for name, compute in computes.items()}
-    monkeypatch.setattr("switchfit.paper.PARTS", parts)
+        return Part(f"part {name}", lambda quick, say: say("begins") or compute(), list_rows=list_rows)
 
-
-def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    first, second = Mock(return_value={"value": 1}), Mock(side_effect=[KeyboardInterrupt, {"value": 2}])
-    parts_that_find(monkeypatch, lti=first, noise=second)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, quick=True)
+    first, second = Mock(side_effect=[{"value": 1}, {"value": 3}]), Mock(side_effect=[KeyboardInterrupt, {"value": 2}])
+    monkeypatch.setattr("switchfit.paper.PARTS", {"lti": build("lti", first), "noise": build("noise", second)})
     said = []
-    results = run(tmp_path, quick=True, say=said.append)
-    assert (first.call_count, second.call_count) == (1, 2)
-    assert said == ["[1/2] part lti: done before the interruption"]
-    assert [entry["found"]["value"] for entry in results.values()] == [1, 2]
-    assert json.loads((tmp_path / "results.json").read_text()) == results
-    assert (tmp_path / "table.md").read_text() == table(results)
-    assert "| lti | 1 \\| 2 | 1 |" in table(results)
-    # A complete run begins anew; one part alone leaves the others as they were.
-    run(tmp_path, quick=False, only="lti")
-    assert (first.call_count, second.call_count) == (2, 2)
-    again = json.loads((tmp_path / "results.json").read_text())
-    assert [entry["quick"] for entry in again.values()] == [False, True]
-
-
-def test_interrupted_study_is_not_taken_for_a_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(noise, "monte_carlo", MagicMock(return_value=MagicMock(requested=5, __len__=lambda study: 3)))
     with pytest.raises(KeyboardInterrupt):
-        noise.compute(True, tmp_path, lambda text: None)
+        run(tmp_path, quick=True, say=said.append)
+    assert said == ["[1/2] part lti: begins", "[2/2] part noise: begins"]
+    for only, values in (("noise", [1, 2]), ("lti", [3, 2])):
+        results = run(tmp_path, quick=only == "noise", only=only)
+        assert [entry["found"]["value"] for entry in results.values()] == values
+        assert json.loads((tmp_path / "results.json").read_text()) == results
+        assert (tmp_path / "table.md").read_text() == table(results)
+    assert [entry["quick"] for entry in results.values()] == [False, True]
+    assert "| lti | 1 \\| 2 | 3 |" in table(results)
+
+
+def test_interrupted_study_is_not_taken_for_a_result(monkeypatch):
+    monkeypatch.setattr(studies, "monte_carlo", MagicMock(return_value=MagicMock(requested=5, __len__=lambda study: 3)))
+    with pytest.raises(KeyboardInterrupt):
+        studies.compute_noise(True, lambda text: None)
 
 
 def test_command_writes_figures_and_table_and_names_the_parts(tmp_path):

@@ -274,8 +274,7 @@ def test_a_batch_of_runs_with_times_that_are_known():
     for lockstep in (False, True):
         natively = not lockstep
         structures = tuple(s.library for s in problem.structures) if natively else problem.structures
-        lengths = tuple(s.N for s in problem.structures)
-        layout = Layout(structures, lengths, places, (), lockstep, natively)
+        layout = Layout(structures, places, (), lockstep, natively)
         with jax.enable_x64(True):
             evaluate = partial(Inputs.of(evaluator, layout).evaluate, layout, ())
             found = jax.jit(evaluate)(theta, jnp.ones(()))

@@ -144,14 +144,6 @@ def test_the_change_of_variables(case):
     assert posterior.constrain(np.zeros((2, 3, len(problem.theta_names)))).shape == (2, 3, len(problem.theta_names))
 
 
-def test_of_an_estimate_z_is_in_units_of_its_covariance():
-    fit = heater_fit()
-    posterior = sf.log_posterior(fit)
-    np.testing.assert_allclose(posterior.start, [0.0, 0.0], atol=1e-12)
-    slope = np.array(jax.jacfwd(posterior.constrain)(jnp.zeros(2)))
-    np.testing.assert_allclose(slope @ slope.T, fit.covariance, rtol=1e-9)
-
-
 def test_an_unknown_at_a_kink_has_the_width_of_its_interval():
     """At a kink it has no variance."""
     values = np.minimum(TIMES, 3.5)

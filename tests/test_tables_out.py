@@ -242,7 +242,7 @@ def test_files_that_hold_no_fits(studies, heater, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"holds the kind of fits 'MonteCarlo', not Bootstrap: sf\.Fits\.load reads"):
         sf.Bootstrap.load(path)
     monkeypatch.setattr(saved, "VERSION", 3)
-    with pytest.raises(ValueError, match="holds fits in version 2 of their format; this switchfit reads version 3"):
+    with pytest.raises(ValueError, match="is a file of saved fits of version 2; this switchfit reads version 3"):
         sf.Fits.load(path)
     heater.save(tmp_path / "fit.json")
     np.savez(tmp_path / "pickle.npz", header=np.array([{}], dtype=object))

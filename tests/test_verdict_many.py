@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_batch import ROOM, TIMES, TRUTH
+from test_batch import room as heat
 
 import switchfit as sf
+from switchfit.batch.fits import FAR_AWAY, _count_collapsed, measure_distances
 from switchfit.batch.program import CHUNK
-from switchfit.batch.verdict import FAR_AWAY, _count_collapsed, measure_distances
 from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -21,12 +22,10 @@ def temperatures(tau=2.1, k=0.8):
     return rising * np.exp(-k * np.maximum(TIMES - tau, 0.0))
 
 
-def room(values=None, *, sigma=0.01, upper=5.0, seed=0, noise=0.01, min_duration=0.0, prior=None, guess=(1.7, 1.0)):
+def room(values=None, *, sigma=0.01, seed=0, noise=0.01, **settings):
     values = temperatures() if values is None else values
     values = values + noise * np.random.default_rng(seed).standard_normal(24)
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=sigma), ("on", "off"), guess[:1], 0.0, 6.0)
-    k = sf.Parameter(guess[1], lower=0.1, upper=upper, prior=prior)
-    return sf.Problem(ROOM, run, {"k": k}, min_duration=min_duration)
+    return heat(sf.Measurements(TIMES, values, sigma=sigma), **settings)
 
 
 def wave(size):
@@ -112,13 +111,6 @@ def test_chi_square_is_shared_among_the_fits():
     assert replace(few, cost=np.array([large]), explained=np.array([0.9])).verdict.level == "doubtful"
     explained = np.repeat(0.9, CHUNK)
     assert replace(many, cost=np.r_[large, np.repeat(11.0, CHUNK - 1)], explained=explained).verdict.level == "good"
-
-
-def test_fits_that_did_not_converge_are_counted():
-    many = sf.estimate_many([room(seed=seed) for seed in range(4)], max_iterations=1)
-    assert many.verdict.level == "bad"
-    assert kinds(many) == ["many fits", "some not converged"]
-    assert "(MAX_ITERATIONS)" in str(many.verdict)
 
 
 def test_collapsed_modes_are_counted():

@@ -1,20 +1,20 @@
 """Public names for type checkers; `__init__.py` has the same names in its table."""
 
 from switchfit.batch.fits import Fits as Fits
-from switchfit.batch.fits import estimate_many as estimate_many
 from switchfit.batch.posterior import LogPosterior as LogPosterior
 from switchfit.batch.posterior import log_posterior as log_posterior
-from switchfit.batch.resampling import Bootstrap as Bootstrap
-from switchfit.batch.resampling import bootstrap as bootstrap
+from switchfit.batch.simulated import Bootstrap as Bootstrap
 from switchfit.batch.simulated import MonteCarlo as MonteCarlo
+from switchfit.batch.simulated import bootstrap as bootstrap
 from switchfit.batch.simulated import monte_carlo as monte_carlo
 from switchfit.batch.starts import Multistart as Multistart
 from switchfit.batch.starts import multistart as multistart
+from switchfit.batch.study import estimate_many as estimate_many
 from switchfit.discretization.mesh import Stiffness as Stiffness
 from switchfit.engine.protocol import Evaluation as Evaluation
 from switchfit.estimation.estimator import Estimate as Estimate
-from switchfit.experiment_design.search import Design as Design
-from switchfit.experiment_design.search import design as design
+from switchfit.experiment_design import Design as Design
+from switchfit.experiment_design import design as design
 from switchfit.fit.evaluator import GuardedEvaluation as GuardedEvaluation
 from switchfit.fit.evaluator import evaluate as evaluate
 from switchfit.fit.evaluator import evaluate_on_guards as evaluate_on_guards

@@ -99,31 +99,35 @@ class Quadratures(NamedTuple):
     DpDp_J: Array
 
 
-class Along(NamedTuple):
-    """Derivatives of f and ell on the trajectory at one time, and D_p x there.
+class Slopes(NamedTuple):
+    """A function of (t, x, p) with m values at one point: its value (m,), D1 (m, n), D2 (m,) and Dp (m, M)."""
 
-    Attributes
-    ----------
-    Dp_x : (n, M)
-    D1f, Dpf : (n, n), (n, M)
-    D1D1f, DpD1f, D1Dpf, DpDpf : (n, n, n), (n, n, M), (n, M, n), (n, M, M)
-    D1ell, Dpell : (n,), (M,)
-    D1D1ell, DpD1ell, D1Dpell, DpDpell : (n, n), (n, M), (M, n), (M, M)
+    value: Array
+    D1: Array
+    D2: Array
+    Dp: Array
+
+
+class Bends(NamedTuple):
+    """First and second derivatives in x and p of such a function; the outermost derivative is the last axis.
+
+    D1 (m, n), Dp (m, M), D1D1 (m, n, n), DpD1 (m, n, M), D1Dp (m, M, n), DpDp (m, M, M).
     """
 
+    D1: Array
+    Dp: Array
+    D1D1: Array
+    DpD1: Array
+    D1Dp: Array
+    DpDp: Array
+
+
+class Along(NamedTuple):
+    """D_p x (n, M) on the trajectory at one time, and the derivatives of f and ell there."""
+
     Dp_x: Array
-    D1f: Array
-    Dpf: Array
-    D1D1f: Array
-    DpD1f: Array
-    D1Dpf: Array
-    DpDpf: Array
-    D1ell: Array
-    Dpell: Array
-    D1D1ell: Array
-    DpD1ell: Array
-    D1Dpell: Array
-    DpDpell: Array
+    f: Bends
+    ell: Bends
 
 
 class Transition(NamedTuple):
@@ -133,36 +137,24 @@ class Transition(NamedTuple):
     ----------
     X : (n,), the jump X^i
     xdot : (n,), f_{i-1}(x-) itself
-    f_im1, D1f_im1, D2f_im1, Dpf_im1 : (n,), (n, n), (n,), (n, M)
-        f_{i-1} carried through R (F_{i-1} above; f_{i-1} itself without a reset map) and its derivatives
-    f_i, D1f_i, D2f_i, Dpf_i : the same of f_i at x+
-    Lambda, D1Lambda, D2Lambda, DpLambda : (), (n,), (), (M,), the jump of ell and its derivatives
+    f_im1
+        f_{i-1} carried through R: F_{i-1} above; f_{i-1} itself without a reset map
+    f_i
+        f_i at x+
+    Lambda
+        the jump of ell
     Dell : (n,), D ell at x+
-    D1R, DpR : (n, n), (n, M)
-    D1D1R, DpD1R, D1DpR, DpDpR : (n, n, n), (n, n, M), (n, M, n), (n, M, M)
+    R
+        derivatives of the reset map
     """
 
     X: Array
     xdot: Array
-    f_im1: Array
-    D1f_im1: Array
-    D2f_im1: Array
-    Dpf_im1: Array
-    f_i: Array
-    D1f_i: Array
-    D2f_i: Array
-    Dpf_i: Array
-    Lambda: Array
-    D1Lambda: Array
-    D2Lambda: Array
-    DpLambda: Array
+    f_im1: Slopes
+    f_i: Slopes
+    Lambda: Slopes
     Dell: Array
-    D1R: Array
-    DpR: Array
-    D1D1R: Array
-    DpD1R: Array
-    D1DpR: Array
-    DpDpR: Array
+    R: Bends
 
 
 def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
@@ -194,7 +186,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
     path = propagate(model, tau, p, side)
     transitions = [evaluate_transition(model, path, i, tau[i], p) for i in range(model.structure.N)]
     before, after = integrate_sensitivities(model, path, transitions, p)
-    start, opened, total = sweep_backward(model, path, transitions, Sensitivities(before.Dp_x, after.Dp_x), p)
+    start, opened, total = sweep_backward(model, path, transitions, before.Dp_x, after.Dp_x, p)
     total = add(total, add_initial_state(model, start, p))
 
     D_tau_J, rows_tau = [], []
@@ -204,7 +196,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
         adjoints: Adjoints = pick(opened, opening)
         minus, plus = pick(after, opening - 1), pick(before, opening)
         total = add(total, add_reset(here, adjoints, minus.Dp_x))
-        D_tau_J.append(here.Lambda + adjoints.psi @ here.X)  # (6), Lambda = 0 without a reset map
+        D_tau_J.append(here.Lambda.value + adjoints.psi @ here.X)  # (6), Lambda = 0 without a reset map
         of_tau, of_p = compute_tau_tau(i, here, adjoints, minus, plus), compute_tau_p(here, adjoints, minus, plus)
         rows_tau.append(jnp.concatenate([of_tau, of_p]))
 
@@ -214,12 +206,9 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
 
 def assemble(rows_tau: list[Array], DpDp_J: Array) -> Array:
     """Return the Hessian, equation (3), from rows (N + M,) of the tau block, zero for j > i, and the p block."""
-    N, D = len(rows_tau), len(rows_tau) + DpDp_J.shape[0]
-    H = jnp.zeros((D, D)).at[N:, N:].set(DpDp_J)
-    for i, row in enumerate(rows_tau):
-        H = H.at[i, : i + 1].set(row[: i + 1]).at[: i + 1, i].set(row[: i + 1])
-        H = H.at[i, N:].set(row[N:]).at[N:, i].set(row[N:])
-    return H
+    rows = jnp.array(rows_tau).reshape(len(rows_tau), len(rows_tau) + len(DpDp_J))
+    tau, cross = rows[:, : len(rows)], rows[:, len(rows) :]
+    return jnp.block([[tau + jnp.tril(tau, -1).T, cross], [cross.T, DpDp_J]])
 
 
 # Equations (11), (13), (16), (17), at a transition time
@@ -228,18 +217,16 @@ def assemble(rows_tau: list[Array], DpDp_J: Array) -> Array:
 def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
     """Return D_{tau_j} D_{tau_i} J for all j <= i, equations (11) and (13): (N,), zero for j > i."""
     psi, Omega, _ = adjoints
-    X, xdot = here.X, here.xdot
-    f_im1, D1f_im1, D2f_im1 = here.f_im1, here.D1f_im1, here.D2f_im1
-    f_i, D1f_i, D2f_i = here.f_i, here.D1f_i, here.D2f_i
-    X_ii = D1f_i @ f_i + D1f_im1 @ xdot - 2 * D1f_i @ f_im1 + D2f_im1 - D2f_i  # (13), i = j
-    second = here.D2Lambda + here.D1Lambda @ xdot  # the jump of ell at a reset map, else 0
-    second = second - here.Dell @ X + psi @ X_ii + X @ Omega @ X  # (11), i = j
+    X, xdot, f_im1, f_i, Lambda, Dell, _ = here
+    X_ii = f_i.D1 @ f_i.value + f_im1.D1 @ xdot - 2 * f_i.D1 @ f_im1.value + f_im1.D2 - f_i.D2  # (13), i = j
+    second = Lambda.D2 + Lambda.D1 @ xdot  # the jump of ell at a reset map, else 0
+    second = second - Dell @ X + psi @ X_ii + X @ Omega @ X  # (11), i = j
     row = jnp.zeros(minus.Phi_X.shape[1]).at[i].set(second)
     for j in range(i):
         # (13), i > j. Misprint: the paper has D1 f_{i-1} at (x(tau_i), tau_j); both Jacobians are at tau_i.
-        X_ij = D1f_im1 @ minus.Phi_X[:, j] - D1f_i @ plus.Phi_X[:, j]
+        X_ij = f_im1.D1 @ minus.Phi_X[:, j] - f_i.D1 @ plus.Phi_X[:, j]
         # Phi X^j at tau_i- and, through the map, at tau_i+: the paper's one where there is none.
-        second = here.D1Lambda @ minus.Phi_X[:, j] + psi @ X_ij + X @ Omega @ plus.Phi_X[:, j]  # (11), i > j
+        second = Lambda.D1 @ minus.Phi_X[:, j] + psi @ X_ij + X @ Omega @ plus.Phi_X[:, j]  # (11), i > j
         row = row.at[j].set(second)
     return row
 
@@ -247,8 +234,8 @@ def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensiti
 def compute_tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
     """Return D_{tau_i} D_p J, equation (16): (M,)."""
     psi, _, Omega_p = adjoints
-    X_taup = here.D1f_im1 @ minus.Dp_x - here.D1f_i @ plus.Dp_x + here.Dpf_im1 - here.Dpf_i  # (17)
-    jump = here.D1Lambda @ minus.Dp_x + here.DpLambda  # the jump of ell at a reset map, else 0
+    X_taup = here.f_im1.D1 @ minus.Dp_x - here.f_i.D1 @ plus.Dp_x + here.f_im1.Dp - here.f_i.Dp  # (17)
+    jump = here.Lambda.D1 @ minus.Dp_x + here.Lambda.Dp  # the jump of ell at a reset map, else 0
     return jump + psi @ X_taup + here.X @ Omega_p  # (16)
 
 
@@ -269,17 +256,11 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
     def Lambda(t: Array, x: Array, p: Array) -> Array:
         return ell_before(t, x, p) - ell_after(t, R(t, x, p), p)
 
-    x_minus, x_plus = path.after[opening - 1], path.before[opening]
-    minus, plus = (tau_i, x_minus, p), (tau_i, x_plus, p)
-    f_im1, f_i = carry_over(*minus), f_after(*plus)
-    D2f_im1, D1f_im1, Dpf_im1 = jax.jacfwd(carry_over, argnums=(0, 1, 2))(*minus)
-    D2f_i, D1f_i, Dpf_i = jax.jacfwd(f_after, argnums=(0, 1, 2))(*plus)
-    D2Lambda, D1Lambda, DpLambda = jax.grad(Lambda, argnums=(0, 1, 2))(*minus)
-    X = f_im1 - f_i  # (8)
-    D1R, DpR, *second = differentiate_twice(R, *minus)
-    before, after = (f_im1, D1f_im1, D2f_im1, Dpf_im1), (f_i, D1f_i, D2f_i, Dpf_i)
-    costs = Lambda(*minus), D1Lambda, D2Lambda, DpLambda, jax.grad(ell_after, argnums=1)(*plus)
-    return Transition(X, f_before(*minus), *before, *after, *costs, D1R, DpR, *second)
+    minus, plus = (tau_i, path.after[opening - 1], p), (tau_i, path.before[opening], p)
+    f_im1, f_i = differentiate(carry_over, *minus), differentiate(f_after, *plus)
+    X = f_im1.value - f_i.value  # (8)
+    Dell, R_twice = jax.grad(ell_after, argnums=1)(*plus), differentiate_twice(R, *minus)
+    return Transition(X, f_before(*minus), f_im1, f_i, differentiate(Lambda, *minus), Dell, R_twice)
 
 
 # The forward sweep: equation (10) and the columns of Phi
@@ -290,8 +271,8 @@ def integrate_sensitivities(
 ) -> tuple[Sensitivities, Sensitivities]:
     """Return Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (R, n, N) and (R, n, M) arrays."""
     n, N = model.structure.n, model.structure.N
-    D1R = jnp.stack([jnp.eye(n), *(t.D1R for t in transitions)])
-    DpR = jnp.stack([jnp.zeros((n, p.shape[0])), *(t.DpR for t in transitions)])
+    D1R = jnp.stack([jnp.eye(n), *(t.R.D1 for t in transitions)])
+    DpR = jnp.stack([jnp.zeros((n, p.shape[0])), *(t.R.Dp for t in transitions)])
     X_columns = jnp.zeros((N + 1, n, N))
     for i, here in enumerate(transitions):
         X_columns = X_columns.at[i + 1, :, i].set(here.X)
@@ -334,11 +315,11 @@ def integrate_sensitivities(
 def evaluate_adjoint_rate(d: Along, adjoints: Adjoints) -> Adjoints:
     """Return right-hand sides of the adjoint equations at one time; affine in the adjoints."""
     psi, Omega, Omega_p = adjoints
-    psi_dot = -d.D1ell - psi @ d.D1f  # (7)
-    Omega_dot = -d.D1D1ell - contract(psi, d.D1D1f) - d.D1f.T @ Omega - Omega @ d.D1f  # (12)
-    Omega_p_dot = (
-        -d.D1D1ell @ d.Dp_x - d.DpD1ell - d.D1f.T @ Omega_p - contract(psi, d.D1D1f @ d.Dp_x + d.DpD1f)
-    )  # (15), extended by D_pD_1 ell
+    Dp_x, f, ell = d
+    psi_dot = -ell.D1 - psi @ f.D1  # (7)
+    Omega_dot = -ell.D1D1 - contract(psi, f.D1D1) - f.D1.T @ Omega - Omega @ f.D1  # (12)
+    # (15), extended by D_pD_1 ell
+    Omega_p_dot = -ell.D1D1 @ Dp_x - ell.DpD1 - f.D1.T @ Omega_p - contract(psi, f.D1D1 @ Dp_x + f.DpD1)
     return Adjoints(psi_dot, Omega_dot, Omega_p_dot)
 
 
@@ -348,26 +329,24 @@ def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
     Misprint: (15) is followed by an integral sign without meaning.
     """
     psi, _, Omega_p = adjoints
-    first = psi @ d.Dpf + d.Dpell  # (9)
-    second = (
-        d.Dpf.T @ Omega_p + contract(psi, d.DpDpf) + contract(psi, d.D1Dpf @ d.Dp_x) + d.DpDpell + d.D1Dpell @ d.Dp_x
-    )  # (14)
+    Dp_x, f, ell = d
+    first = psi @ f.Dp + ell.Dp  # (9)
+    of_f = f.Dp.T @ Omega_p + contract(psi, f.DpDp) + contract(psi, f.D1Dp @ Dp_x)
+    second = of_f + ell.DpDp + ell.D1Dp @ Dp_x  # (14)
     return Quadratures(first, second)
 
 
 def sweep_backward(
-    model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
+    model: Model, path: Path, transitions: list[Transition], Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
     """Return the adjoints at t0, those at the start of each row (R, ...; at tau_i+ if it opens a segment), and (9),
     (14).
 
-    `Dp_x` holds D_p x at the start and at the end of each row, two (R, n, M) arrays.
+    `Dp_x_before` and `Dp_x_after` (R, n, M) are D_p x at the start and at the end of each row.
     """
-    Dp_x_before, Dp_x_after = Dp_x
     final, total = add_point_cost(model.terminal, path.after[-1], Dp_x_after[-1], p)
-    at_t0, jumps, sampled = add_sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
-    late, sampled_late = add_late_jumps(model, path, Dp_x_before, p)
-    total = add(total, add(sampled, sampled_late))
+    jumps, late, sampled = add_sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
+    total = add(total, sampled)
 
     def step(tableau: Tableau) -> Callable[..., tuple[Adjoints, Quadratures]]:
         def back(adjoints: Adjoints, total: Quadratures, h: Array, d: Along) -> tuple[Adjoints, Quadratures]:
@@ -385,15 +364,15 @@ def sweep_backward(
         # quadratures of the same stages; at a transition the adjoints at tau_i+ are kept before they go through the map
         # to tau_i-.
         opened, total = switch_method(model, segment, step, add(adjoints, jump), total, end - start, d)
-        opened = add(opened, late[0]) if late else opened
+        opened = add(opened, late)
         return (pass_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
 
     layout = path.layout
     Dp_minus = jnp.concatenate([jnp.zeros_like(Dp_x_before[:1]), Dp_x_after[layout.first_row[1:] - 1]])
     rows = (layout.start, layout.end, path.pieces, path.before, path.after, Dp_x_before, Dp_x_after)
-    given = (layout.segment, layout.opens, jumps, late, *rows)
+    given = (layout.segment, layout.opens, pick(jumps, slice(1, None)), late, *rows)
     (start, total), opened = lax.scan(row, (final, total), given, reverse=True)
-    return add(start, at_t0), opened, total
+    return add(start, pick(jumps, 0)), opened, total
 
 
 def differentiate_along_row(
@@ -407,24 +386,24 @@ def differentiate_along_row(
     parts = jnp.stack([1.0 - tableau.c for tableau in model.tableaus])[model.mode_of_segment[segment]]
     times, directions = start + parts * (end - start), jnp.eye(p.shape[0])
 
-    def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
+    def of_mode(mode: int) -> Callable[..., tuple[Array, Array, Bends]]:
         f = model.field(mode, piece)
 
-        def stage(s: Array, t: Array, x_k: Array, x_k1: Array, *Dp_x: Array) -> tuple[Array, ...]:
+        def stage(s: Array, t: Array, x_k: Array, x_k1: Array, *Dp_x: Array) -> tuple[Array, Array, Bends]:
             # D_p x at a stage is the derivative of the interpolated x, so that both belong to one curve.
             x, linear = jax.linearize(lambda *ends: interpolate(f, s, start, end, *ends), x_k, x_k1, p)
             columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
-            return x, columns, *differentiate_twice(f, t, x, p)
+            return x, columns, differentiate_twice(f, t, x, p)
 
         return jax.vmap(stage, in_axes=(0, 0, None, None, None, None))
 
-    def of_ell(mode: int) -> Callable[..., tuple[Array, ...]]:
+    def of_ell(mode: int) -> Callable[..., Bends]:
         return jax.vmap(lambda t, x: differentiate_twice(model.density(mode, piece), t, x, p))
 
-    x, Dp_x, *of_f = switch_mode(model, segment, of_mode, parts, times, *values)
+    x, Dp_x, f = switch_mode(model, segment, of_mode, parts, times, *values)
     if not model.structure.has_free_tf:  # the same in all modes
-        return Along(Dp_x, *of_f, *of_ell(0)(times, x))
-    return Along(Dp_x, *of_f, *switch_mode(model, segment, of_ell, times, x))
+        return Along(Dp_x, f, of_ell(0)(times, x))
+    return Along(Dp_x, f, switch_mode(model, segment, of_ell, times, x))
 
 
 def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:
@@ -456,65 +435,47 @@ def add_point_cost(
     """Return the contributions of a cost of x at one time, a sample or the terminal cost, to the adjoints there and
     to (9), (14).
     """
-    (Dell, Dpell) = jax.grad(cost, argnums=(0, 1))(x, p)
-    (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.hessian(cost, argnums=(0, 1))(x, p)
+    ell = differentiate_twice(lambda t, x, p: cost(x, p), jnp.zeros(()), x, p)
     # psi- - psi+ = D ell_k, and so on: see "Costs" above.
-    jump = Adjoints(Dell, D2ell, D2ell @ Dp_x + DpD1ell)
-    return jump, Quadratures(Dpell, DpDpell + D1Dpell @ Dp_x)
+    jump = Adjoints(ell.D1, ell.D1D1, ell.D1D1 @ Dp_x + ell.DpD1)
+    return jump, Quadratures(ell.Dp, ell.DpDp + ell.D1Dp @ Dp_x)
 
 
 def add_sample_jumps(
     model: Model, path: Path, Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
-    """Return the jumps of the adjoints at t0 and at the end of each row (R, ...), and the contributions of samples
-    to (9), (14).
+    """Return the jumps of the adjoints at t0 and at the end of each row (R + 1, ...), those at the start of each row
+    (R, ...), and the contributions of samples to (9), (14).
+
+    A late sample is a cost of the state at the start of the row that holds ``t - delay``, any other one of that at the
+    end of its row, or at t0.
     """
     (R, n), M = path.after.shape, p.shape[0]
-    jumps = Adjoints(jnp.zeros((R + 1, n)), jnp.zeros((R + 1, n, n)), jnp.zeros((R + 1, n, M)))
-    total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
-    for k, samples in enumerate(model.arguments.samples):
-        if model.structure.measurements[k].delay is not None:
-            continue
+    ends = Adjoints(jnp.zeros((R + 1, n)), jnp.zeros((R + 1, n, n)), jnp.zeros((R + 1, n, M)))
+    starts, total = pick(ends, slice(1, None)), Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
+    for k, (sensor, samples) in enumerate(zip(model.structure.measurements, model.arguments.samples, strict=True)):
 
-        def one(sample: Any, x: Array, Dp_x: Array, k: int = k) -> tuple[Adjoints, Quadratures]:
+        def add_late(Dp_x: Array, x: Array, *given: Any, k: int = k) -> tuple[Adjoints, Quadratures]:
+            def cost(x: Array, p: Array) -> Array:
+                there, x_s = step_to_late_sample(model, k, *given, x, p)
+                return model.sample_cost(k, there, x_s, p)
+
+            return add_point_cost(cost, x, Dp_x, p)
+
+        def add_own(Dp_x: Array, x: Array, sample: Samples, k: int = k) -> tuple[Adjoints, Quadratures]:
             return add_point_cost(lambda x, p: model.sample_cost(k, sample, x, p), x, Dp_x, p)
 
-        Dp_x = pick_at_cells(path.layout, Dp_x_before, Dp_x_after, samples.cell)
-        jump, added = jax.vmap(one)(samples, path.at_samples(samples.cell), Dp_x)
-        ends = find_row_ending_cell(path.layout.first_cell, samples.cell) + 1  # 0 is t0
-        jumps = jax.tree.map(lambda a, b, ends=ends: a.at[ends].add(b), jumps, jump)
+        if sensor.delay is not None:
+            row, *of_rows, x = find_late_rows(model, path, k, p)
+            jump, added = jax.vmap(add_late)(Dp_x_before[row], x, samples, *of_rows)
+            starts = scatter(starts, row, jump)
+        else:
+            Dp_x = pick_at_cells(path.layout, Dp_x_before, Dp_x_after, samples.cell)
+            jump, added = jax.vmap(add_own)(Dp_x, path.at_samples(samples.cell), samples)
+            # 0 is t0
+            ends = scatter(ends, find_row_ending_cell(path.layout.first_cell, samples.cell) + 1, jump)
         total = add(total, jax.tree.map(lambda a: a.sum(0), added))
-    return pick(jumps, 0), jax.tree.map(lambda a: a[1:], jumps), total
-
-
-def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
-    """Return the jumps of the adjoints at the start of each row by late samples, and their contributions to (9), (14).
-
-    A late sample is a cost of the state at the start of the row that holds ``t - delay``. The jumps are one tuple of
-    (R, ...) arrays, or an empty tuple without late samples.
-    """
-    (R, n), M = path.before.shape, p.shape[0]
-    jumps = Adjoints(jnp.zeros((R, n)), jnp.zeros((R, n, n)), jnp.zeros((R, n, M)))
-    total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
-    which = [k for k, sensor in enumerate(model.structure.measurements) if sensor.delay is not None]
-    for k in which:
-        samples = model.arguments.samples[k]
-        row, *of_rows, x = find_late_rows(model, path, k, p)
-        x_d = Dp_x_before[row]
-
-        def ell(sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array, k: int = k) -> Array:
-            there, x_s = step_to_late_sample(model, k, sample, segment, piece, start, x, p)
-            return model.sample_cost(k, there, x_s, p)
-
-        first = jax.jacfwd(ell, argnums=(4, 5))
-        second = jax.jacfwd(first, argnums=(4, 5))
-        given = samples, *of_rows, x, p
-        Dell, Dpell = jax.vmap(first, in_axes=(0, 0, 0, 0, 0, None))(*given)
-        (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.vmap(second, in_axes=(0, 0, 0, 0, 0, None))(*given)
-        jump = Adjoints(Dell, D2ell, D2ell @ x_d + DpD1ell)
-        jumps = jax.tree.map(lambda a, b, row=row: a.at[row].add(b), jumps, jump)
-        total = add(total, Quadratures(Dpell.sum(0), (DpDpell + D1Dpell @ x_d).sum(0)))
-    return (jumps,) if which else (), total
+    return ends, starts, total
 
 
 def pass_reset(
@@ -523,12 +484,11 @@ def pass_reset(
     """Return the adjoints at tau_i- from those at tau_i+, where a row opens a segment; `Dp_x` is that at tau_i-."""
 
     def through(here: Transition) -> Adjoints:
-        psi, Omega, Omega_p = adjoints
-        D1R = here.D1R
+        (psi, Omega, Omega_p), R = adjoints, here.R
         return Adjoints(
-            psi @ D1R,
-            D1R.T @ Omega @ D1R + contract(psi, here.D1D1R),
-            D1R.T @ Omega_p + contract(psi, here.D1D1R @ Dp_x + here.DpD1R),
+            psi @ R.D1,
+            R.D1.T @ Omega @ R.D1 + contract(psi, R.D1D1),
+            R.D1.T @ Omega_p + contract(psi, R.D1D1 @ Dp_x + R.DpD1),
         )
 
     for i, here in enumerate(transitions):
@@ -538,8 +498,8 @@ def pass_reset(
 
 def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
     """Return the contributions of the reset map's own dependence on p to (9) and (14); `Dp_x` (n, M) is at tau_i-."""
-    psi, _, Omega_p = adjoints
-    return Quadratures(psi @ here.DpR, here.DpR.T @ Omega_p + contract(psi, here.DpDpR + here.D1DpR @ Dp_x))
+    (psi, _, Omega_p), R = adjoints, here.R
+    return Quadratures(psi @ R.Dp, R.Dp.T @ Omega_p + contract(psi, R.DpDp + R.D1Dp @ Dp_x))
 
 
 def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures:
@@ -584,12 +544,17 @@ def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
     return jax.vmap(unravel)(flat[None] + h * (a @ K)), unravel(flat + h * (b @ K))
 
 
-def differentiate_twice(
-    function: Callable[[Array, Array, Array], Array], t: Array, x: Array, p: Array
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return ``D1, Dp, D1D1, DpD1, D1Dp, DpDp`` of a function of (t, x, p); the outermost derivative is
-    the last axis.
-    """
+Function = Callable[[Array, Array, Array], Array]
+
+
+def differentiate(function: Function, t: Array, x: Array, p: Array) -> Slopes:
+    """Return the value and the first derivatives of a function of (t, x, p)."""
+    D2, D1, Dp = jax.jacfwd(function, argnums=(0, 1, 2))(t, x, p)
+    return Slopes(function(t, x, p), D1, D2, Dp)
+
+
+def differentiate_twice(function: Function, t: Array, x: Array, p: Array) -> Bends:
+    """Return the first and second derivatives in x and p of a function of (t, x, p)."""
 
     def first(t: Array, x: Array, p: Array) -> tuple[Any, Any]:
         derivatives = jax.jacfwd(function, argnums=(1, 2))(t, x, p)
@@ -597,7 +562,7 @@ def differentiate_twice(
 
     second, (D1, Dp) = jax.jacfwd(first, argnums=(1, 2), has_aux=True)(t, x, p)
     (D1D1, DpD1), (D1Dp, DpDp) = second
-    return D1, Dp, D1D1, DpD1, D1Dp, DpDp
+    return Bends(D1, Dp, D1D1, DpD1, D1Dp, DpDp)
 
 
 def contract(psi: Array, second: Array) -> Array:
@@ -615,9 +580,14 @@ def where(condition: Array, one: Any, other: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
 
 
-def pick(values: Any, *index: Any) -> Any:
+def pick(values: Any, index: Any) -> Any:
     """Return ``values[index]`` of a tuple of arrays."""
     return jax.tree.map(lambda a: a[index], values)
+
+
+def scatter(values: Any, index: Array, added: Any) -> Any:
+    """Return a tuple of arrays with others (K, ...) added at places (K,) of their first axis."""
+    return jax.tree.map(lambda a, b: a.at[index].add(b), values, added)
 
 
 @partial(jax.jit, static_argnames=("structure",))

@@ -14,7 +14,7 @@ import io
 import os
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import closing, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,7 @@ MANY = 8
 
 
 def run_chunks(
-    work: Any, count: int, *, client: Any = None, folder: str | Path | None = None, progress: Progress | None = None
+    work: Any, count: int, *, client: Any = None, folder: Path | None = None, progress: Progress = lambda *done: None
 ) -> tuple[NDArray[np.intp], Arrays]:
     """Do all runs 0 .. count - 1, in chunks.
 
@@ -73,32 +73,27 @@ def run_chunks(
         If the folder holds the chunks of something else.
     """
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
-    store = None if folder is None else _Store(Path(folder), work.fingerprint())
-    results: dict[int, Arrays] = {}
-    if store is not None:
-        results = {chunk.start: found for chunk in chunks if (found := store.load(chunk)) is not None}
-    done = sum(len(chunk) for chunk in chunks if chunk.start in results)
-    missing = [chunk for chunk in chunks if chunk.start not in results]
-    stopped = progress is not None and done > 0 and bool(progress(done, count))
+    store = None if folder is None else _Store(folder, work.fingerprint())
+    stored = {chunk: store.load(chunk) if store else None for chunk in chunks}
+    results = {chunk: arrays for chunk, arrays in stored.items() if arrays is not None}
+    missing = [chunk for chunk in chunks if chunk not in results]
+    done = count - sum(map(len, missing))
+    stopped = done > 0 and progress(done, count)
     if missing and not stopped:
         computed = _run_in_threads(work, missing) if client is None else _run_on_cluster(work, missing, client)
-        with closing(computed):
-            try:
-                for chunk, arrays in computed:
-                    results[chunk.start] = arrays
-                    if store is not None:
-                        store.save(chunk, arrays)
-                    done += len(chunk)
-                    if progress is not None and progress(done, count):
-                        break
-            except KeyboardInterrupt:
-                pass
-    finished = [chunk for chunk in chunks if chunk.start in results]
-    if not finished:
+        with closing(computed), suppress(KeyboardInterrupt):
+            for chunk, arrays in computed:
+                results[chunk] = arrays
+                if store:
+                    store.save(chunk, arrays)
+                done += len(chunk)
+                if progress(done, count):
+                    break
+    if not results:
         raise KeyboardInterrupt
+    finished = [chunk for chunk in chunks if chunk in results]
     runs = np.concatenate([np.asarray(chunk) for chunk in finished])
-    names = results[finished[0].start]
-    return runs, {name: np.concatenate([results[chunk.start][name] for chunk in finished]) for name in names}
+    return runs, {name: np.concatenate([results[chunk][name] for chunk in finished]) for name in results[finished[0]]}
 
 
 def _run_in_threads(work: Any, chunks: list[range]) -> Generator[tuple[range, Arrays]]:
@@ -125,11 +120,8 @@ def _run_on_cluster(work: Any, chunks: list[range], client: Any) -> Generator[tu
     import distributed
 
     blob = cloudpickle.dumps(work)
-    shared = client.submit(_receive, blob, pure=False)
-    futures = {
-        client.submit(_run_remotely, shared, chunk.start, chunk.stop, pure=False, retries=RETRIES): chunk
-        for chunk in chunks
-    }
+    shared, each = client.submit(_receive, blob, pure=False), {"pure": False, "retries": RETRIES}
+    futures = {client.submit(_run_remotely, shared, chunk, **each): chunk for chunk in chunks}
     try:
         for future in distributed.as_completed(list(futures)):
             yield futures[future], future.result()
@@ -148,8 +140,8 @@ def _unpickle(blob: bytes) -> Any:
     return cloudpickle.loads(blob)
 
 
-def _run_remotely(blob: bytes, start: int, stop: int) -> Arrays:
-    return _unpickle(blob)(range(start, stop))
+def _run_remotely(blob: bytes, chunk: range) -> Arrays:
+    return _unpickle(blob)(chunk)
 
 
 class _Store:

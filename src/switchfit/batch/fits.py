@@ -1,70 +1,54 @@
-"""What many fits found: arrays with one entry a fit. One model, many logs: every log a problem of its own.
+"""What many fits found: arrays with one entry a fit; how many are good, doubtful and bad, why, and what to do next.
 
-Save many fits as one NumPy archive, and load them without losing a bit.
+Ten thousand fits cannot be simulated one by one. Each is judged by what its program returns (status, J, theta, the
+Hessian) and by the share of its data's variance that J leaves, by the rules of single fits
+(`switchfit.uncertainty.answers`), as if its residuals could not be tested. Not looked at are the correlation of the
+residuals, single channels, other starts, and checks of derivatives: fit one by itself for these.
 
-A file holds one array for each array of `Fits` under the name of its field, ``header``, the JSON of everything else
-(UTF-8 bytes), and ``seal``, a digest of all of these, by which damage is noticed. Nothing in it is pickled.
+With J half a sum of squares, and V that of the data about their means, the share of the variance that is explained is
+``1 - J / V``. So it needs V once for each data set, where a single fit compares its trajectory channel by channel.
+
+Many fits are saved as one NumPy archive. It holds one array for each array of `Fits` under the name of its field,
+``header``, the JSON of everything else (UTF-8 bytes), and ``seal``, a digest of all of these, by which damage is
+noticed. Nothing in it is pickled.
 """
 
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, make_dataclass
-from functools import cached_property
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, make_dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self, get_type_hints
+from typing import Any, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.batch.chunks import read_arrays, run_chunks, write_arrays
-from switchfit.batch.program import Limits
-from switchfit.batch.study import StudyOfLogs, list_places
-from switchfit.batch.verdict import count_priors, find_doubts, has_converged, judge_many, measure_variance
+from switchfit.batch.chunks import read_arrays, write_arrays
 from switchfit.estimation.estimator import Estimate, parse_fit, write_fit
-from switchfit.estimation.local_fit import check_settings
-from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.result import interval, measure_quantile
-from switchfit.fit.solution import refuse_hidden_switches
-from switchfit.problem.data import FloatArray
+from switchfit.optimize import Status
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.dates import Origin
-from switchfit.problem.problem import Problem, require_estimable
-from switchfit.problem.validation import as_callable, as_instance, as_level, as_path, as_sequence, join_names
-from switchfit.runtime.files import find_dtype, from_json, to_json
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.problem import Problem
+from switchfit.problem.unknowns import get_min_duration
+from switchfit.problem.validation import as_level, as_path
+from switchfit.runtime import special
+from switchfit.runtime.errors import Issue
+from switchfit.runtime.files import find_dtype, from_json, parse_document, to_json
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
-from switchfit.runtime.progress import show_progress
+from switchfit.uncertainty import verdict
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.verdict import LEVELS, Doubt, Verdict, find_levels
+from switchfit.uncertainty.residuals import HALF, UNLIKELY, compare_with_sigma
+from switchfit.uncertainty.verdict import FINE, LEVELS, Doubt, Finding, Level, Numbers, Verdict, build_verdict
 from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"
 VERSION = 2
-
-
-def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the arrays of a file and its header; ValueError if it was not written by `Fits.save` as it is."""
-    arrays, reason = read_arrays(path)
-    if arrays and reason:
-        raise ValueError(f"{path} is damaged: {reason}.")
-    try:
-        content = json.loads(arrays.pop("header").tobytes())
-        if content["format"] != FORMAT:
-            reason = f"its header has no format {FORMAT!r}"
-    except (KeyError, TypeError, ValueError, RecursionError):
-        reason = reason or "it has no header"
-    if reason:
-        raise ValueError(f"{path} does not hold saved fits ({reason}).")
-    return arrays, content
-
-
-def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[str, Any]) -> Any:
-    """Return fits of a kind from the content of a file."""
-    _, rest = _split_fields(kind)
-    nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
-    return kind(**arrays, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
@@ -218,7 +202,7 @@ class Fits(Tabular, Displayed):
     @cached_property
     def levels(self) -> NDArray[np.str_]:
         """The level of each fit, "good", "doubtful" or "bad": (R,)."""
-        return find_levels(self.doubts, len(self))
+        return verdict.find_levels(self.doubts, len(self))
 
     @cached_property
     def doubts(self) -> list[Doubt]:
@@ -364,177 +348,287 @@ class Fits(Tabular, Displayed):
         ('Multistart', 'CONVERGED')
         """
         file = as_path(path, "path")
-        arrays, content = _read_archive(file)
-        version, name = content.get("version"), content.get("kind")
-        if version != VERSION:
-            raise ValueError(
-                f"{file} holds fits in version {version!r} of their format; this switchfit reads version {VERSION}. "
-                "Read it with the switchfit that wrote it."
-            )
+        arrays, reason = read_arrays(file)
+        if reason:
+            raise ValueError(f"{file} {'is damaged' if arrays else 'does not hold saved fits'}: {reason}.")
+        header = arrays.pop("header", np.zeros(0, np.uint8)).tobytes()
+        content = parse_document(header, file, "a file of saved fits", FORMAT, VERSION)
         kinds = {each.__name__: each for each in (cls, *cls.__subclasses__())}
-        if name not in kinds:
+        if (name := content.get("kind")) not in kinds:
             raise ValueError(
                 f"{file} holds the kind of fits {name!r}, not {cls.__name__}: sf.Fits.load reads every kind."
             )
+        kind = kinds[name]
         try:
-            return _build_fits(kinds[name], arrays, content)
+            nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
+            return kind(**arrays, **vars(from_json(_split_fields(kind)[1], content.get("fits"), "fits")), **nested)
         except (TypeError, ValueError, OverflowError, RecursionError, MemoryError) as error:
             raise ValueError(f"{file} is damaged: {error}.") from error
 
 
-class LongRun(NamedTuple):
-    """When fits end, where a long run is done and kept, who is told how far it is, and when it began.
-
-    Attributes
-    ----------
-    limits : Limits
-    client, folder : as of `run_chunks`
-    callback : callable ``(done, total)``, a true value stops; or None
-    began : float
-        As of ``time.perf_counter()``.
-    """
-
-    limits: Limits
-    client: Any
-    folder: str | Path | None
-    callback: Callable[[int, int], object] | None
-    began: float
-
-    @classmethod
-    def check(cls, tolerance: Any, max_iterations: Any, client: Any, folder: Any, callback: Any) -> LongRun:
-        """Return these settings; raise for those of the wrong type, before anything long is done."""
-        limits = Limits(*check_settings(tolerance, max_iterations))
-        if client is not None and not hasattr(client, "submit"):
-            raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
-        if folder is not None:
-            as_path(folder, "folder")
-        if callback is not None:
-            as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
-        return cls(limits, client, folder, callback, time.perf_counter())
+AT_END = 1e-9
+"""Duration of a mode, as a part of the horizon, or distance from a bound, as a part of it, that counts as zero."""
 
 
-def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) -> dict[str, Any]:
-    """Do `count` runs with a bar on the terminal: the fields of `Fits`.
+def describe_ends(
+    problem: Problem, theta: FloatArray, cost: FloatArray, variation: FloatArray
+) -> dict[str, NDArray[Any]]:
+    """Return the fields `samples`, `explained`, `collapsed` and `at_bounds` of `Fits`, (R,) each.
 
     Parameters
     ----------
     problem : Problem
-        One of those that are fitted: its names, and whether its noise is known.
-    work, count : as of `run_chunks`
-    title : str
-        Of the bar.
-    how : LongRun
-
-    Raises
-    ------
-    ValueError
-        For a problem with a switch that is hidden in a function, with which no fit could be right.
+        Its bounds, modes and horizons; its data may differ from those that were fitted.
+    theta : (R, d)
+    cost : (R,)
+    variation : (R,)
+        Sum of `switchfit.fit.evaluator.measure_variation` over the experiments.
     """
-    _refuse_hidden_switches(problem)
-    with show_progress(how.callback, title) as progress:
-        runs, arrays = run_chunks(work, count, client=how.client, folder=how.folder, progress=progress)
-    known, priors, unknowns = problem.is_sigma_known, count_priors(problem), problem.unknowns
-    variance = measure_variance(arrays["cost"], arrays["samples"] + priors - arrays["free"], known)
-    return arrays | {
-        "covariance": variance[:, None, None] * arrays["covariance"],
-        "theta_names": problem.theta_names,
-        "theta_units": unknowns.units,
-        "requested": count,
-        "runs": runs,
-        "sigma_known": known,
-        "priors": priors,
-        "piece_places": list_places(problem),
-        "log_scaled": unknowns.log_names,
-        "log_origins": unknowns.origin,
-        "seconds": time.perf_counter() - how.began,
-        "date_origins": list_origins(problem),
+    unknowns, priors = problem.unknowns, problem.unknowns.priors
+    squares = cost - np.array([priors.evaluate(each)[0] for each in theta]) if priors.any else cost
+    with np.errstate(divide="ignore", invalid="ignore"):
+        explained = np.where(variation == 0, squares <= 0, 1 - squares / variation)
+        near = AT_END * np.abs(theta)
+        held = (theta <= unknowns.lower + near) | (theta >= unknowns.upper - near)
+        collapsed = sum(map(partial(_count_collapsed, problem), problem.experiments, problem.ends_of_modes(theta)))
+    return {
+        "samples": np.full(len(cost), count_samples(problem)),
+        "explained": np.where(np.isnan(variation) | np.isnan(cost), np.nan, explained),
+        "collapsed": np.asarray(collapsed, dtype=np.int64),
+        "at_bounds": np.sum(held & ~unknowns.is_time, axis=1),
     }
 
 
-def _refuse_hidden_switches(problem: Problem) -> None:
-    """Raise what `estimate` would raise about the model, before thousands of fits list it one by one."""
-    try:
-        evaluator, theta = evaluator_of(problem), problem.initial_theta
-        gradient = evaluator(theta).gradient
-    except Exception:  # a guess at which the model cannot be evaluated: the fits that begin there will say so
-        return
-    if np.isfinite(gradient).all():
-        refuse_hidden_switches(evaluator, theta, gradient)
+def _count_collapsed(problem: Problem, experiment: Experiment, ends: FloatArray) -> NDArray[np.int64]:
+    """Return how many modes of an experiment last no longer than they must, from their ends (R, N + 2): (R,)."""
+    least = np.array([get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence])
+    shortest = least + AT_END * (experiment.end - experiment.t0)
+    found: NDArray[np.int64] = np.sum(np.diff(ends, axis=1) <= shortest, axis=1)
+    return found
 
 
-def list_origins(problem: Problem) -> tuple[Origin | None, ...]:
-    """Return the date at which each unknown that is a date is 0; None for every other."""
-    found: list[Origin | None] = [None] * len(problem.theta_names)
-    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
-        for place in places[places >= 0].tolist():
-            found[place] = experiment.origin
-    return tuple(found)
+def count_samples(problem: Problem) -> int:
+    """Return the measured values that are not missing."""
+    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
 
 
-def estimate_many(
-    problems: Sequence[Problem],
-    *,
-    tolerance: float = 1e-7,
-    max_iterations: int = 200,
-    client: Any = None,
-    folder: str | Path | None = None,
-    callback: Callable[[int, int], object] | None = None,
-) -> Fits:
-    """Fit many problems of one model, each with its own data, guess and mesh.
+def count_priors(problem: Problem) -> int:
+    """Return the unknowns that have a prior."""
+    return int(np.count_nonzero(problem.unknowns.priors.precision))
+
+
+def measure_variance(cost: FloatArray, freedom: NDArray[np.int64], sigma_known: bool | None) -> FloatArray:
+    """Return by what covariances are multiplied: 1 if sigma is known, the residual variance if not; NaN where neither
+    is: (R,).
+    """
+    if sigma_known:
+        return np.ones(len(cost))
+    there = (freedom > 0) & (sigma_known is False)
+    return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
+
+
+MINOR = 0.01
+"""Share of a study's fits that may have failed, or ended at a bound or with a collapsed mode, without a doubt about its
+standard deviations and 95 % intervals."""
+
+FAR_AWAY = 10.0
+"""Robust standard deviations (1.48 times the median deviation) from the median beyond which a fit of a study has ended
+in another minimum. The tails of noise do not reach that far; a single fit that does shows in standard deviations."""
+
+EXPLAINED_BADLY = ("unexplained", "no noise")
+"""Doubts that chi-square gives."""
+
+LEVEL = 0.95
+"""Level at which a study's intervals are checked against the truth. It is said if they miss it half as often again as
+they should (`HALF`), and chance does not explain it."""
+
+
+def has_converged(status: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which of fits with these names of their `Status` converged: (R,)."""
+    return np.isin(status, [one.name for one in Status if one.successful])
+
+
+def find_doubts(fits: Mapping[str, NDArray[Any]], sigma_known: bool | None, priors: int) -> list[Doubt]:
+    """Return what speaks against each of R fits, in order of weight.
 
     Parameters
     ----------
-    problems : sequence of Problem
-        With the same modes, mode sequences, kinds of data and unknowns. Numbers of samples may differ; problems whose
-        padded lengths agree share one compiled program.
-    tolerance, max_iterations : as of `estimate`
-    client, folder, callback : as of `monte_carlo`
-
-    Returns
-    -------
-    Fits
-        In the order of the problems. Fits whose integration error turns out too large are done again by `estimate`.
-
-    Raises
-    ------
-    ValueError
-        If the problems differ in more than their numbers, or the folder holds something else.
-    TypeError
-        If an argument is of the wrong type.
-
-    See Also
-    --------
-    estimate, monte_carlo, multistart
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
-    >>> fits = sf.estimate_many([heater_problem() for _ in range(3)])
-    >>> fits.theta.shape, bool(fits.success.all())
-    ((3, 2), True)
+    fits : mapping of str to array
+        Fields of `Fits`: `status`, `cost`, `hessian`, `free`, `samples`, `explained`, `collapsed`, `at_bounds`.
+    sigma_known, priors : as of `Fits`
     """
-    problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
-    how = LongRun.check(tolerance, max_iterations, client, folder, callback)
-    if not problems:
-        raise ValueError("estimate_many needs one problem or more; got none.")
-    first = problems[0]
-    for k, problem in enumerate(problems):
-        as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
-        require_estimable(problem)
-        if problem.theta_names != first.theta_names or problem.is_sigma_known is not first.is_sigma_known:
-            raise ValueError(
-                f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
-                f"{join_names(problem.theta_names)}, the first one {join_names(first.theta_names)}. Fit it by itself."
-            )
-        units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
-        if units[0] != units[1]:
-            raise ValueError(
-                f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
-                "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
-            )
-    starts = np.array([problem.initial_theta for problem in problems])
-    study = StudyOfLogs(first, [], starts, how.limits, 0, problems)
-    found = repeat(first, study, len(problems), "Logs", how)
-    every = zip(*map(list_origins, problems), strict=True)
-    return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})
+    status, explained, freedom = fits["status"], fits["explained"], fits["samples"] + priors - fits["free"]
+    has_noise, has_shares = sigma_known is not None, bool(np.isfinite(explained).any())
+    numbers = Numbers(
+        has_converged(status),
+        explained=explained,
+        freedom=freedom if has_noise and has_shares else np.inf,
+        collapsed=np.where(status == Status.COLLAPSED.name, 1, fits["collapsed"]),
+        at_bounds=fits["at_bounds"] if has_noise or has_shares else 0,
+        smallest=_find_smallest(fits["hessian"], fits["free"], status),
+        references=not has_noise,
+    )
+    if has_shares and sigma_known:
+        probability, known = compare_with_sigma(2 * fits["cost"], freedom, tests=len(status))
+        numbers = replace(numbers, probability=probability, known=known)
+    return verdict.find_doubts(numbers)
+
+
+def judge_many(fits: Fits) -> Verdict:
+    """Return the verdict on fits of many logs, or of anything in which each fit counts by itself."""
+    R, doubts = len(fits), fits.doubts
+    counts: dict[str, float] = {level: float(np.sum(fits.levels == level)) for level in LEVELS}
+    stopped = list(_find_stop(fits))
+    if not doubts and not stopped:
+        known = np.isfinite(fits.explained)
+        if not known.any():
+            return Verdict("good", (Issue("many fits", figures=counts),))
+        counts |= {"worst": float(fits.explained[known].min()), "median": float(np.median(fits.explained[known]))}
+        return Verdict("good", (Issue("many fits", (str(fits.runs[_find_worst(fits, known)]),), counts),))
+    level: Level = "bad" if counts["bad"] >= HALF * R else "doubtful"
+    reasons = [Issue("many fits", (), counts)] if R > 1 else []
+    reasons += [_count(fits, doubt) for doubt in doubts] + [finding.reason for finding in stopped]
+    steps = [Issue("next: fit alone", (str(fits.runs[_find_worst(fits, doubts[0].which)]),))] if doubts else []
+    steps += [Issue(f"next: {step}") for finding in stopped for step in finding.steps]
+    if any(doubt.kind == "a mode collapsed" for doubt in doubts):
+        steps.append(Issue("next: leave the mode out"))
+    return Verdict(level, tuple(reasons), tuple(steps))
+
+
+def judge_study(
+    fits: Fits,
+    *,
+    truth: FloatArray | None = None,
+    error: float = 0.0,
+    origin: Verdict | None = None,
+    considered: NDArray[np.bool_] | None = None,
+) -> Verdict:
+    """Return the verdict on fits whose spread is what they are for.
+
+    Parameters
+    ----------
+    fits : Fits
+    truth : (d,), optional
+        What all of them should find.
+    error : float
+        Integration error of J, relative.
+    origin : Verdict, optional
+        On the fit that the data are made of.
+    considered : (d,) bool, optional
+        Unknowns whose spread means something; all if left out.
+    """
+    R, ended = len(fits.status), fits.success
+    shared = np.ones(len(fits.theta_names), dtype=bool) if considered is None else considered
+    found: list[Finding] = []
+    if origin is not None and origin.level == "bad":
+        found.append(Finding("bad", Issue("resampled fit", (origin.level,)), ("look at the fit",)))
+    failed = int(R - ended.sum())
+    if failed > MINOR * R:
+        level: Level = "bad" if failed >= HALF * R else "doubtful"
+        found.append(Finding(level, _count(fits, Doubt("not converged", level, ~ended)), ("see failures",)))
+    distances = measure_distances(fits, shared)
+    elsewhere = distances > FAR_AWAY
+    if elsewhere.any():
+        farthest = str(fits.runs[int(np.argmax(distances))])
+        figures = {"count": float(elsewhere.sum()), "fits": float(R)}
+        found.append(Finding("doubtful", Issue("ended elsewhere", (farthest,), figures), ("take quantiles",)))
+    for doubt in fits.doubts:
+        many = doubt.which.sum() > MINOR * R
+        if doubt.kind in ("a mode collapsed", "at bounds", "not determined") and many:
+            step = "leave the mode out" if doubt.kind == "a mode collapsed" else "take quantiles"
+            found.append(Finding("doubtful", _count(fits, doubt), (step,)))
+        elif doubt.kind in EXPLAINED_BADLY and origin is None and np.any(doubt.which & ~elsewhere):
+            found.append(Finding("doubtful", _count(fits, doubt), ("check sigma",)))
+    if truth is not None:
+        found += _check_coverage(fits, truth, ended & ~elsewhere)
+    if not error <= FINE:
+        found.append(Finding("bad", Issue("integration error", ("J",), {"error": error}), ("smaller rtol",)))
+    found += _find_stop(fits)
+    figures = {"count": float(ended.sum()), "fits": float(R)}
+    return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
+
+
+def judge_failed_starts(fits: Fits) -> Verdict:
+    """Return the verdict on fits from many starts none of which could be fitted to the end.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    everywhere = Doubt("not converged", "bad", np.ones(len(fits), dtype=bool))
+    return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
+
+
+def measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:
+    """Return how far fits converged from the others, in spreads; 0 for those that did not converge: (R,).
+
+    An unknown's deviation from the median is measured by the median of these deviations, or by the median standard
+    error, or 1e-3 of the unknown's size where most are held. Of some unknowns (d,), the largest counts.
+    """
+    ended = fits.success
+    found = np.zeros(len(ended))
+    if ended.sum() < 3:
+        return found
+    theta = fits.theta[ended]
+    centre = np.median(theta, axis=0)
+    deviation = np.abs(theta - centre)
+    errors = fits.standard_errors[ended]
+    usual = np.array([np.median(e[np.isfinite(e)]) if np.isfinite(e).any() else 0.0 for e in errors.T])
+    spread = np.maximum(1.4826 * np.median(deviation, axis=0), usual)
+    spread = np.where(spread > 0, spread, 1e-3 * np.maximum(np.abs(centre), 1e-300))
+    found[ended] = np.max(deviation / spread * considered, axis=1)
+    return found
+
+
+def _find_smallest(H: FloatArray, free: NDArray[np.int64], status: NDArray[np.str_]) -> FloatArray:
+    """Return the smallest eigenvalue of each scaled Hessian, infinite where a constraint is active: (R,)."""
+    found = np.where(status == Status.SINGULAR.name, 0.0, np.inf)
+    diagonal = np.diagonal(H, axis1=1, axis2=2)
+    whole = (free == H.shape[1]) & np.isfinite(H).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
+    if whole.any():
+        scale = diagonal[whole] ** -0.5
+        smallest = np.linalg.eigvalsh(H[whole] * scale[:, :, None] * scale[:, None, :])[:, 0]
+        found[whole] = np.minimum(found[whole], smallest)
+    return found
+
+
+def _check_coverage(fits: Fits, truth: FloatArray, counted: NDArray[np.bool_]) -> Iterator[Finding]:
+    """Find unknowns whose intervals hold the truth less often than they should."""
+    low, high = np.moveaxis(fits.confidence_intervals(LEVEL)[counted], 2, 0)
+    known = ~np.isnan(low).all(axis=0) if len(low) else np.zeros(low.shape[1], dtype=bool)
+    if not known.any():
+        return
+    n = len(low)
+    inside = np.sum((low <= truth) & (truth <= high), axis=0)
+    chance = special.bdtr(inside, n, LEVEL)  # of so few, or fewer
+    short = known & (n - inside > (1 + HALF) * (1 - LEVEL) * n) & (chance < UNLIKELY / len(truth))
+    if short.any():
+        order = np.argsort(np.where(short, inside, n + 1), kind="stable")[: short.sum()]
+        names = tuple(fits.theta_names[i] for i in order)
+        shares = {"share": float(inside[order[0]] / n), "level": LEVEL}
+        yield Finding("doubtful", Issue("intervals too short", names, shares), ("profiles",))
+
+
+def _find_stop(fits: Fits) -> Iterator[Finding]:
+    """Find out whether the fits were stopped before the last."""
+    left = fits.requested - len(fits.status)
+    if left > 0:
+        figures = {"count": float(left), "fits": float(fits.requested)}
+        yield Finding("doubtful", Issue("stopped", figures=figures), ("go on",))
+
+
+def _count(fits: Fits, doubt: Doubt) -> Issue:
+    """Return a reason with the number of fits that it is about, the worst of them and how much that explains."""
+    figures = {"count": float(doubt.which.sum()), "fits": float(len(doubt.which))}
+    if doubt.kind == "not converged":
+        endings = Counter(fits.status[doubt.which].tolist()).most_common()
+        return Issue("some not converged", tuple(name for name, _ in endings), figures)
+    worst = _find_worst(fits, doubt.which)
+    return Issue(f"some {doubt.kind}", (str(fits.runs[worst]),), figures | {"worst": float(fits.explained[worst])})
+
+
+def _find_worst(fits: Fits, which: NDArray[np.bool_]) -> int:
+    """Return the place of the worst of some fits: the one that explains least, if any does."""
+    places = np.flatnonzero(which)
+    shares = fits.explained[places]
+    return int(places[0] if np.isnan(shares).all() else places[np.nanargmin(shares)])

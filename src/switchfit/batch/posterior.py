@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from switchfit.batch.program import Inputs, choose_layout, has_gpu
 from switchfit.estimation.estimator import Estimate
@@ -40,55 +40,53 @@ FLAT = -np.inf
 """Logarithm of a density of zero."""
 
 
-class Link(NamedTuple):
-    """What limits one transition time, or a free tf.
+class Limits(NamedTuple):
+    """What limits each unknown.
 
     Attributes
     ----------
-    place : int
-        Its index in theta.
-    before : int
-        Index in theta of the time before it; -1 if that is fixed, or t0.
-    gap : float
+    before : (d,) int
+        Of a transition time, or a free tf, the index in theta of the time before it; -1 if that is fixed, or t0, and
+        for all other unknowns.
+    gap : (d,)
         Shortest time between the two.
-    low : float
-        Its lower bound; if `before` is -1, not less than the fixed time before it plus the gap.
-    high : float
-        Its upper bound, so that all times after it find room.
+    low : (d,)
+        Lower bound; of a time after one that is fixed, not less than this plus the gap.
+    high : (d,)
+        Upper bound, so that all times after it find room.
     """
 
-    place: int
-    before: int
-    gap: float
-    low: float
-    high: float
+    before: NDArray[np.intp]
+    gap: FloatArray
+    low: FloatArray
+    high: FloatArray
 
 
-def link_times(problem: Problem) -> list[Link]:
-    """Return the limits of all free transition times, in the order of theta.
+def limit_unknowns(problem: Problem) -> Limits:
+    """Return the limits of all unknowns.
 
     Parameters
     ----------
     problem : Problem
     """
-    found = []
-    unknowns = problem.unknowns
+    unknowns, d = problem.unknowns, len(problem.theta_names)
+    found = Limits(np.full(d, -1), np.zeros(d), unknowns.lower.copy(), unknowns.upper.copy())
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        times = experiment.initial_times
+        times, places = experiment.initial_times, where.tolist()
         gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
-        highs, high = np.zeros(len(where)), np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
-        for i in reversed(range(len(where))):
-            own = times[i] if where[i] < 0 else unknowns.upper[where[i]]
-            highs[i] = min(own, high)
-            high = highs[i] - gaps[i]
+        latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
+        for i in reversed(range(len(places))):
+            latest = min(latest, times[i] if places[i] < 0 else found.high[places[i]])
+            if places[i] >= 0:
+                found.high[places[i]] = latest
+            latest -= gaps[i]
         before, last = -1, experiment.t0
-        for i, place in enumerate(where.tolist()):
-            if place < 0:
-                before, last = -1, times[i]
-                continue
-            low, gap = float(unknowns.lower[place]), gaps[i]
-            found.append(Link(place, before, gap, low if before >= 0 else max(low, last + gap), float(highs[i])))
-            before = place
+        for i, place in enumerate(places):
+            if place >= 0:
+                found.before[place], found.gap[place] = before, gaps[i]
+                if before < 0:
+                    found.low[place] = max(found.low[place], last + gaps[i])
+            before, last = place, times[i]
     return found
 
 
@@ -217,11 +215,8 @@ class LogPosterior:
         >>> posterior.unconstrain([3.0, 2.505]).round(12)
         array([0., 0.])
         """
-        at, unknowns = self.problem.check_theta(theta), self.problem.unknowns
-        low, high = unknowns.lower.copy(), unknowns.upper.copy()
-        for link in self._links:
-            low[link.place] = link.low if link.before < 0 else max(link.low, at[link.before] + link.gap)
-            high[link.place] = link.high
+        at, (before, gap, low, high) = self.problem.check_theta(theta), self._limits
+        low = np.where(before >= 0, np.maximum(low, at[before] + gap), low)
         has_low, has_high = np.isfinite(low), np.isfinite(high)
         with np.errstate(divide="ignore", invalid="ignore"):  # what is not chosen
             part = np.clip(np.where(high > low, (at - low) / (high - low), 0.5), EDGE, 1 - EDGE)
@@ -272,8 +267,8 @@ class LogPosterior:
         return build_arviz(draws, {"inference_library": "switchfit", "draws": "posterior"})
 
     @cached_property
-    def _links(self) -> list[Link]:
-        return link_times(self.problem)
+    def _limits(self) -> Limits:
+        return limit_unknowns(self.problem)
 
     @cached_property
     def _density(self) -> Callable[[Any], Any]:
@@ -301,11 +296,11 @@ class LogPosterior:
 
     def _transform(self, z: Any) -> tuple[Any, Any]:
         """Return theta at z (d,), and ``log |dtheta/dz|``."""
-        unknowns = self.problem.unknowns
-        lower, upper = unknowns.lower, unknowns.upper
+        limits = self._limits
+        lower, upper = limits.low, limits.high
         z = self.center + jnp.asarray(self.root) @ z
         has_low, has_high = np.isfinite(lower), np.isfinite(upper)
-        both, one = has_low & has_high, has_low != has_high
+        both, one = has_low & has_high, (has_low != has_high) & (limits.before < 0)
         width = np.where(both, upper - lower, 1.0)
         signed, inside = jnp.where(has_low, z, -z), jax.nn.sigmoid(z)
         log_slope = jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
@@ -313,11 +308,10 @@ class LogPosterior:
         theta = jnp.where(both, lower + width * inside, jnp.where(has_low, lower + away, upper - away))
         theta = jnp.where(both | one, theta, z)
         slopes = jnp.where(both, np.log(width) + log_slope, jnp.where(one, signed, 0.0))
-        for link in self._links:
-            i = link.place
-            first = link.low if link.before < 0 else jnp.maximum(link.low, theta[link.before] + link.gap)
-            theta = theta.at[i].set(first + (link.high - first) * inside[i])
-            slopes = slopes.at[i].set(jnp.log(link.high - first) + log_slope[i])
+        for i in np.flatnonzero(limits.before >= 0).tolist():  # each after the time before it
+            first = jnp.maximum(lower[i], theta[limits.before[i]] + limits.gap[i])
+            theta = theta.at[i].set(first + (upper[i] - first) * inside[i])
+            slopes = slopes.at[i].set(jnp.log(upper[i] - first) + log_slope[i])
         return theta, jnp.sum(slopes) + np.linalg.slogdet(self.root)[1]
 
     def _scale_by(self, fit: Fit) -> LogPosterior:
@@ -360,19 +354,14 @@ class LogPosterior:
                 known = jnp.isfinite(J)
                 return J, jnp.where(known, g, 0.0), jnp.where(known, H, 0.0)
 
-        @jax.custom_jvp
-        def differentiate(theta: Any) -> tuple[Any, Any]:
-            return evaluate(theta)[:2]
+        differentiate = jax.custom_jvp(lambda theta: evaluate(theta)[:2])
+        cost = jax.custom_jvp(lambda theta: evaluate(theta)[0])
 
         @differentiate.defjvp
         def push_gradient(primals: tuple[Any], tangents: tuple[Any]) -> Any:
             with use_float64():
                 J, g, H = evaluate(*primals)
                 return (J, g), (g @ tangents[0], H @ tangents[0])
-
-        @jax.custom_jvp
-        def cost(theta: Any) -> Any:
-            return evaluate(theta)[0]
 
         @cost.defjvp
         def push_cost(primals: tuple[Any], tangents: tuple[Any]) -> Any:

@@ -77,7 +77,6 @@ class Layout:
     """What the compiled program depends on: structures, and where in theta each experiment's unknowns stand."""
 
     structures: tuple[Structure, ...]  # where machine code evaluates J, what their sequences have in common alone
-    transitions: tuple[int, ...]
     places: tuple[tuple[int, ...], ...]  # of the N transition times and M parameters, -1 where fixed
     varying: tuple[int, ...]
     lockstep: bool
@@ -115,7 +114,6 @@ def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = (), *, on_gpu
     natively = not on_gpu and problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
     return Layout(
         tuple(structure.library for structure in structures) if natively else structures,
-        tuple(structure.N for structure in structures),
         tuple(tuple(int(k) for k in places) for places in problem.places),
         varying=varying,
         lockstep=not natively and has_gpu(),
@@ -138,6 +136,8 @@ class Inputs(NamedTuple):
     variables : Variables
         Those that the optimiser has in place of theta.
     lower, upper : (d,), bounds of theta
+    constraints : Constraints
+        On the variables.
     """
 
     arguments: tuple[Arguments, ...]
@@ -147,15 +147,22 @@ class Inputs(NamedTuple):
     variables: Variables
     lower: Any
     upper: Any
+    constraints: Constraints
 
     @classmethod
     def of(cls, evaluator: Evaluator, layout: Layout) -> Inputs:
         """Return those of a problem on the meshes of an evaluator."""
-        unknowns, natively = evaluator.problem.unknowns, layout.natively
-        times = tuple(experiment.initial_times_with_jumps for experiment in evaluator.problem.experiments)
-        sequences = tuple(places_in_library(structure) if natively else {} for structure in evaluator.structures)
-        of_theta = unknowns.priors, unknowns.variables, unknowns.lower, unknowns.upper
-        return cls(tuple(evaluator.arguments), times, sequences, *of_theta)
+        problem, unknowns, variables = (
+            evaluator.problem,
+            evaluator.problem.unknowns,
+            evaluator.problem.unknowns.variables,
+        )
+        times = tuple(experiment.initial_times_with_jumps for experiment in problem.experiments)
+        sequences = tuple(places_in_library(each) if layout.natively else {} for each in evaluator.structures)
+        limits: list[Any] = [variables.inward(unknowns.lower), variables.inward(unknowns.upper)]
+        rows: list[Any] = [unknowns.A, unknowns.b, *limits, variables.sizes_inward(problem.sizes)]
+        of_theta = unknowns.priors, variables, unknowns.lower, unknowns.upper
+        return cls(tuple(evaluator.arguments), times, sequences, *of_theta, Constraints(*rows))
 
     def find_theta(self, z: Any) -> Any:
         """Return theta (d,) at z, the variables of the optimiser."""
@@ -170,8 +177,8 @@ class Inputs(NamedTuple):
         arguments, d = replace_leaves(self.arguments, layout.varying, own), theta.shape[0]
         J, g, curvature = self.priors.evaluate(theta, jnp)
         H, extended = jnp.diag(curvature), jnp.append(theta, 0.0)
-        for group in _group_experiments(layout, arguments, self.sequences):
-            structure, N = layout.structures[group[0]], layout.transitions[group[0]]
+        for group in _group_experiments(layout, arguments, self):
+            structure, N = layout.structures[group[0]], len(self.times[group[0]])
             where = np.array([layout.places[e] for e in group])
             where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
             fixed = jnp.stack([self.times[e] for e in group])
@@ -203,15 +210,14 @@ def replace_leaves(
     return tuple(jax.tree.unflatten(tree, leaves))
 
 
-def _group_experiments(
-    layout: Layout, arguments: tuple[Arguments, ...], sequences: Sequence[Mapping[str, Any]]
-) -> list[list[int]]:
+def _group_experiments(layout: Layout, arguments: tuple[Arguments, ...], inputs: Inputs) -> list[list[int]]:
     """Return groups of experiments with the same structure and array shapes, which one loop can evaluate."""
     groups: dict[Any, list[int]] = {}
-    given = zip(layout.structures, layout.transitions, arguments, sequences, strict=True)
-    for e, (structure, N, own, sequence) in enumerate(given):
-        shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(own))
-        groups.setdefault((structure, N, shapes, tuple(sorted(sequence))), []).append(e)
+    for e, (structure, *own) in enumerate(
+        zip(layout.structures, arguments, inputs.times, inputs.sequences, strict=True)
+    ):
+        leaves, tree = jax.tree.flatten(own)
+        groups.setdefault((structure, tree, tuple(map(np.shape, leaves))), []).append(e)
     return list(groups.values())
 
 
@@ -433,16 +439,11 @@ class Batch:
 
     def _run_program(self, starts: FloatArray) -> Outcome:
         """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""
-        problem, limits = self.evaluator.problem, self.limits
-        unknowns, variables = problem.unknowns, problem.unknowns.variables
-        bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
-        numbers: list[Any] = [unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes)]
-        constraints = Constraints(*numbers)
         # What it does not settle has as many iterations left for the optimiser that finishes it.
-        limits = limits._replace(max_iterations=limits.max_iterations // 2)
-        padded = pad_fits(variables.inward(starts), self.layout.size)
+        limits = self.limits._replace(max_iterations=self.limits.max_iterations // 2)
+        inward = self.evaluator.problem.unknowns.variables.inward(starts)
         try:
-            found = self._run(_minimize_fits, constraints, limits, padded, len(starts))
+            found = self._run(_minimize_fits, limits, pad_fits(inward, self.layout.size), len(starts))
         except Exception as error:
             # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
@@ -454,23 +455,22 @@ class Batch:
         is_sharp = self.layout.natively and not all(map(Follower(self.evaluator).suits, outcome.theta[[0, -1]]))
         return Outcome.at_starts(starts, np) if is_sharp else outcome
 
-    def _fit_on_meshes(self, k: int, start: FloatArray, limits: Limits) -> Result:
-        """Fit the data of fit k, which the evaluator has, from a start."""
-        problem, varying = self.evaluator.problem, self.varying
+    def _fit_one(self, k: int, start: FloatArray, limits: Limits) -> Result:
+        """Fit the data of fit k from a start. Meshes follow, unless each fit has times of its own, with which no mesh
+        is made.
+        """
+        problem, varying, evaluator = self.evaluator.problem, self.varying, self._give_data(k)
 
         def build(meshes: Sequence[Mesh]) -> Evaluator:
             return Batch(problem, meshes, varying, limits)._give_data(k)
 
-        has_own_times = len(varying) == len(jax.tree.leaves(self._base))
-        if has_own_times:
-            return minimize_cost(self.evaluator, start, "exact", *limits)
-        return minimize_cost(Follower(self.evaluator, build), start, "auto", *limits)  # fewer steps by a trust region
+        if len(varying) == len(jax.tree.leaves(self._base)):
+            return minimize_cost(evaluator, start, "exact", *limits)
+        # A trust region takes fewer steps.
+        return minimize_cost(Follower(evaluator, build), start, "auto", *limits)
 
     def _finish_rest(self, outcome: Outcome, starts: FloatArray) -> Chunk:
-        """Return the outcomes as a chunk; fits that did not settle are done by `minimize`, one by one.
-
-        Meshes follow, unless each fit has times of its own, with which no mesh is made.
-        """
+        """Return the outcomes as a chunk; fits that did not settle are done by `minimize`, one by one."""
         problem, limits, chunk = self.evaluator.problem, self.limits, Chunk.of(outcome)
         settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
         # Held coordinates are left out of the covariance: rows of the identity in H, zero in its inverse.
@@ -484,10 +484,7 @@ class Batch:
         for k in np.flatnonzero(~settled).tolist():
             before = int(chunk.iterations[k])
             try:
-                self._give_data(k)
-                found = self._fit_on_meshes(
-                    k, starts[k], limits._replace(max_iterations=limits.max_iterations - before)
-                )
+                found = self._fit_one(k, starts[k], limits._replace(max_iterations=limits.max_iterations - before))
             except Exception as error:  # of any kind: the other fits go on
                 chunk.set_error(k, error)
                 chunk.free[k] = 0
@@ -501,7 +498,6 @@ class Batch:
 def _minimize_fits(
     inputs: Inputs,
     values: tuple[jax.Array, ...],
-    constraints: Constraints,
     limits: Limits,
     starts: jax.Array,
     count: jax.Array,
@@ -509,7 +505,6 @@ def _minimize_fits(
     layout: Layout,
 ) -> Outcome:
     """Return the outcomes of the first `count` fits."""
-
     variables = inputs.variables
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
@@ -519,8 +514,8 @@ def _minimize_fits(
             J, g, H = inputs.evaluate(layout, own, theta, side)
             return J, *variables.derivatives_inward(theta, g, H, jnp)
 
-        breakpoints = _list_breakpoints(layout, replace_leaves(inputs.arguments, layout.varying, own))
-        found = minimize_traced(Task(evaluate, constraints, breakpoints, *limits), start)
+        breakpoints = _list_breakpoints(layout, inputs.times, replace_leaves(inputs.arguments, layout.varying, own))
+        found = minimize_traced(Task(evaluate, inputs.constraints, breakpoints, *limits), start)
         theta = inputs.find_theta(found.theta)
         left = variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
         gradient, hessian = variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
@@ -559,12 +554,12 @@ def _evaluate_fits(
     return lax.fori_loop(0, count, one, empty)
 
 
-def _list_breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
+def _list_breakpoints(layout: Layout, times: tuple[Any, ...], arguments: tuple[Arguments, ...]) -> Breakpoints:
     """Return the nodes of each free transition time; these are not scaled."""
     nodes = {
         place: own.nodes
-        for own, N, places in zip(arguments, layout.transitions, layout.places, strict=True)
-        for place in places[:N]
+        for own, tau, places in zip(arguments, times, layout.places, strict=True)
+        for place in places[: len(tau)]
         if place >= 0
     }
     if not nodes:
@@ -594,27 +589,15 @@ def describe_failure(error: BaseException) -> str:
 
 def describe_error(error: BaseException) -> str:
     """Return kind and text of an error on one line; of an error in a callback, those of the original error."""
-    text = str(error)
-    if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
-        raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
-        text = raised[-1] if raised else text
-    else:
-        text = f"{type(error).__name__}: {text}"
+    # JAX hands on what a callback raised as text, whose last such line says what it was.
+    raised = [line for line in str(error).splitlines() if RAISED.match(line)]
+    text = raised[-1] if raised else f"{type(error).__name__}: {error}"
     return " ".join(text.split())[:LONGEST_ERROR]
 
 
 def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:
     """Return the termination of fit k, which ended at kinks."""
-    names, theta = problem.unknowns.names, outcome.theta[k]
-    kinks = tuple(
-        Kink(names[i], float(theta[i]), float(outcome.left[k, i]), float(outcome.gradient[k, i]))
-        for i in np.flatnonzero(outcome.held[k])
-    )
-    return Termination(
-        Status.CONVERGED_AT_KINK,
-        cost=float(outcome.cost[k]),
-        optimality=float(outcome.optimality[k]),
-        tolerance=tolerance,
-        iterations=int(outcome.iterations[k]),
-        kinks=kinks,
-    )
+    names, columns = problem.unknowns.names, (outcome.theta[k], outcome.left[k], outcome.gradient[k])
+    kinks = tuple(Kink(names[i], *(float(column[i]) for column in columns)) for i in np.flatnonzero(outcome.held[k]))
+    figures = {name: getattr(outcome, name)[k].item() for name in ("cost", "optimality", "iterations")}
+    return Termination(Status.CONVERGED_AT_KINK, tolerance=tolerance, kinks=kinks, **figures)

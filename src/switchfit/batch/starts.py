@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.fits import Fits, judge_failed_starts
 from switchfit.batch.program import Limits, describe_failure
-from switchfit.batch.study import Study
-from switchfit.batch.verdict import judge_failed_starts
+from switchfit.batch.study import LongRun, Study, repeat
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
@@ -168,16 +167,11 @@ def multistart(
         points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
     study = Study(problem, _find_meshes(problem, points), points, how.limits, seed)
     found = repeat(problem, study, len(points), "Multistart", how)
-    best, errors = _find_best(problem, Fits(**found), how.limits)
-    status, message = found["status"].tolist(), found["message"].tolist()
-    for k, error in errors.items():
-        status[k], message[k] = Status.ERROR.name, describe_failure(error)
-    found |= {"status": np.array(status), "message": np.array(message)}
-    fits = Fits(**found)
+    fits, best = _find_best(problem, Fits(**found), how.limits)
     clusters = _find_clusters(problem, fits)
     if best is not None:
         best = replace(best, starts=_count_starts(fits, clusters, best.cost))
-    return Multistart(**found, clusters=clusters, best=best)
+    return Multistart(**found | {"status": fits.status, "message": fits.message}, clusters=clusters, best=best)
 
 
 def _find_meshes(problem: Problem, points: FloatArray) -> list[Mesh]:
@@ -198,16 +192,18 @@ def _count_starts(fits: Fits, clusters: NDArray[np.int64], best: float) -> tuple
     return len(fits) - 1, better, max(int(np.sum(clusters == 0)) - 1, 0)
 
 
-def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Estimate | None, dict[int, Exception]]:
-    """Return a full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
-    errors: dict[int, Exception] = {}
+def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Fits, Estimate | None]:
+    """Return a full estimate, resumed at the lowest end that allows one, and the fits with the errors of lower ends."""
+    status, message = fits.status.astype(object), fits.message.astype(object)
+    best = None
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
         try:
-            return fit_locally(problem, start=start, **limits._asdict()), errors
+            best = fit_locally(problem, start=start, **limits._asdict())
+            break
         except Exception as error:  # of this end alone: listed
-            errors[k] = error
-    return None, errors
+            status[k], message[k] = Status.ERROR.name, describe_failure(error)
+    return replace(fits, status=status.astype(str), message=message.astype(str)), best
 
 
 def _check_starts(problem: Problem, starts: Any) -> FloatArray:

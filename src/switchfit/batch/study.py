@@ -17,57 +17,44 @@ happen anywhere, and from there on their guards.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch import fits as judged
+from switchfit.batch.chunks import Arrays, compute_fingerprint, run_chunks
+from switchfit.batch.fits import Fits, count_priors, count_samples, has_converged, measure_variance
 from switchfit.batch.program import Batch, Chunk, Limits, Varying, choose_chunk_size, describe_failure
-from switchfit.batch.verdict import (
-    EXPLAINED_BADLY,
-    count_priors,
-    count_samples,
-    describe_ends,
-    find_doubts,
-    has_converged,
-    measure_variance,
-)
 from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.branches import has_corners
-from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
 from switchfit.fit.result import measure_quantile
+from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.optimize import Status
 from switchfit.optimize.traced import Outcome
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
+from switchfit.problem.dates import Origin
+from switchfit.problem.problem import Problem, require_estimable
+from switchfit.problem.validation import as_callable, as_instance, as_path, as_sequence, join_names
+from switchfit.runtime.progress import show_progress
 from switchfit.strategy.starts import End, fit_briefly
-from switchfit.uncertainty.walks import (
-    HIGHEST_LEVEL,
-    MOST_HALVINGS,
-    MOST_RUNS,
-    PIECE,
-    Derivatives,
-    Walks,
-    is_any_near,
-    join_walks,
-    list_transitions,
-    list_walks,
-    stack_sample_times,
-    trace_walks,
-)
+from switchfit.uncertainty import walks as ways
+from switchfit.uncertainty.walks import HIGHEST_LEVEL, Derivatives, Walks
 
 MOST_SAMPLES = 5
 """With more samples than that within an interval one parabola is taken: their kinks begin to average out, and the
 pieces of all fits would be most of what is kept."""
 
-MOST_KEPT = MOST_SAMPLES + 1 + MOST_HALVINGS
+MOST_KEPT = MOST_SAMPLES + 1 + ways.MOST_HALVINGS
 """Pieces that are kept for one side."""
 
 AT_KINK = Status.CONVERGED_AT_KINK.name
@@ -79,16 +66,15 @@ def list_places(problem: Problem) -> NDArray[np.intp]:
     None where J has no noise model, with guards, terminal constraints or corners of the state, of which compiled
     programs know nothing, and of more than `MOST_RUNS` experiments.
     """
-    judged = problem.is_sigma_known is not None and not problem.constraint_names
-    judged = judged and not any(map(has_corners, problem.structures))
-    if not judged or len(problem.experiments) > MOST_RUNS:
+    alone = problem.is_sigma_known is None or problem.constraint_names or any(map(has_corners, problem.structures))
+    if alone or len(problem.experiments) > ways.MOST_RUNS:
         return np.zeros(0, dtype=np.intp)
-    return np.array([k for _, k in list_transitions(problem)], dtype=np.intp)
+    return np.array([k for _, k in ways.list_transitions(problem)], dtype=np.intp)
 
 
 def make_no_pieces(problem: Problem, count: int) -> FloatArray:
     """Return the pieces of fits none of which has a sample near: (R, T, 2, `MOST_KEPT`, 5) of NaN."""
-    return np.full((count, len(list_places(problem)), 2, MOST_KEPT, PIECE), np.nan)
+    return np.full((count, len(list_places(problem)), 2, MOST_KEPT, ways.PIECE), np.nan)
 
 
 def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], batch: Batch) -> FloatArray:
@@ -102,34 +88,31 @@ def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], ba
     batch : Batch
         Which evaluates the chunk's fits.
     """
-    found, converged = make_no_pieces(groups[0][0], len(chunk.cost)), has_converged(chunk.status)
-    if not found.shape[1]:
-        return found
-    lots = [lot for problem, fits in groups for lot in _list_walks(problem, chunk, fits[converged[fits]])]
+    found, at_kink = make_no_pieces(groups[0][0], len(chunk.cost)), chunk.status == AT_KINK
+    # With JAX other evaluations have to be compiled for this: it is done for kinks alone, where there is nothing else.
+    followed = has_converged(chunk.status) & (at_kink | batch.layout.natively)
+    looked_at = groups if found.shape[1] else []
+    lots = [lot for problem, fits in looked_at for lot in _list_walks(problem, chunk, fits[followed[fits]])]
     if not lots:
         return found
-    fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
-    # Other evaluations have to be compiled for this: it is done for kinks alone, where there is nothing else.
-    if not batch.layout.natively:
-        kept = chunk.status[fits] == AT_KINK
-        fits, rows, walks = fits[kept], rows[kept], Walks(*(each[kept] for each in walks))
+    fits, rows = (np.concatenate([lot[i] for lot in lots]) for i in (0, 1))
+    walks = ways.join_walks([lot[2] for lot in lots])
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
         return batch.evaluate(fits[which], thetas, walks.side[which])
 
-    pieces = trace_walks(walks, chunk.cost[fits], evaluate, MOST_KEPT)
+    pieces = ways.trace_walks(walks, chunk.cost[fits], evaluate, MOST_KEPT)
     found[fits, rows, (walks.side + 1) // 2] = pieces
     incomplete = np.isnan(found[:, :, :, 0, 0]).any(axis=2)
     found[incomplete] = np.nan
     return found
 
 
-Lot = tuple[NDArray[np.intp], NDArray[np.intp], Walks]
-"""Ways of several fits: which fits, which rows among the chunk's pieces, and the ways."""
-
-
-def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Iterator[Lot]:
-    """Yield the ways to both sides of each transition time at a kink, or with a few samples within its interval.
+def _list_walks(
+    problem: Problem, chunk: Chunk, fits: NDArray[np.intp]
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Walks]]:
+    """Yield the ways to both sides of each transition time at a kink, or with a few samples within its interval: which
+    fits, which rows among the chunk's pieces, and the ways.
 
     The fits must share bounds and sample times.
     """
@@ -145,17 +128,17 @@ def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Itera
         errors = np.sqrt(np.maximum(variances, 0.0) * scale[:, None])
         free = variances > 0
     ends = problem.ends_of_modes(theta)
-    for row, (e, place) in enumerate(list_transitions(problem)):
-        tau, samples = theta[:, place], stack_sample_times(problem, theta, e)
+    for row, (e, place) in enumerate(ways.list_transitions(problem)):
+        tau, samples = theta[:, place], ways.stack_sample_times(problem, theta, e)
         collapsed = np.sum(ends[e] == tau[:, None], axis=1) > 1  # ties it to another time
         held = (chunk.status[fits] == AT_KINK) & (variances[:, place] == 0)
         with np.errstate(invalid="ignore"):
             within = np.abs(samples - tau[:, None]) <= (quantile * errors[:, place])[:, None]
         few = np.sum(within, axis=1) <= MOST_SAMPLES
-        taken = ~collapsed & (held | (few & is_any_near(samples, tau, errors[:, place])))
+        taken = ~collapsed & (held | (few & ways.is_any_near(samples, tau, errors[:, place])))
         if taken.any():
             own = theta[taken], free[taken], thresholds[taken], samples[taken]
-            walks = list_walks(problem, e, place, *own, MOST_KEPT)
+            walks = ways.list_walks(problem, e, place, *own, MOST_KEPT)
             yield np.tile(fits[taken], 2), np.full(len(walks.place), row), walks
 
 
@@ -307,17 +290,18 @@ class Study:
         """Return of which fits a better end may be elsewhere: not converged, a mode collapsed, or far from the data."""
         arrays = self.describe_fits(chunk, runs)
         doubted = arrays["collapsed"] > 0
-        for doubt in find_doubts(arrays, self.problem.is_sigma_known, count_priors(self.problem)):
-            if doubt.kind in ("not converged", "little explained", *EXPLAINED_BADLY):
+        for doubt in judged.find_doubts(arrays, self.problem.is_sigma_known, count_priors(self.problem)):
+            if doubt.kind in ("not converged", "little explained", *judged.EXPLAINED_BADLY):
                 doubted |= doubt.which
         return doubted
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
         """Return the arrays of fits as they are."""
-        variation, described = np.broadcast_to(self.measure_variation(runs), len(runs)), []
-        for problem, fits in self.group_fits(runs):
-            ends = describe_ends(problem, chunk.theta[fits], chunk.cost[fits], variation[fits])
-            described.append(ends | {"samples": np.full(len(fits), count_samples(problem))})
+        variation = np.broadcast_to(self.measure_variation(runs), len(runs))
+        described = [
+            judged.describe_ends(problem, chunk.theta[fits], chunk.cost[fits], variation[fits])
+            for problem, fits in self.group_fits(runs)
+        ]
         ends = {name: np.concatenate([one[name] for one in described]) for name in described[0]}
         return {**chunk.to_arrays(), **ends, "start": self.list_starts(runs)}
 
@@ -332,6 +316,94 @@ class Study:
         )
 
 
+class LongRun(NamedTuple):
+    """When fits end, where a long run is done and kept, who is told how far it is, and when it began.
+
+    Attributes
+    ----------
+    limits : Limits
+    client, folder : as of `run_chunks`
+    callback : callable ``(done, total)``, a true value stops; or None
+    began : float
+        As of ``time.perf_counter()``.
+    """
+
+    limits: Limits
+    client: Any
+    folder: Path | None
+    callback: Callable[[int, int], object] | None
+    began: float
+
+    @classmethod
+    def check(cls, tolerance: Any, max_iterations: Any, client: Any, folder: Any, callback: Any) -> LongRun:
+        """Return these settings; raise for those of the wrong type, before anything long is done."""
+        limits = Limits(*check_settings(tolerance, max_iterations))
+        if client is not None and not hasattr(client, "submit"):
+            raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
+        folder = None if folder is None else as_path(folder, "folder")
+        if callback is not None:
+            as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
+        return cls(limits, client, folder, callback, time.perf_counter())
+
+
+def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) -> dict[str, Any]:
+    """Do `count` runs with a bar on the terminal: the fields of `Fits`.
+
+    Parameters
+    ----------
+    problem : Problem
+        One of those that are fitted: its names, and whether its noise is known.
+    work, count : as of `run_chunks`
+    title : str
+        Of the bar.
+    how : LongRun
+
+    Raises
+    ------
+    ValueError
+        For a problem with a switch that is hidden in a function, with which no fit could be right.
+    """
+    _refuse_hidden_switches(problem)
+    with show_progress(how.callback, title) as progress:
+        runs, arrays = run_chunks(work, count, client=how.client, folder=how.folder, progress=progress)
+    known, priors, unknowns = problem.is_sigma_known, count_priors(problem), problem.unknowns
+    variance = measure_variance(arrays["cost"], arrays["samples"] + priors - arrays["free"], known)
+    return arrays | {
+        "covariance": variance[:, None, None] * arrays["covariance"],
+        "theta_names": problem.theta_names,
+        "theta_units": unknowns.units,
+        "requested": count,
+        "runs": runs,
+        "sigma_known": known,
+        "priors": priors,
+        "piece_places": list_places(problem),
+        "log_scaled": unknowns.log_names,
+        "log_origins": unknowns.origin,
+        "seconds": time.perf_counter() - how.began,
+        "date_origins": list_origins(problem),
+    }
+
+
+def _refuse_hidden_switches(problem: Problem) -> None:
+    """Raise what `estimate` would raise about the model, before thousands of fits list it one by one."""
+    try:
+        evaluator, theta = evaluator_of(problem), problem.initial_theta
+        gradient = evaluator(theta).gradient
+    except Exception:  # a guess at which the model cannot be evaluated: the fits that begin there will say so
+        return
+    if np.isfinite(gradient).all():
+        refuse_hidden_switches(evaluator, theta, gradient)
+
+
+def list_origins(problem: Problem) -> tuple[Origin | None, ...]:
+    """Return the date at which each unknown that is a date is 0; None for every other."""
+    found: list[Origin | None] = [None] * len(problem.theta_names)
+    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
+        for place in places[places >= 0].tolist():
+            found[place] = experiment.origin
+    return tuple(found)
+
+
 @dataclass
 class StudyOfLogs(Study):
     """Problems of one model, each with data, guess and meshes of its own."""
@@ -343,20 +415,17 @@ class StudyOfLogs(Study):
     def __call__(self, runs: range) -> Arrays:
         """Fits of some of the problems: those whose programs agree go together, and then back into their order."""
         groups: dict[Any, list[int]] = {}
-        errors: dict[int, Exception] = {}
+        parts, order = [], []
         for k in runs:
             try:
                 groups.setdefault(_get_kind(self.problems[k]), []).append(k)
             except Exception as error:  # as where its guess cannot be integrated: listed, it must not end the others
-                errors[k] = error
-        parts = []
+                parts.append(self._select([k], []).describe_failed(error))
+                order.append(k)
         for members in groups.values():
             meshes = evaluator_of(self.problems[members[0]]).meshes
             parts.append(super(StudyOfLogs, self._select(members, meshes)).__call__(range(len(members))))
-        order = [k for members in groups.values() for k in members]
-        if errors:
-            order += errors
-            parts.append(self._select(list(errors), []).list_failed(list(errors.values())))
+            order += members
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
@@ -392,13 +461,11 @@ class StudyOfLogs(Study):
         """Return J of the data of each problem that are met by their means: (R,)."""
         return np.array([measure_variation(self.problems[k]).sum() for k in runs])
 
-    def list_failed(self, errors: list[Exception]) -> Arrays:
-        """Return the arrays of problems whose fits failed before they began."""
-        chunk = Chunk.of(Outcome.at_starts(self.starts, np))
-        for k, error in enumerate(errors):
-            chunk.clear_fit(k, error)
-        runs = range(len(errors))
-        return self.describe_fits(chunk, runs) | {"pieces": make_no_pieces(self.problem, len(runs))}
+    def describe_failed(self, error: Exception) -> Arrays:
+        """Return the arrays of the only problem, whose fit failed before it began."""
+        chunk, runs = Chunk.of(Outcome.at_starts(self.starts, np)), range(1)
+        chunk.clear_fit(0, error)
+        return self.describe_fits(chunk, runs) | {"pieces": make_no_pieces(self.problem, 1)}
 
 
 def _get_kind(problem: Problem) -> Any:
@@ -411,3 +478,72 @@ def _get_kind(problem: Problem) -> Any:
     times = [experiment.initial_times_with_jumps for experiment in problem.experiments]
     fixed = [np.where(where[: len(t)] < 0, t, 0.0) for where, t in zip(problem.places, times, strict=True)]
     return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))
+
+
+def estimate_many(
+    problems: Sequence[Problem],
+    *,
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    client: Any = None,
+    folder: str | Path | None = None,
+    callback: Callable[[int, int], object] | None = None,
+) -> Fits:
+    """Fit many problems of one model, each with its own data, guess and mesh.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        With the same modes, mode sequences, kinds of data and unknowns. Numbers of samples may differ; problems whose
+        padded lengths agree share one compiled program.
+    tolerance, max_iterations : as of `estimate`
+    client, folder, callback : as of `monte_carlo`
+
+    Returns
+    -------
+    Fits
+        In the order of the problems. Fits whose integration error turns out too large are done again by `estimate`.
+
+    Raises
+    ------
+    ValueError
+        If the problems differ in more than their numbers, or the folder holds something else.
+    TypeError
+        If an argument is of the wrong type.
+
+    See Also
+    --------
+    estimate, monte_carlo, multistart
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fits = sf.estimate_many([heater_problem() for _ in range(3)])
+    >>> fits.theta.shape, bool(fits.success.all())
+    ((3, 2), True)
+    """
+    problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
+    how = LongRun.check(tolerance, max_iterations, client, folder, callback)
+    if not problems:
+        raise ValueError("estimate_many needs one problem or more; got none.")
+    first = problems[0]
+    for k, problem in enumerate(problems):
+        as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
+        require_estimable(problem)
+        if problem.theta_names != first.theta_names or problem.is_sigma_known is not first.is_sigma_known:
+            raise ValueError(
+                f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
+                f"{join_names(problem.theta_names)}, the first one {join_names(first.theta_names)}. Fit it by itself."
+            )
+        units = [[run.time_unit for run in of.experiments] for of in (problem, first)]
+        if units[0] != units[1]:
+            raise ValueError(
+                f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
+                "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
+            )
+    starts = np.array([problem.initial_theta for problem in problems])
+    study = StudyOfLogs(first, [], starts, how.limits, 0, problems)
+    found = repeat(first, study, len(problems), "Logs", how)
+    every = zip(*map(list_origins, problems), strict=True)
+    return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})

@@ -122,8 +122,8 @@ def paper(
 ) -> None:
     """Reproduce the paper's experiments and figures.
 
-    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when
-    the same command is run again.
+    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run leaves the
+    parts that are done; --only runs another one.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
     with terminal.report_errors(debug):
@@ -133,6 +133,6 @@ def paper(
         try:
             run(out, quick=quick, only=only, say=terminal.print_note)
         except KeyboardInterrupt:
-            terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
+            terminal.fail("interrupted; run the parts that are missing by --only.", terminal.INTERRUPTED)
         terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
         terminal.print_note(f"written to {out}")

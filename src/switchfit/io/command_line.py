@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.experiment_design.search import Design, DesignRecord
+from switchfit.experiment_design import Design, DesignRecord
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.trajectory import Trajectory
 from switchfit.io.result_tables import list_unknowns, zip_rows

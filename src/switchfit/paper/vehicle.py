@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -35,8 +34,6 @@ COLUMN, PAGE = 3.5, 7.16
 DARK, RED, BLUE, LIGHT = "#222222", "#b2182b", "#4a7fb5", "#b5b5b5"
 SYMBOLS = {"tau_1": r"$\tau_1$", "tau_2": r"$\tau_2$", "mu": r"$\mu$"}
 
-
-TITLE = "The vehicle (Fig. 2)"
 #: Length and width of a wheel as drawn (m).
 WHEEL = (0.22, 0.08)
 #: Heading as drawn (degrees), and length of the longest force (m).
@@ -72,7 +69,7 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
+def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> None:
     """Set labels at a size for one column, a thin frame, and the letter of the panel."""
     ax.set_xlabel(xlabel, fontsize=8)
     ax.set_ylabel(ylabel, fontsize=8)
@@ -80,7 +77,6 @@ def tidy(ax: Axes, xlabel: str, ylabel: str, *, letter: str = "") -> Axes:
     ax.spines[["top", "right"]].set_visible(False)
     if letter:
         ax.set_title(letter, loc="left", fontsize=8)
-    return ax
 
 
 def conditions(found: Found) -> str:
@@ -130,17 +126,14 @@ def stick_slip(
 
 
 def simulate_drive(
-    theta: tuple[float, float, float] = TRUTH,
-    *,
-    tf: float = HORIZON,
-    stick_force: float = 15.0,
-    restick: Restick = "continuous",
-    step: float = 0.1,
+    theta: tuple[float, float, float] = TRUTH, *, tf: float = HORIZON, step: float = 0.1, **settings: Any
 ) -> Trajectory:
-    """Simulate equation (18) at given transition times and mu, with a node every `step` seconds."""
+    """Simulate equation (18) at given transition times and mu, with a node every `step` seconds; the settings are those
+    of `stick_slip`.
+    """
     times = step * np.arange(round(tf / step) + 1)
     nothing = Measurements(times, np.zeros((len(times), 6)))
-    return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
+    return simulate(stick_slip(nothing, theta, tf=tf, **settings))
 
 
 def build_simulated_problem() -> Problem:
@@ -252,13 +245,13 @@ def summary(fit: Estimate) -> dict[str, Any]:
     }
 
 
-def compute(quick: bool, folder: Path, say: Say) -> Found:
+def compute_vehicle(quick: bool, say: Say) -> Found:
     """Return the lengths (m) and the forces in slip (N) of the model."""
     settings = inspect.signature(skid_steer).parameters
     return {name: settings[name].default for name in ("B_l", "B_w", "a", "b")} | {"forces": list(SLIP_FORCES)}
 
 
-def draw(found: Found) -> dict[str, Figure]:
+def draw_vehicle(found: Found) -> dict[str, Figure]:
     """Draw the vehicle in slip, turning to the left: wheels with their forces, friction against the lateral speed."""
     from matplotlib.patches import Rectangle
     from matplotlib.transforms import Affine2D
@@ -299,8 +292,3 @@ def draw(found: Found) -> dict[str, Figure]:
     ax.tick_params(labelsize=7)
     ax.legend(frameon=False, fontsize=6.5, loc="lower right")
     return {"fig2-vehicle": figure}
-
-
-def rows(found: Found) -> list[Row]:
-    """Return no lines."""
-    return []

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.fits import Fits
-from switchfit.batch.resampling import Bootstrap
-from switchfit.batch.simulated import MonteCarlo
+from switchfit.batch.simulated import Bootstrap, MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.fits import Fits
-from switchfit.batch.resampling import Bootstrap
-from switchfit.batch.simulated import MonteCarlo
+from switchfit.batch.simulated import Bootstrap, MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from switchfit.experiment_design.search import Design
+from switchfit.experiment_design import Design
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix

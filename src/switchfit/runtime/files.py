@@ -134,11 +134,18 @@ def write_document(content: dict[str, Any], path: Path) -> None:
 
 
 def read_document(path: Path, what: str, form: str, version: int) -> dict[str, Any]:
-    """Return the JSON object in a file, with its "format" and its "version" checked.
+    """Return the JSON object in a file, with its "format" and its "version" checked, as of `parse_document`."""
+    return parse_document(path.read_bytes(), path, what, form, version)  # OSError names the file
+
+
+def parse_document(text: bytes, path: Path, what: str, form: str, version: int) -> dict[str, Any]:
+    """Return a JSON object, with its "format" and its "version" checked.
 
     Parameters
     ----------
+    text : bytes
     path : Path
+        Where it was read, for messages.
     what : str
         What the file should be, with its article, for messages.
     form : str
@@ -148,13 +155,11 @@ def read_document(path: Path, what: str, form: str, version: int) -> dict[str, A
 
     Raises
     ------
-    OSError
-        If it cannot be read.
     ValueError
         If it is not valid JSON, of another format or of another version.
     """
     try:
-        content = json.loads(path.read_bytes().decode())
+        content = json.loads(text.decode())
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != form:
