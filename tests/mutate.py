@@ -309,8 +309,8 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "what has left the window counts half": swap(TRACKER, "slope = along[:, :D]", "slope = 0.5 * along[:, :D]"),
         "no minimum along what has no effect": swap(
             TRACKER,
-            "H -= row[:, :, None] * row[:, None, :] / pivot",
-            "H -= 0 * row[:, :, None] * row[:, None, :] / pivot",
+            "matrix, empty = H[:D, :D] - H[:D, D:] @ solved[:, :-1]",
+            "matrix, empty = H[:D, :D]",
         ),
         "a new value is not joined to the old one": swap(
             TRACKER, "[[1.0, -1.0], [-1.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]"
@@ -329,7 +329,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "a model that has lost the samples recovers": swap(ONLINE, "self._lost = now", "self._lost = None"),
         "inputs hold before they come": swap(ONLINE, "return given if before is None else before", "return given"),
-        "the journal forgets the inputs": swap("online/saved.py", '"u": _listed(u)', '"u": None'),
+        "the journal forgets the inputs": swap("online/saved.py", '"u": u}', '"u": None}'),
     },
     "design": {
         "sign of the criterion's slope": swap(CRITERION, "return mean, -xp.swapaxes", "return mean, xp.swapaxes"),

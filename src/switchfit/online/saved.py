@@ -9,16 +9,16 @@ import io
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.online.state import Now
 from switchfit.online.tracker import Left, Start, Tracker
-from switchfit.problem.data import FloatArray, Input, Measurements
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.runtime.files import write_atomically
 from switchfit.strategy.library import Sequences
 
 ENTRIES, STATES = "state at the start of the window", "initial state"
@@ -28,59 +28,40 @@ NO_EFFECT = 1e-12
 """Part of the largest second derivative below which one counts as none."""
 
 
-class Kept(NamedTuple):
-    """What has been measured since the start of the window, and what was found.
+def build_kept_problem(
+    problem: Problem, now: Now, data: list[Measurements], given: dict[str, Any], arrival: Start | None
+) -> Problem:
+    """Return the problem of what has been measured since the start of the window, which begins at what was found.
 
-    Attributes
+    Parameters
     ----------
+    problem : Problem
+    now : Now
     data : list of Measurements
-    inputs : Input or None
-    horizon : (t0, tf)
-    sequence : tuple of str
-    times : (N,)
-    theta : (U,), parameters and initial states in the order of the problem's theta
+    given : dict of str to value
+        What else the run has since then: its inputs, its modes and their times, t0 and tf.
     arrival : Start or None, if nothing has left the window
         In U parameters and A entries for the state, the parameters being where it has moved.
     """
-
-    data: list[Measurements]
-    inputs: Input | None
-    horizon: tuple[float, float]
-    sequence: tuple[str, ...]
-    times: FloatArray
-    theta: FloatArray
-    arrival: Start | None
-
-
-def build_kept_problem(problem: Problem, kept: Kept) -> Problem:
-    """Return the problem with other samples and inputs, which begins at what was found."""
-    run, arrival = problem.experiments[0], kept.arrival
-    states, offset = problem.unknowns.initial_states[0], int(problem.unknowns.is_time.sum())
+    run, states, offset = problem.experiments[0], problem.unknowns.initial_states[0], problem.unknowns.is_time.sum()
     own = problem.system.initial_state if run.initial_state is None else run.initial_state
-    places = states.tolist() if arrival is None else []
+    parameters = {name: replace(each, value=now.parameters[name]) for name, each in problem.parameters.items()}
     initial: Any = own
-    if any(place >= 0 for place in places):
-        initial = [
-            replace(entry, value=float(kept.theta[place - offset])) if place >= 0 else entry
-            for entry, place in zip(own, places, strict=True)
-        ]
-    parameters = dict(problem.parameters)
-    for name, of in problem.unknowns.parameters.items():
-        shape = np.shape(parameters[name].value)
-        value = kept.theta[of.start - offset : of.stop - offset].reshape(shape)
-        parameters[name] = replace(parameters[name], value=value)
-    data = kept.data
     if arrival is not None:
-        initial, sensor = _describe_arrival(problem, arrival, kept.horizon[0])
+        initial, sensor = _describe_arrival(problem, arrival, given["t0"])
         data = [sensor, *data]
         known = {ENTRIES: len(arrival.gradient) - len(arrival.moved), STATES: int((states >= 0).sum())}
         parameters = {name: replace(parameter, prior=None) for name, parameter in parameters.items()}
         parameters |= {name: Parameter(np.zeros(size)) for name, size in known.items() if size}
-    t0, tf = kept.horizon
-    sequence, times = _drop_empty_modes(kept.sequence, np.clip(kept.times, t0, tf).tolist(), t0, tf)
-    begins: dict[str, Any] = {"t0": t0, "initial_state": initial, "inputs": kept.inputs}
-    now = replace(run, data=tuple(data), mode_sequence=sequence, transition_times=times, tf=tf, **begins)
-    return replace(problem, experiments=(now,), parameters=parameters)
+    elif (states >= 0).any():
+        values = [float(now.best.theta[place - offset]) if place >= 0 else None for place in states.tolist()]
+        initial = [
+            entry if value is None else replace(entry, value=value) for entry, value in zip(own, values, strict=True)
+        ]
+    times = np.clip(given["transition_times"], given["t0"], given["tf"]).tolist()
+    sequence, times = _drop_empty_modes(given["mode_sequence"], times, given["t0"], given["tf"])
+    begins = given | {"mode_sequence": sequence, "transition_times": times, "initial_state": initial}
+    return replace(problem, experiments=(replace(run, data=tuple(data), **begins),), parameters=parameters)
 
 
 def _drop_empty_modes(
@@ -178,29 +159,18 @@ def unpack(tracker: Tracker, numbers: dict[str, Any], arrays: dict[str, FloatArr
     tracker.left = [Left(*each) for each in numbers["left"]]
 
 
-class Journal:
-    """A file with a line for each update, which has left the process before the update begins.
+def open_journal(path: Path) -> None:
+    """Make a journal, a file with a line for each update, or leave out the last line of one that was cut off."""
+    written = path.read_bytes() if path.exists() else b""
+    with path.open("ab") as file:
+        file.truncate(written.rfind(b"\n") + 1)
 
-    Parameters
-    ----------
-    path : Path
-    """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        written = path.read_bytes() if path.exists() else b""
-        with path.open("ab") as file:
-            file.truncate(written.rfind(b"\n") + 1)  # without a line that was cut off
-
-    def write(self, t: float, y: Any, u: Any) -> None:
-        """Add an update."""
-        line = json.dumps({"t": t, "y": _listed(y), "u": _listed(u)})
-        with self.path.open("ab", buffering=0) as file:
-            file.write(line.encode() + b"\n")
-
-    def clear(self) -> None:
-        """Forget what the saved state has."""
-        write_atomically(b"", self.path)
+def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> None:
+    """Write an update to a journal, with the values of each sensor; it leaves the process before the update begins."""
+    line = json.dumps({"t": t, "y": y, "u": u}, default=lambda value: np.asarray(value, dtype=np.float64).tolist())
+    with path.open("ab", buffering=0) as file:
+        file.write(line.encode() + b"\n")
 
 
 def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
@@ -209,18 +179,7 @@ def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
     for line in path.read_bytes().split(b"\n")[:-1]:
         try:
             each = json.loads(line)
-            found.append((each["t"], _given(each["y"]), _given(each["u"])))
-        except (ValueError, KeyError, TypeError) as error:
+            found.append((each["t"], {int(k): values for k, values in each["y"].items()}, each["u"]))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} is not the journal of an online estimator ({error}).") from error
     return found
-
-
-def _listed(value: Any) -> Any:
-    """Return a value of an update for JSON; the keys of sensors are numbers, those of channels text."""
-    if isinstance(value, dict):
-        return {"items": [[key, _listed(each)] for key, each in value.items()]}
-    return None if value is None else np.asarray(value, dtype=np.float64).tolist()
-
-
-def _given(value: Any) -> Any:
-    return {key: _given(each) for key, each in value["items"]} if isinstance(value, dict) else value

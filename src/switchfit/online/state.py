@@ -400,11 +400,10 @@ def build_quiet_problem(online: Any, length: float) -> Problem:
     changes: dict[str, Any] = {"mode_sequence": run.mode_sequence[:1]}
     if online.held is not None and run.inputs is not None:
         changes["inputs"] = hold(run.inputs, np.array([t0]), online.held[None])
-    parameters = dict(problem.parameters)
+    parameters = problem.parameters
     if now is not None:
         changes |= {"mode_sequence": (now.mode,), "initial_state": now.state}
-        for name in problem.unknowns.parameters:
-            parameters[name] = replace(parameters[name], value=now.parameters[name])
+        parameters = {name: replace(each, value=now.parameters[name]) for name, each in parameters.items()}
     quiet = replace(run, data=tuple(data), transition_times=(), t0=t0, tf=t0 + length, **changes)
     return replace(problem, experiments=(quiet,), parameters=parameters)
 

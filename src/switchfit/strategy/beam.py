@@ -299,7 +299,9 @@ class Beam:
     places : (M,) int
         Position of each entry of p among these: two names of the model may refer to one parameter.
     ties : (M, M)
-        The part of a change of p in which entries of one parameter differ, as a matrix.
+        The part of a change of p in which entries of one parameter differ, what it has beside their mean, as a matrix.
+    into : (S + M, S + U)
+        How births and the entries of p, which may be one parameter under two names, follow from births and parameters.
     lower, upper : (U,)
     priors : PriorTerms
     spread : (U,)
@@ -341,8 +343,11 @@ class Beam:
         # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
         # repetitions.
         in_theta, self.places = np.unique(place_parameters(problem, e, structure), return_inverse=True)
-        self.ties = _tie(self.places)
+        same, S = self.places[:, None] == self.places, self.births
+        self.ties = np.eye(len(same)) - same / same.sum(1)
         self.own = in_theta - int(unknowns.is_time.sum())
+        self.into = np.zeros((S + len(same), S + len(in_theta)))
+        self.into[:S, :S], self.into[S:, S:] = np.eye(S), self.places[:, None] == np.arange(len(in_theta))
         self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
         self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
@@ -598,10 +603,7 @@ class Pass:
         them.
         """
         beam, B, S = self.beam, len(kept.mode), self.beam.births
-        U = len(beam.own)
-        into = np.zeros((S + len(beam.places), S + U))  # derivatives along all names of a parameter add up
-        into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
-        # From entries of p, which may be one parameter under two names, to unknowns (times, q): H -> I' H I, g -> I' g.
+        into, U = beam.into, len(beam.own)  # H -> I' H I, g -> I' g: derivatives along all names of a parameter add up
         H, g = into.T @ states.matrices @ into, states.gradients @ into
         before_q = self._move(states.moved)
         # All unknowns free, then the parameters inside their bounds, then the times for these parameters: conditional
@@ -636,12 +638,6 @@ class Pass:
             evidence = Quadratic(np.append(times[k], q[k]), slope, alone).restrict(np.arange(S, S + U))
             found[0] = found[0]._replace(evidence=evidence)
         return found
-
-
-def _tie(places: Integers) -> FloatArray:
-    """Return what a change of p (M,) has beside the mean of the entries with the same place, as a matrix (M, M)."""
-    same = places[:, None] == places
-    return np.eye(len(places)) - same / same.sum(1)
 
 
 def prepare(problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> Beam:
