@@ -19,9 +19,9 @@ from switchfit.modes.conclusion import list_neighbours
 from switchfit.modes.criterion import CORRELATED, Score, compute_weights, measure_whiteness
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.hunt import propose_starts
-from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.report.formats import format_rounded
+from switchfit.strategy.library import build_library
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -490,18 +490,18 @@ def test_parameters_far_off_are_found_from_other_starts():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"library": ("rise", "jump")}, "library names the mode 'jump'; the system has the modes"),
+        ({"library": ("rise", "jump")}, "library names the unknown mode 'jump'; the modes are"),
         ({"library": ()}, "library is empty"),
-        ({"first": "jump"}, "first names the mode 'jump'"),
+        ({"first": "jump"}, "first names the unknown mode 'jump'"),
         ({"first": ()}, "first is empty"),
-        ({"library": ("rise", "fall"), "last": "turn"}, "last names the mode 'turn'; the library has the modes"),
-        ({"successions": {"jump": "rise"}}, "successions names the mode 'jump'"),
-        ({"successions": {"rise": "jump"}}, "successions of 'rise' names the mode 'jump'"),
+        ({"library": ("rise", "fall"), "last": "turn"}, "last names the unknown mode 'turn'; the modes are"),
+        ({"successions": {"jump": "rise"}}, "successions names the unknown mode 'jump'"),
+        ({"successions": {"rise": "jump"}}, "successions of 'rise' names the unknown mode 'jump'"),
         ({"successions": {"rise": "rise"}}, "names the mode itself"),
         ({"first": "rise", "last": "turn", "successions": {"rise": "fall"}}, "can be reached from first"),
         ({"min_duration": -1.0}, "min_duration must be zero or positive; got -1.0"),
-        ({"min_duration": {"rise": -1.0}}, "min_duration of 'rise' must be zero or positive"),
-        ({"min_duration": {"jump": 1.0}}, "min_duration names the mode 'jump'"),
+        ({"min_duration": {"rise": -1.0}}, "min_duration must be zero or positive; got {'rise': -1.0}"),
+        ({"min_duration": {"jump": 1.0}}, "min_duration names the unknown mode 'jump'"),
         ({"max_switches": -1}, "max_switches"),
         ({"width": 2}, "width is 2, but the library has 3 modes"),
         ({"grid": 0.0}, "grid"),

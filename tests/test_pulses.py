@@ -13,9 +13,9 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.criterion import Score
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.hunt import Improver, Pool, insert_modes, list_pulses
-from switchfit.modes.library import build_library
 from switchfit.modes.rates import compute_rates
 from switchfit.modes.schedule import Schedule
+from switchfit.strategy.library import build_library
 
 EMPTY = Schedule(("idle",), np.zeros(0), 0.0, 12.0)
 NONE = np.zeros(0)

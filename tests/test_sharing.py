@@ -12,8 +12,8 @@ from switchfit.engine.native import program
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.fitter import Fitter
-from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, list_insertions, space_evenly, splice
+from switchfit.strategy.library import build_library
 
 TIMES = np.linspace(0.0, 8.0, 41)
 
@@ -69,11 +69,11 @@ def test_costs_of_many_moves_are_those_of_each(delay):
         alone = []
         for schedule in moved:
             both = [*here[:e], schedule, *here[e + 1 :]]
-            alone.append(fitter.costs(both, fitter.start))
+            alone.append(fitter.cost(both, fitter.start))
             own = Evaluator(fitter._build_problem(both), meshes=fitter.meshes)
             assert alone[-1] == own.cost(np.concatenate([*(each.times for each in both), fitter.start]))
-        np.testing.assert_allclose(fitter.costs.compute_all(here, e, moved, fitter.start), alone, rtol=1e-13)
-        assert fitter.costs(here, fitter.start) == alone[-1]  # the experiment is as it was before
+        np.testing.assert_allclose(fitter.compute_costs(here, e, moved, fitter.start), alone, rtol=1e-13)
+        assert fitter.cost(here, fitter.start) == alone[-1]  # the experiment is as it was before
 
 
 def is_same(one, other):

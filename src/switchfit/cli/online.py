@@ -92,11 +92,11 @@ def online(
         loaded = load_problem(problem, replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
-        from switchfit.modes.library import build_library
         from switchfit.online.log import build_log
         from switchfit.problem.data import Measurements
         from switchfit.problem.structure import select_kind
         from switchfit.runtime.presentation import format_count
+        from switchfit.strategy.library import build_library
 
         terminal.make_folder(out)
         for file in filter(None, (state, journal)):

@@ -26,7 +26,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.library import build_library
 from switchfit.online.saved import (
     append_update,
     build_kept_problem,
@@ -58,7 +57,7 @@ from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
 from switchfit.strategy.choice import estimate
-from switchfit.strategy.library import Rules, Sequences
+from switchfit.strategy.library import Rules, Sequences, build_library
 
 THRESHOLD = 12.0
 """Of 200 drives of 20 s without a change 5 % exceed it."""

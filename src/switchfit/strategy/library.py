@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint, TransitionCost
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, check_durations
 from switchfit.problem.structure import Function, Structure, select_kind, trace_structure
+from switchfit.problem.unknowns import get_min_duration
+from switchfit.problem.validation import as_count, as_name, as_names, join_names, require_known, shorten
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,91 @@ class Library:
     def trimmed(self) -> Library:
         """The same sequences, with a largest number of switches that one of them has: programs have room for it."""
         return replace(self, max_switches=max(self.possible_switches, default=0))
+
+
+def build_library(
+    problem: Problem,
+    library: Any = None,
+    *,
+    first: Any = None,
+    last: Any = None,
+    successions: Any = None,
+    min_duration: Any = None,
+    max_switches: Any = 8,
+) -> Library:
+    """Return the library of a search from the arguments of `find_modes`, checked.
+
+    Parameters
+    ----------
+    problem : Problem
+    library : sequence of str, optional
+    first, last : str or sequence of str, optional
+    successions : mapping of str to sequence of str, optional
+    min_duration : float or mapping of str to float, optional
+    max_switches : int
+
+    Raises
+    ------
+    ValueError
+        For names that the system lacks, successions from a mode that is not in the library, a `last` that cannot be
+        reached from any `first`, or a negative duration.
+    TypeError
+        If an argument is of the wrong type.
+    """
+    most = as_count(max_switches, "max_switches")
+    names = _choose_modes(library, "library", tuple(problem.system.modes))
+    begins, ends = _choose_modes(first, "first", names), _choose_modes(last, "last", names)
+    followers = _check_successions(successions, names)
+    found = Library(names, begins, ends, followers, _read_durations(problem, min_duration, names), most)
+    if not replace(found, max_switches=len(names)).possible_switches:  # however many switches there may be
+        raise ValueError(
+            f"no mode of last ({join_names(ends)}) can be reached from first ({join_names(begins)}) by the "
+            "successions: add the missing successions, or change first or last."
+        )
+    return found
+
+
+def _choose_modes(given: Any, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the given modes among some names, in their order; all if they are left out."""
+    if given is None:
+        return names
+    chosen = (as_name(given, what),) if isinstance(given, str) else as_names(given, what, "a mode or a list of modes")
+    if not chosen:
+        raise ValueError(f"{what} is empty: name at least one mode, or leave it out for all modes.")
+    require_known(chosen, what, names)
+    return tuple(name for name in names if name in chosen)
+
+
+def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Return the modes that may follow each mode; a mode that a mapping leaves out has none."""
+    if given is None:
+        return {name: tuple(other for other in names if other != name) for name in names}
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            "successions must be a dict of mode -> the modes that may follow it, such as "
+            f"{{'flight': ('slide',), 'slide': ('stick',)}}; got {shorten(given)}."
+        )
+    require_known(given, "successions", names)
+    found: dict[str, tuple[str, ...]] = dict.fromkeys(names, ())
+    for name, after in given.items():
+        what = f"successions of {shorten(name)}"
+        listed = (after,) if isinstance(after, str) else as_names(after, what, "a sequence of names of modes")
+        require_known(listed, what, names)
+        if name in listed:
+            raise ValueError(f"{what} names the mode itself: a switch leads to another mode. Leave it out.")
+        found[name] = tuple(other for other in names if other in listed)
+    return found
+
+
+def _read_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dict[str, float]:
+    """Return the shortest duration of each mode; that of the problem where it is left out."""
+    found = {name: get_min_duration(problem.min_duration, name) for name in names}
+    if given is not None:
+        asked = check_durations(given, problem.system)
+        found |= {name: asked.get(name, found[name]) if isinstance(asked, dict) else asked for name in names}
+    if not all(0 <= least < np.inf for least in found.values()):
+        raise ValueError(f"min_duration must be zero or positive; got {shorten(given)}.")
+    return found
 
 
 Integers = NDArray[np.int64]
