@@ -221,7 +221,9 @@ def test_residuals_that_depend_on_the_input_are_found():
     assert found.inputs[0].probability < 1e-6
     assert any(reason.kind == "input not explained" for reason in found.verdict.reasons)
     assert "Correlation with inputs" in str(found)
-    with pytest.raises(ValueError, match="the fit has an input, and another run has its own: give validate an"):
+    with pytest.raises(
+        ValueError, match=r"inputs, or other data than sf\.Measurements: give validate an sf\.Experiment"
+    ):
         fit.validate(other.experiments[0].data[0])
 
 
@@ -267,8 +269,8 @@ def test_what_cannot_be_validated():
             r"refit names 'b', which is no unknown of the other run's own; these",
         ),
         (fit, two, {}, ValueError, "of the fit have 1 channels, those of the other run 2"),
-        (fit, [data] * 2, {}, ValueError, "the fit has 1 data in its experiment, 1 of them Measurements; got 2"),
-        (both, data, {}, ValueError, r"the fit has 2 experiments: give validate an sf.Experiment"),
+        (fit, [data] * 2, {}, ValueError, "the fit has 1 Measurements; got 2 for the other run"),
+        (both, data, {}, ValueError, "the fit has several experiments, inputs, or other data"),
         (each, data, {}, ValueError, "sigma differs from sample to sample in the fit"),
     ):
         with pytest.raises(error, match=said):

@@ -81,9 +81,16 @@ class Pool:
         if not fitted.failed and (known is None or fitted.cost < known.cost):
             self._found[fitted.sequences] = fitted
 
-    def compute(self, fitted: Fitted, criterion: CriterionName | None = None) -> float:
+    def compute(self, fitted: Fitted, criterion: CriterionName | None = None, *, discounted: bool = True) -> float:
         """Return a criterion of a fit, by default that of the search."""
-        return compute_criterion(self.score, fitted, self.criterion if criterion is None else criterion)
+        name, score = criterion or self.criterion, self.score if discounted else self.undiscounted
+        switches = fitted.switches if name == "cost" else fitted.free_switches
+        return score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
+
+    @property
+    def is_likelihood(self) -> bool:
+        """Whether the cost is one."""
+        return self.score.sigma_known is not None
 
     def discount(self, score: Score) -> None:
         """Compare by mBIC with a discounted score from now on.
@@ -127,19 +134,6 @@ class Pool:
     def measure_probability(self, fitted: Fitted) -> float:
         """Return the probability of chi-square at its cost, NaN where 2 J has no such distribution."""
         return self.score.measure_probability(fitted.cost, int(fitted.acting.sum()) + fitted.free_switches)
-
-
-def compute_criterion(score: Score, fitted: Fitted, name: CriterionName) -> float:
-    """Return a criterion of a fit.
-
-    Parameters
-    ----------
-    score : Score
-    fitted : Fitted
-    name : {"bic", "mbic", "aicc", "cost"}
-    """
-    switches = fitted.switches if name == "cost" else fitted.free_switches
-    return score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
 
 
 LOWER = 1e-6

@@ -27,8 +27,8 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
 from switchfit.runtime.presentation import Displayed, Printed, draw_figure, format_line
+from switchfit.strategy.known_order import fix_unknowns
 from switchfit.strategy.library import Library
-from switchfit.strategy.other_run import fix_unknowns
 
 
 class ModeStatus(Enum):
@@ -280,33 +280,15 @@ class ModeFit:
     acting: NDArray[np.bool_]
     cost: float
     criterion: float
-    bic: float
-    mbic: float
-    aicc: float
     weight: float
+    bic: float = np.nan
+    mbic: float = np.nan
+    aicc: float = np.nan
 
     @property
     def switches(self) -> int:
         """Number of switches of all experiments."""
         return sum(len(sequence) - 1 for sequence in self.sequences)
-
-    def modes_at(self, t: FloatArray, e: int) -> list[str]:
-        """Return the mode of experiment e at each of the times t (L,); at a transition, the later one.
-
-        See Also
-        --------
-        ModeSearch.mode_probability
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> search = sf.find_modes(heater_problem(), max_switches=2)
-        >>> search.fitted[1].modes_at(np.array([1.0, 5.0]), 0)
-        ['on', 'off']
-        """
-        return [self.sequences[e][k] for k in np.searchsorted(self.transition_times[e], t, "right").tolist()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -530,7 +512,8 @@ class ModeSearch(SearchRecord, Displayed):
         found = np.zeros((len(times), len(self.modes)))
         rows = np.arange(len(times))
         for fit in self.chosen:
-            found[rows, [self.modes.index(mode) for mode in fit.modes_at(times, e)]] += fit.weight
+            sequence = [self.modes.index(mode) for mode in fit.sequences[e]]
+            found[rows, np.take(sequence, np.searchsorted(fit.transition_times[e], times, "right"))] += fit.weight
         return found
 
     def plot(self) -> Any:

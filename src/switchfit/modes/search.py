@@ -311,13 +311,11 @@ def _check_criterion(
 def _check_starts(problem: Problem, given: ArrayLike) -> tuple[FloatArray, ...]:
     found = np.atleast_2d(as_array(given, "starts"))
     names = problem.theta_names[int(problem.unknowns.is_time.sum()) :]
-    if found.ndim != 2 or found.shape[1] != len(names):
+    if found.ndim != 2 or found.shape[1] != len(names) or not len(found) or not np.all(np.isfinite(found)):
         raise ValueError(
-            f"starts must have a row for each start with {len(names)} values: {join_names(names) or 'none'}; got "
-            f"shape {np.shape(given)}."
+            f"starts must have a row for each start with {len(names)} finite values: {join_names(names) or 'none'}; "
+            f"got {shorten(found)}."
         )
-    if not len(found) or not np.all(np.isfinite(found)):
-        raise ValueError(f"starts must be one or more rows of finite numbers; got {shorten(found)}.")
     return tuple(found)
 
 
