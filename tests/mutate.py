@@ -329,7 +329,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "a model that has lost the samples recovers": swap(ONLINE, "self._lost = now", "self._lost = None"),
         "inputs hold before they come": swap(ONLINE, "return given if before is None else before", "return given"),
-        "the journal forgets the inputs": swap("online/saved.py", '"u": u}', '"u": None}'),
+        "the journal forgets the inputs": swap(TRACKER, '"u": u}', '"u": None}'),
     },
     "design": {
         "sign of the criterion's slope": swap(CRITERION, "return mean, -xp.swapaxes", "return mean, xp.swapaxes"),

@@ -221,9 +221,7 @@ def test_residuals_that_depend_on_the_input_are_found():
     assert found.inputs[0].probability < 1e-6
     assert any(reason.kind == "input not explained" for reason in found.verdict.reasons)
     assert "Correlation with inputs" in str(found)
-    with pytest.raises(
-        ValueError, match=r"inputs, or other data than sf\.Measurements: give validate an sf\.Experiment"
-    ):
+    with pytest.raises(ValueError, match=r"inputs, or other data than .*: give validate an sf\.Experiment"):
         fit.validate(other.experiments[0].data[0])
 
 

@@ -132,7 +132,7 @@ def _start(
 ) -> OnlineEstimator:
     """Return the estimator: a new one, or that of a state and a journal."""
     import switchfit as sf
-    from switchfit.online.saved import read_journal
+    from switchfit.online.tracker import read_journal
 
     written = journal if journal is not None and journal.exists() else None
     if state is not None and state.exists():

@@ -26,17 +26,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
-from switchfit.online.saved import (
+from switchfit.online.state import Alarm, Best, Now, OnlineStatus, build_kept_problem, calibrate, hold, read_sigma
+from switchfit.online.tracker import (
+    Feed,
+    Settings,
+    Start,
+    StoppedError,
+    Tracker,
     append_update,
-    build_kept_problem,
-    open_journal,
-    pack,
+    invert,
     read,
     read_journal,
-    unpack,
+    shift_cubic,
 )
-from switchfit.online.state import Alarm, Best, Now, OnlineStatus, calibrate, hold, read_sigma
-from switchfit.online.tracker import Feed, Settings, Start, StoppedError, Tracker, invert, shift_cubic
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
@@ -51,6 +53,7 @@ from switchfit.problem.validation import (
     as_path,
     as_positive,
     join_names,
+    require_known,
     shorten,
 )
 from switchfit.runtime import special
@@ -187,14 +190,12 @@ class OnlineEstimator:
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
-        unknown = next((mode for mode in renewed if mode not in problem.system.modes), None)
-        if unknown is not None:
-            known = join_names(problem.system.modes)
-            raise ValueError(f"renews has {shorten(unknown)}, which is no mode of the system; there are: {known}.")
+        require_known(renewed, "renews", problem.system.modes)
         self._renews = {mode: self._find_places(names, f"renews of {mode!r}") for mode, names in renewed.items()}
-        self._walks = [
-            (name, self._find_places(name, "drift"), as_positive(walks[name], f"drift of {name}")) for name in walks
-        ]
+        self._walks = np.zeros(self._beam.into.shape[1])  # variances of random walks after one time unit
+        for name in walks:
+            self._find_places(name, "drift")
+            self._walks[self._slices[name]] = as_positive(walks[name], f"drift of {name}") ** 2
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Path | None = None
@@ -204,19 +205,15 @@ class OnlineEstimator:
 
     def _find_places(self, names: Any, what: str) -> NDArray[np.intp]:
         """Return the positions of free parameters, a name or several, among the D unknowns of the engine."""
-        beam, unknowns = self._beam, self.problem.unknowns
-        offset, found = int(unknowns.is_time.sum()), []
         chosen = as_names((names,) if isinstance(names, str) else names, what, "the name of a parameter, or several")
         if not chosen:
             raise ValueError(f"{what} is empty: name a parameter, or leave it out.")
         for name in chosen:
-            of = unknowns.parameters.get(name)
-            if of is None:
-                known = join_names(unknowns.parameters)
+            if name not in self._slices:
+                known = join_names(self._slices)
                 raise ValueError(f"{what} has {shorten(name)}, which is no free parameter; there are: {known}.")
-            own = beam.own[beam.places] + offset
-            found.append(beam.births + np.flatnonzero((own >= of.start) & (own < of.stop)))
-        return np.concatenate(found)
+        own = np.r_[tuple(self._slices[name] for name in chosen)]
+        return np.flatnonzero(self._beam.into[:, own].any(axis=1))
 
     def build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
         """Return an estimator of another problem with the same settings, without a budget.
@@ -485,10 +482,10 @@ class OnlineEstimator:
         while tracker.first + 2 < feed.count and feed.nodes[tracker.first + 1] < feed.last - self.window:
             tracker.leave()
         begins = float(feed.nodes[tracker.first])
-        if self._walks and begins - self._renewed >= DRIFT_AFTER * self.window:
-            elapsed = begins - self._renewed
-            variances = [np.full(len(places), elapsed * sd**2) for _, places, sd in self._walks]
-            tracker.renew(np.concatenate([places for _, places, _ in self._walks]), np.concatenate(variances))
+        if self._walks.any() and begins - self._renewed >= DRIFT_AFTER * self.window:
+            variances = self._beam.into @ self._walks * (begins - self._renewed)
+            places = np.flatnonzero(variances)
+            tracker.renew(places, variances[places])
             self._renewed = begins
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
             tracker.drop_nodes()
@@ -564,7 +561,7 @@ class OnlineEstimator:
         names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
         others |= {"held": None if self.held is None else self.held.tolist(), "_spacing": self.spacing}
-        write_atomically(pack(self._tracker, others), as_path(path, "path"))
+        write_atomically(self._tracker.pack(others), as_path(path, "path"))
         if self._journal is not None:
             write_atomically(b"", self._journal)  # the saved state has what was in it
 
@@ -596,7 +593,9 @@ class OnlineEstimator:
         '{"t": 0.1, "y": {"0": [0.5]}, "u": null}\\n'
         """
         self._journal = as_path(path, "path")
-        open_journal(self._journal)
+        written = self._journal.read_bytes() if self._journal.exists() else b""
+        with self._journal.open("ab") as file:
+            file.truncate(written.rfind(b"\n") + 1)  # without a line that was cut off
 
     @classmethod
     def load(
@@ -646,7 +645,7 @@ class OnlineEstimator:
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
         online._tracker.step(0, births=False)  # gives the engine its settings
-        unpack(online._tracker, numbers, arrays, file)
+        online._tracker.unpack(numbers, arrays, file)
         if online._tracker.has(online._feed.count - 1):  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
         online._renewed = numbers["_renewed"]
@@ -715,7 +714,7 @@ class OnlineEstimator:
         own, count = kept.take(slice(b, b + 1)), int(kept.switches[b])
         modes, times = own.modes[0, : count + 1], tracker.times(own, found.moved[b : b + 1])[0, :count]
         best = self._describe(count, found, b)
-        walked = self._measure_walks(best) if self._walks else 0.0
+        walked = self._measure_walks(best) if self._walks.any() else 0.0
         past = tuple(tracker.left)
         alarm, retracted = self._declare(t, modes, times, statistic, best)
         if alarm is not None and alarm.mode in self._renews:
@@ -819,16 +818,12 @@ class OnlineEstimator:
         The estimate misses what comes at a time s by the share W(s) of the information that there was before. That
         grows from its value W at the start of the window to 1; evenly, the mean of W(s)^2 is ``(1 + W + W^2) / 3``.
         """
-        start, matrix, found = self._tracker.start, best.matrix, np.zeros(len(best.matrix))
-        begins = float(self._feed.nodes[self._tracker.first])
-        share = np.zeros(len(matrix))
+        start, W, into = self._tracker.start, np.zeros(len(self._walks)), self._beam.into
         if start is not None:
-            before = np.diag(invert(self._beam.into.T @ start.matrix @ self._beam.into))
-            np.divide(np.diag(invert(matrix)), before, out=share, where=np.isfinite(before))
-        for name, _, sd in self._walks:
-            W = np.minimum(share[best.parameters[name]], 1.0)
-            found[best.parameters[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
-        return found
+            before = np.diag(invert(into.T @ start.matrix @ into))
+            np.divide(np.diag(invert(best.matrix)), before, out=W, where=np.isfinite(before))
+            W = np.minimum(W, 1.0)
+        return self._walks * (self._feed.last - self._feed.nodes[self._tracker.first]) * (1 + W + W**2) / 3
 
     def _read_parameters(self, best: Best) -> dict[str, FloatArray]:
         """Return the values of all parameters, the fixed ones too."""

@@ -14,12 +14,17 @@ cost), in the unknowns ``d = (e, tau, p)``: A = n entries e that shift the state
 transition times in the window, and the parameters, ``x = x_w + Z d``. Transition times that leave the window become
 further entries of e; as more than n directions cannot all move n entries of the state, there are combinations without
 effect on the state, and the cost takes its minimum along them (the Schur complement).
+
+The state of an online estimator in a file, and the journal of the samples since then.
 """
 
 from __future__ import annotations
 
+import io
+import json
 from itertools import accumulate
 from math import nextafter
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -607,6 +612,43 @@ class Tracker:
         self.dropped += self.first
         self.first = 0
 
+    # --- files -----------------------------------------------------------------------------------------------------
+
+    def pack(self, others: dict[str, Any]) -> bytes:
+        """Return all arrays, and other numbers, as a file."""
+        arrays: dict[str, Any] = {f"feed {name}": array for name, array in self.feed.copy_arrays().items()}
+        for place, there in enumerate(self.kept):
+            if there is not None:
+                self.catch_up(place, there[1])
+                arrays |= {f"kept {place} {name}": array for name, array in there[0]._asdict().items()}
+        arrays |= {"records": self.records, "declared": self.declared}
+        if self.start is not None:
+            arrays |= {f"start {name}": np.asarray(array) for name, array in self.start._asdict().items()}
+        numbers = others | {"format": FORMAT, "first": self.first, "dropped": self.dropped, "left": self.left}
+        buffer = io.BytesIO()
+        np.savez(buffer, numbers=np.frombuffer(json.dumps(numbers).encode(), dtype=np.uint8), **arrays)
+        return buffer.getvalue()
+
+    def unpack(self, numbers: dict[str, Any], arrays: dict[str, FloatArray], path: Path) -> None:
+        """Take what was saved; ValueError if that is of another problem or other settings."""
+        if arrays["records"].shape != self.records.shape:
+            raise ValueError(f"{path} was saved for another problem, or with other settings: give the same ones.")
+
+        def part(name: str) -> dict[str, Any]:
+            begin = f"{name} "
+            return {key.removeprefix(begin): array for key, array in arrays.items() if key.startswith(begin)}
+
+        self.feed.set_arrays(part("feed"))
+        self.records[:] = arrays["records"]
+        self.declared = arrays["declared"].astype(np.int64)
+        for place in range(len(self.kept)):
+            found = part(f"kept {place}")
+            self.kept[place] = self.view(place, Sequences(**found)) if found else None
+        if start := part("start"):
+            self.start = Start(**start)._replace(cost=float(start["cost"]))
+        self.first, self.dropped = numbers["first"], numbers["dropped"]
+        self.left = [Left(*each) for each in numbers["left"]]
+
 
 def drop_artificial(matrix: FloatArray, artificial: FloatArray) -> FloatArray:
     """Return H (D, D) without artificial terms (D,) of its diagonal; zeros where nothing else is left."""
@@ -628,4 +670,39 @@ def invert(matrix: FloatArray) -> FloatArray:
         found[there, there] = np.inf
     diagonal = np.diag(found)
     np.fill_diagonal(found, np.where(diagonal > 0, diagonal, np.inf))
+    return found
+
+
+FORMAT = "switchfit online 1"
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+    """Return the numbers and the arrays of a file; ValueError for any other."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        numbers = json.loads(arrays.pop("numbers").tobytes())
+    except (ValueError, KeyError, EOFError) as error:
+        raise ValueError(f"{path} is not a saved online estimator ({error}).") from error
+    if numbers.get("format") != FORMAT:
+        raise ValueError(f"{path} is of another version: it has {numbers.get('format')!r}, not {FORMAT!r}.")
+    return numbers, arrays
+
+
+def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> None:
+    """Write an update to a journal, with the values of each sensor; it leaves the process before the update begins."""
+    line = json.dumps({"t": t, "y": y, "u": u}, default=lambda value: np.asarray(value, dtype=np.float64).tolist())
+    with path.open("ab", buffering=0) as file:
+        file.write(line.encode() + b"\n")
+
+
+def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
+    """Return the updates of a journal; the last one may have been cut off, and is left out then."""
+    found = []
+    for line in path.read_bytes().split(b"\n")[:-1]:
+        try:
+            each = json.loads(line)
+            found.append((each["t"], {int(k): values for k, values in each["y"].items()}, each["u"]))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path} is not the journal of an online estimator ({error}).") from error
     return found
