@@ -464,7 +464,7 @@ def test_bad_settings_are_refused(problem, log):
         ({"threshold": 1.0, "false_alarms": 1.0}, "not both"),
         ({"drift": {"mu": 0.1}}, "window="),
         ({"renews": {"slip": "nu"}}, "no free parameter"),
-        ({"renews": {"skid": "mu"}}, "no mode"),
+        ({"renews": {"skid": "mu"}}, "renews names the unknown mode 'skid'"),
         ({"renews": {"slip": ()}}, "renews of 'slip' is empty"),
         ({"drift": {"mu": 0.0}, "window": 1.0}, "drift of mu must be positive; got 0.0"),
         ({"capacity": 0}, "capacity must be 1 or more; got 0"),

@@ -262,20 +262,16 @@ def estimate(
             if strategy == "local":
                 raise
             failure = error
-        if best is not None and (strategy == "local" or (strategy == "auto" and hessian != "auto")):
-            return best
-        if best is not None and strategy == "auto" and _is_settled(problem, best, max_iterations):
+        if best is not None and strategy == "auto":
+            is_cut = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # only a few were asked for
+            strategy = "local" if hessian != "auto" or is_cut or is_enough(problem, best) else strategy
+        if best is not None and strategy == "local":
             return best
         search = Search(problem, best, problem.check_theta(start), strategy, fit, began)
         search.run(line, callback, budget)
         if failure is not None and search.best is None:
             raise failure
         return search.finish()
-
-
-def _is_settled(problem: Problem, best: Estimate, max_iterations: int) -> bool:
-    """Return whether the first fit is all that "auto" makes: it is enough, or only a few iterations were asked for."""
-    return (best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS) or is_enough(problem, best)
 
 
 def _write_to(

@@ -90,27 +90,19 @@ def choose_hops(
     """
     unknowns = evaluator.problem.unknowns
     inside = (unknowns.lower < theta) & (theta < unknowns.upper)
-    hops = list(_list_hops(evaluator, theta, inside if free is None else inside & free))
+    free, whole = inside if free is None else inside & free, evaluator(theta)
+    runs = range(len(evaluator.engines))
+    hops = [hop for e in runs for hop in _list_hops(evaluator, e, whole, theta, free)]
     near = sorted(hops, key=lambda hop: hop[0])[:MOST]
     again = [find_lowest(start) for lowest, start, find_lowest in near if np.isfinite(lowest)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
 
 
 def _list_hops(
-    evaluator: Evaluator, theta: FloatArray, free: NDArray[np.bool_]
-) -> Iterator[tuple[float, FloatArray, FindLowest]]:
-    """Yield the lowest J of the quadratic model about the middle of each sample interval near by, theta there, and a
-    function that returns both of the model about another point.
-    """
-    whole = evaluator(theta)
-    for e in range(len(evaluator.engines)):
-        yield from _list_hops_of_run(evaluator, e, whole, theta, free)
-
-
-def _list_hops_of_run(
     evaluator: Evaluator, e: int, whole: Evaluation[FloatArray], theta: FloatArray, free: NDArray[np.bool_]
 ) -> Iterator[tuple[float, FloatArray, FindLowest]]:
-    """Yield what `_list_hops` does for one run.
+    """Yield for each sample interval of a run near by the lowest J of the quadratic model about its middle, theta
+    there, and a function that returns both of the model about another point.
 
     The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
     point.

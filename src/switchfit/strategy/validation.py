@@ -214,8 +214,7 @@ def whiten_residuals(
     """
     d = len(problem.theta_names)
     found = [[c.residuals.copy() for c in run] for run in comparisons]
-    sigma = _collect_sigma(comparisons) * noise
-    freedom = len(sigma)
+    freedom = sum(item.count for item in problem.measurements)
     Z = np.zeros((d, 0))
     if refit is not None:
         where = _find_places(problem, refit)
@@ -228,6 +227,7 @@ def whiten_residuals(
     if robust or problem.is_sigma_known is None or not (np.isfinite(C).all() and np.isfinite(noise)):
         return found, np.nan, freedom, np.full((d, d), np.nan)
     samples = collect_sample_derivatives(problem, sensitivities)
+    sigma = noise * samples.weight**-0.5
     X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
     if refit is not None and refit.priors:
         rows, error = _weigh_priors(problem, refit)
@@ -299,14 +299,6 @@ def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> F
     C = np.zeros((d, d))
     C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
     return C
-
-
-def _collect_sigma(comparisons: Sequence[Sequence[Comparison]]) -> FloatArray:
-    """Return the sigma of all samples that are not missing, in the order of their derivatives; 1 where unknown."""
-    measured = [c for run in comparisons for c in run if c.kind == "measurements"]
-    sizes = [np.ones(c.measured.shape) if c.sigma is None else c.sigma for c in measured]
-    there = [size[np.isfinite(c.measured)] for size, c in zip(sizes, measured, strict=True)]
-    return np.concatenate([np.zeros(0), *there])
 
 
 class InputCorrelation(NamedTuple):
