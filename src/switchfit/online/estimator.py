@@ -34,6 +34,7 @@ from switchfit.online.tracker import (
     StoppedError,
     Tracker,
     append_update,
+    drop_artificial,
     invert,
     read,
     read_journal,
@@ -558,9 +559,9 @@ class OnlineEstimator:
         """
         if self._stopped is not None:
             raise StoppedError(self._stopped)
-        names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
+        names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold", "spacing")
         others = {name: getattr(self, name) for name in names}
-        others |= {"held": None if self.held is None else self.held.tolist(), "_spacing": self.spacing}
+        others["held"] = None if self.held is None else self.held.tolist()
         write_atomically(self._tracker.pack(others), as_path(path, "path"))
         if self._journal is not None:
             write_atomically(b"", self._journal)  # the saved state has what was in it
@@ -640,7 +641,7 @@ class OnlineEstimator:
         file = as_path(path, "path")
         numbers, arrays = read(file)
         online = cls(problem, **settings, threshold=numbers["threshold"])
-        online.spacing, online._values = numbers["_spacing"], numbers["_values"]
+        online.spacing, online._values, online._renewed = (numbers[n] for n in ("spacing", "_values", "_renewed"))
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
@@ -648,9 +649,7 @@ class OnlineEstimator:
         online._tracker.unpack(numbers, arrays, file)
         if online._tracker.has(online._feed.count - 1):  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
-        online._renewed = numbers["_renewed"]
-        online._fitted, online._lost = tuple(numbers["_fitted"]), numbers["_lost"]
-        online._recent = [tuple(each) for each in numbers["_recent"]]
+        online._fitted, online._lost, online._recent = (numbers[name] for name in ("_fitted", "_lost", "_recent"))
         for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
             with suppress(ValueError):  # the update that was refused then
                 online.update(t, y, u=u)
@@ -807,10 +806,10 @@ class OnlineEstimator:
         """Return the linearised cost of a hypothesis with so many times in the window, in these and the problem's
         parameters.
         """
-        of_engine, A = (found.matrices[b].copy(), found.tangents[b].copy()), self._settings.entries
-        theta, times = self._read_theta(found.moved[b]), slice(A, A + count)
-        artificial = self._tracker.artificial
-        return Best(theta, found.states[b].copy(), times, self._slices, of_engine, artificial, self._beam.into)
+        A, into = self._settings.entries, self._beam.into
+        matrix = into.T @ drop_artificial(found.matrices[b], self._tracker.artificial) @ into
+        state, tangent = found.states[b].copy(), found.tangents[b] @ into
+        return Best(self._read_theta(found.moved[b]), state, tangent, slice(A, A + count), self._slices, matrix)
 
     def _measure_walks(self, best: Best) -> FloatArray:
         """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).
@@ -848,18 +847,20 @@ def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:
 
 def _check_problem(problem: Problem) -> list[Measurements]:
     """Return the sensors of a problem that can be estimated online; ValueError for others."""
-    if len(problem.experiments) != 1:
-        raise ValueError(f"an online estimator follows one run; the problem has {len(problem.experiments)}.")
     run = problem.experiments[0]
     sensors = list(select_kind(run.data, Measurements))
-    if len(sensors) < len(run.data):
-        raise ValueError("an online estimator takes samples alone: data of the experiment other than sf.Measurements.")
-    if run.jumps:
-        raise ValueError("an online estimator takes no jumps at known times; the experiment has some.")
-    for item in sensors:
-        if item.sigma is None or item.sigma_names:
-            what = "is left out" if item.sigma is None else "is a parameter"
-            raise ValueError(f"sigma {what}: an online estimator needs a number to tell a change of mode from noise.")
-        if isinstance(item.delay, str):
-            raise ValueError(f"the delay {item.delay!r} is a parameter: an online estimator needs a number.")
+    wrong = {
+        f"{len(problem.experiments)} runs": len(problem.experiments) > 1,
+        "other data": len(sensors) < len(run.data),
+        "jumps at known times": bool(run.jumps),
+        "a sigma that is left out": any(item.sigma is None for item in sensors),
+        "a sigma that is a parameter": any(item.sigma_names for item in sensors),
+        "a delay that is a parameter": any(isinstance(item.delay, str) for item in sensors),
+    }
+    found = [what for what, is_there in wrong.items() if is_there]
+    if found:
+        raise ValueError(
+            "an online estimator takes one run of sf.Measurements whose sigma and delay are numbers, which tell a "
+            f"change of mode from noise; the problem has {join_names(found)}."
+        )
     return sensors
