@@ -64,8 +64,7 @@ from switchfit.strategy.library import (
     list_jumps,
     refuse_unsupported,
     select_lowest,
-    trace_library,
-    trace_order,
+    trace_transitions,
 )
 from switchfit.strategy.starts import check_time
 
@@ -322,8 +321,7 @@ class Beam:
         run, unknowns = problem.experiments[e], problem.unknowns
         refuse_unsupported(problem, e)
         self.births = max(len(run.transition_times) if library is None else library.max_switches, 1)
-        traced = trace_order(problem, e) if library is None else trace_library(problem, e, library, self.births)
-        structure, self.functions = traced
+        structure, self.functions = trace_transitions(problem, e, library, self.births)
         self.modes = structure.mode_names
         self.slots = Slots.of(run.times if library is None else (), self.births)
         self.grid = choose_grid(run) if grid is None else grid

@@ -215,42 +215,29 @@ def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -
     return found.reset_maps[0], found.transition_costs[0], found.guards[0]
 
 
-def trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers]:
+def trace_transitions(problem: Problem, e: int, library: Library | None, births: int) -> tuple[Structure, Integers]:
     """Return the structure of an experiment with the modes and transitions of a library, and the places of the reset
     map, of the cost and of the guard of each of its transitions: (3, K, K), -1 without one.
+
+    Without a library, those of the given order of modes, whose N + 1 places stand for the modes.
     """
-    modes = tuple(name for name in problem.system.modes if name in library.modes)
-    places = {pair: (modes.index(pair[0]), modes.index(pair[1])) for pair in product(modes, modes)}
-    steps = [(pair, place) for pair, place in places.items() if pair[0] != pair[1] and library.allows(*pair)]
-    return _trace(problem, e, modes, steps, births)
-
-
-def trace_order(problem: Problem, e: int) -> tuple[Structure, Integers]:
-    """Return what `trace_library` does for the given order of modes, whose N + 1 places stand for the modes."""
-    sequence = problem.experiments[e].mode_sequence
-    modes = tuple(name for name in problem.system.modes if name in sequence)
-    steps = [(pair, (k, k + 1)) for k, pair in enumerate(pairwise(sequence))]
-    return _trace(problem, e, modes, steps, len(steps))
-
-
-def _trace(
-    problem: Problem,
-    e: int,
-    modes: tuple[str, ...],
-    steps: Sequence[tuple[tuple[str, str], tuple[int, int]]],
-    births: int,
-) -> tuple[Structure, Integers]:
-    """Trace a run and its transitions, each of which is a step between two places."""
     run = problem.experiments[e]
-    structure = trace_structure(problem.system, run, problem._functions, problem.solver, max(births, 1))
+    sequence = run.mode_sequence
+    modes = tuple(m for m in problem.system.modes if m in (sequence if library is None else library.modes))
+    if library is None:
+        steps = [(pair, (k, k + 1)) for k, pair in enumerate(pairwise(sequence))]
+    else:
+        pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
+        steps = [(pair, (modes.index(pair[0]), modes.index(pair[1]))) for pair in pairs]
+    structure = trace_structure(problem.system, run, problem._functions, problem.solver, births)
     known: list[list[Any]] = [list(dict.fromkeys(structure.reset_maps[i] for i in structure.jumps)), [], []]
     size = max(len(modes), *(1 + max(place) for _, place in steps), 1)
     tables = np.full((3, size, size), -1, dtype=np.int64)
     for pair, place in steps:
-        for table, library, function in zip(tables, known, trace_transition(problem, run, pair), strict=True):
+        for table, functions, function in zip(tables, known, trace_transition(problem, run, pair), strict=True):
             if function is not None:
-                library += [] if function in library else [function]
-                table[place] = library.index(function)
+                functions += [] if function in functions else [function]
+                table[place] = functions.index(function)
     reset_maps, transition_costs, guards = map(tuple, known)
     structure = replace(
         structure,
