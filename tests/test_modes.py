@@ -503,7 +503,7 @@ def test_parameters_far_off_are_found_from_other_starts():
         ({"min_duration": {"rise": -1.0}}, "min_duration must be zero or positive; got {'rise': -1.0}"),
         ({"min_duration": {"jump": 1.0}}, "min_duration names the unknown mode 'jump'"),
         ({"max_switches": -1}, "max_switches"),
-        ({"width": 2}, "width is 2, but the library has 3 modes"),
+        ({"width": 2}, "width must be 3 or more; got 2"),
         ({"grid": 0.0}, "grid"),
         ({"criterion": "aic"}, "criterion must be one of"),
         ({"criterion": "cost"}, "criterion='cost' needs switch_cost"),
@@ -592,7 +592,7 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         sf.ModeSearch.load(path, problem=sf.Problem(SYSTEM, other, FREE))
     for changes, message in (
         ({"format": "switchfit fit"}, "is not a saved search"),
-        ({"version": 1}, "of version 1; this switchfit reads version 3"),
+        ({"version": 1}, "of version 1; this switchfit reads version 4"),
         ({"search": content["search"] | {"fits": "many"}}, "is damaged"),
     ):
         path.write_text(json.dumps(content | changes))

@@ -238,7 +238,7 @@ class Certifier:
 
 
 FORMAT = "switchfit modes"
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,9 +304,7 @@ class SearchRecord:
     time_units: tuple[str, ...]
     starts: tuple[float, ...]
     ends: tuple[float, ...]
-    values: int
     sigma_known: bool | None
-    switch_cost: float
     ending: ModeEnding
     fits: int
     evaluations: int
@@ -334,11 +332,8 @@ class ModeSearch(SearchRecord, Displayed):
     run_names, time_units : tuple of str, one for each experiment
     starts, ends : tuple of float, one for each experiment
         t0 and tf.
-    values : int
-        Measured values.
     sigma_known : bool or None
         None if the cost is no likelihood.
-    switch_cost : float
     ending : ModeEnding
         The status with what belongs to it, as data.
     fits, evaluations : int
@@ -413,7 +408,7 @@ class ModeSearch(SearchRecord, Displayed):
     @property
     def transition_times(self) -> tuple[FloatArray, ...]:
         """Transition times of the best, one (N,) array for each experiment."""
-        return self._require_best().transition_times if self.best is None else self.best.transition_times
+        return self._require_best().transition_times
 
     @property
     def parameters(self) -> dict[str, FloatArray]:

@@ -226,7 +226,8 @@ def find_modes(
     )  # fmt: skip
     _check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
-    method, width = as_choice(method, "method", METHODS), _check_width(width, modes)
+    method = as_choice(method, "method", METHODS)
+    width = as_count(width, "width", at_least=len(modes.modes))  # each of which may come first
     grid = None if grid is None else _check_grid(grid, problem)
     given = None if starts is None else _check_starts(problem, starts)
     settings = Settings(modes, chooser, base, method, width, grid, given, as_seed(seed), callback, began)
@@ -270,16 +271,6 @@ def _check_grid(grid: Any, problem: Problem) -> float:
     return length
 
 
-def _check_width(width: Any, library: Library) -> int:
-    found = as_count(width, "width", at_least=1)
-    if found < len(library.modes):
-        raise ValueError(
-            f"width is {found}, but the library has {len(library.modes)} modes, each of which may come first: give "
-            f"width={len(library.modes)} or more."
-        )
-    return found
-
-
 def _check_criterion(
     problem: Problem, criterion: Any, switch_cost: Any
 ) -> tuple[CriterionName | Callable[[Estimate], float], Score, CriterionName]:
@@ -296,15 +287,11 @@ def _check_criterion(
                 "it. Leave one of them out."
             )
         return "cost", score, "cost"
-    if chooser == "cost":
-        raise ValueError("criterion='cost' needs switch_cost, the cost of a switch in units of J.")
+    if chooser == "cost" or (score.sigma_known is None and not callable(chooser)):
+        needed = "switch_cost" if chooser == "cost" else "Measurements alone: a running cost is no likelihood"
+        raise ValueError(f"criterion={chooser!r} needs {needed}. Give switch_cost, the cost of a switch in units of J.")
     if score.sigma_known is None:
-        if callable(chooser):
-            return chooser, score, "cost"
-        raise ValueError(
-            f"criterion={chooser!r} needs a likelihood, and the cost has other terms than Measurements: a running cost "
-            "is no likelihood. Give switch_cost, the cost of a switch in units of J."
-        )
+        return chooser, score, "cost"
     return chooser, score, chooser if chooser in INFORMATION else "bic"
 
 
@@ -350,9 +337,7 @@ def _build_result(
         time_units=tuple(run.time_unit for run in runs),
         starts=tuple(run.t0 for run in runs),
         ends=tuple(run.end for run in runs),
-        values=score.values,
         sigma_known=score.sigma_known,
-        switch_cost=score.switch_cost,
         fits=0 if fitter is None else fitter.fits,
         evaluations=0 if fitter is None else fitter.evaluations,
         seconds=time.perf_counter() - settings.began,
