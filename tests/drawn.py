@@ -45,7 +45,7 @@ NAMES = {
     "io/logs": "logs log_formats units real_logs gps_drive dates",
     "io/problem_file": "io files dates saved_problem bad_input cli_modes jumps",
     "models": "vehicles vehicle_mechanics",
-    "modes": "modes schedule pulses insertion sharing",
+    "modes": "modes schedule insertion",
     "online": "online online_cli",
     "optimize": "sqp qp equalities arrow batch strategy runs",
     "paper": "paper closed_form",

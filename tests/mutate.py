@@ -54,7 +54,7 @@ TESTS = {
     ],
     "online": [["tests/test_online.py"]],
     "design": [["tests/test_design.py"]],
-    "modes": [["tests/test_schedule.py"], ["tests/test_sharing.py"], ["tests/test_modes.py", "-m", "not slow"]],
+    "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part that were thought of, one after the other until something does."""
 
