@@ -53,7 +53,7 @@ NAMES = {
     "report": "online_report report plots verdict tables_out modes validation verdict_many",
     "report/html": "html",
     "runtime": "progress save files threads bad_input",
-    "strategy": "validate strategy known_order beam validation starts final_time",
+    "strategy": "validate strategy beam validation starts final_time",
     "uncertainty": "uncertainty profile prediction verdict",
 }
 TESTS = {room: names.split() for room, names in NAMES.items()}

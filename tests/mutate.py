@@ -42,7 +42,7 @@ TESTS = {
     "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge or routine or order or factors"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
-    "beam": [["tests/test_known_order.py", "-k", "say"], ["tests/test_beam.py", "-k", "not jax"]],
+    "beam": [["tests/test_strategy.py", "-k", "say"], ["tests/test_beam.py", "-k", "not jax"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or every_check"]],
     "corners": [
         [

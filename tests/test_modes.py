@@ -122,11 +122,6 @@ def test_mode_probabilities_are_those_of_the_alternatives(found):
         found.mode_probability([1.0], experiment=1)
 
 
-def test_criteria_are_those_computed_by_hand(found):
-    for row in found.fitted:
-        assert abs(row.bic - (2 * row.cost + (1 + row.switches) * np.log(162))) < 1e-5 * row.cost
-
-
 @pytest.mark.parametrize(
     ("name", "known", "unknown"),
     [
@@ -334,14 +329,6 @@ def test_a_mode_of_few_samples_is_warned_of():
 # --- structure, several runs, costs -----------------------------------------------------------------------------------
 
 
-def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
-    found = sf.find_modes(make_problem(), first="rise", last="fall", min_duration={"turn": 3.5}, max_switches=2)
-    assert found.mode_sequence == SEQUENCE
-    first, second = found.transition_times[0]
-    assert abs(second - first - 3.5) < 1e-9
-    assert found.best.problem.min_duration == {"rise": 0.0, "fall": 0.0, "turn": 3.5}
-
-
 def test_a_log_that_begins_in_the_middle_of_a_mode():
     """min_duration holds for the first and the last mode as well, as in a fit; the search says where that matters."""
     run = make_run(times=(0.6, 5.0))
@@ -353,6 +340,7 @@ def test_a_log_that_begins_in_the_middle_of_a_mode():
     free = sf.find_modes(problem, max_switches=2, min_duration={"rise": 0.0})
     assert free.mode_sequence == SEQUENCE
     np.testing.assert_allclose(free.transition_times[0], [0.6, 5.0], atol=0.1)
+    assert free.best.problem.min_duration == {"rise": 0.0, "fall": 2.0, "turn": 2.0}
     assert not kinds_of(free.warnings, "cut off")
 
 
