@@ -673,7 +673,7 @@ def invert(matrix: FloatArray) -> FloatArray:
     return found
 
 
-FORMAT = "switchfit online 1"
+FORMAT = "switchfit online 2"
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
