@@ -140,25 +140,6 @@ class SharedEngine(NativeEngine):
         return found
 
 
-def share_evaluator(evaluator: Evaluator, problem: Problem, experiments: Sequence[Experiments]) -> Evaluator:
-    """Return the evaluator of a problem with other sequences, without guards, terminal constraints and jumps.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Whose data and meshes it has.
-    problem : Problem
-        By `Problem.with_sequences`.
-    experiments : sequence of dict
-        Of `SharedEngine`, one for each experiment.
-    """
-    found = object.__new__(Evaluator)
-    found.problem, found.meshes, found.arguments = problem, evaluator.meshes, evaluator.arguments
-    given = zip(problem.structures, found.arguments, found.meshes, experiments, strict=True)
-    found.engines = [SharedEngine(*each) for each in given]
-    return found
-
-
 COLLAPSED = 1e-6
 """Duration, as a part of the horizon, below which a mode is left out."""
 
@@ -468,7 +449,11 @@ class Fitter:
         problem = self._build_problem(guesses)
         if not self._is_native or problem.system.guards or problem.constraint_names:
             return Evaluator(problem, meshes=self.meshes)
-        return share_evaluator(self.evaluator, problem, self._experiments)
+        found = object.__new__(Evaluator)
+        found.problem, found.meshes, found.arguments = problem, self.evaluator.meshes, self.evaluator.arguments
+        given = zip(problem.structures, found.arguments, found.meshes, self._experiments, strict=True)
+        found.engines = [SharedEngine(*each) for each in given]
+        return found
 
     @staticmethod
     def _hold(constraints: LinearConstraints, theta: FloatArray, acting: NDArray[np.bool_]) -> LinearConstraints:

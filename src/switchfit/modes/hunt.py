@@ -222,7 +222,11 @@ class Improver:
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
             if proposal.sequences not in taken and len(taken) < most and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
-                self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
+                given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
+                schedules = [
+                    Schedule(sequence, np.asarray(times, dtype=float), *span) for sequence, times, span in given
+                ]
+                self.polish(schedules, proposal.parameters, "fits of proposals")
 
     def _is_hopeless(self, proposal: Proposal) -> bool:
         """Return whether data that are explained leave a proposal no hope: its linear model's cost is far above J."""
@@ -231,11 +235,6 @@ class Improver:
             return False
         penalty = self.pool.score.measure_penalty(self.pool.criterion)
         return proposal.cost > best.cost + penalty * best.switches + HOPELESS * (penalty + 1.0)
-
-    def build_schedules(self, proposal: Proposal) -> list[Schedule]:
-        """Return the schedules of a proposal."""
-        given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
-        return [Schedule(sequence, np.asarray(times, dtype=float), *span) for sequence, times, span in given]
 
     def improve(self) -> None:
         """Move from the best until no move lowers the criterion."""
