@@ -354,7 +354,7 @@ class Tracker:
         self._coded: tuple[Any, list[int]] = (None, [])
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
-        self.birth_information = float(12.0 * (beam.noise / beam.slots.measure_width(beam.grid)[0]) ** 2)
+        self.birth_information = float(12.0 * (beam.noise / beam.reaches[0]) ** 2)
         weak = np.where(beam.priors.precision > 0, 0.0, (beam.noise / self._pass.spread) ** 2)[beam.places]
         of_births = np.full(beam.births, self.birth_information)
         of_births[: settings.entries] = 0.0
