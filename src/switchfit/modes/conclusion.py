@@ -329,7 +329,7 @@ class Judge:
         """Yield the first and the last mode if min_duration makes them longer: a log may begin in the middle of one."""
         for i in {0, schedule.switches} if schedule.switches else ():
             mode, (begin, end) = schedule.sequence[i], schedule.knots[i : i + 2].tolist()
-            least = self.certifier.library.min_duration(mode)
+            least = self.certifier.library.durations[mode]
             if least > 0 and end - begin <= least * (1 + AT_BOUND):
                 yield ModeWarning("cut off", mode, run, begin, end, unit=unit)
 

@@ -204,7 +204,7 @@ class Certifier:
         for schedule, run in zip(fitted.schedules, searched.experiments, strict=True):
             times = keep_off(spread(schedule, library) or schedule, run.jump_times).times
             runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(times)))
-        durations = {mode: library.min_duration(mode) for mode in searched.system.modes}
+        durations = dict(library.durations)
         shortest = durations if len(set(durations.values())) > 1 else max(durations.values())
         rtol, atol = self.given.rtol, self.given.atol
         problem = replace(searched, experiments=runs, min_duration=shortest, rtol=rtol, atol=atol)

@@ -329,7 +329,7 @@ def _build_result(
     runs, library, chooser = problem.experiments, settings.library, settings.chooser
     return ModeSearch(
         modes=library.modes,
-        durations=tuple(library.min_duration(mode) for mode in library.modes),
+        durations=tuple(library.durations[mode] for mode in library.modes),
         max_switches=library.max_switches,
         criterion=chooser if isinstance(chooser, str) else getattr(chooser, "__name__", "criterion"),
         parameter_names=() if fitter is None else fitter.parameter_names,
@@ -351,7 +351,8 @@ class _Search:
 
     def __init__(self, problem: Problem, score: Score, settings: Settings) -> None:
         self.problem, self.score, self.settings = problem, score, settings
-        self.library = settings.library.trimmed
+        # Programs have room for the largest number of switches that a sequence has.
+        self.library = replace(settings.library, max_switches=max(settings.library.possible_switches))
         self.fitter, self.pool = Fitter(problem, self.library), Pool(score, settings.criterion)
         self.improver = Improver(self.fitter, self.pool, self._report)
         self.certifier = Certifier(self.fitter.problem, problem, settings.library)

@@ -38,7 +38,7 @@ class Library:
     successions : mapping of str to tuple of str
         The modes that may follow each mode.
     durations : mapping of str to float
-        Shortest time that each mode lasts, 0 where it may be any.
+        Shortest time that each mode lasts, in the time unit of the experiments; 0 where it may be any.
     max_switches : int
         Largest number of switches of a sequence.
     """
@@ -53,10 +53,6 @@ class Library:
     def allows(self, before: str, after: str) -> bool:
         """Return whether one mode may follow another."""
         return after in self.successions.get(before, ())
-
-    def min_duration(self, mode: str) -> float:
-        """Return the shortest time that a mode lasts, in the time unit of the experiments."""
-        return self.durations.get(mode, 0.0)
 
     def admits(self, sequence: Sequence[str]) -> bool:
         """Return whether a mode sequence is one of the library, with at most `max_switches` switches."""
@@ -92,11 +88,6 @@ class Library:
     def possible_switches(self) -> tuple[int, ...]:
         """The numbers of switches up to `max_switches` with which there is a sequence."""
         return tuple(k for k, modes in enumerate(self.ends_after) if modes & set(self.first))
-
-    @property
-    def trimmed(self) -> Library:
-        """The same sequences, with a largest number of switches that one of them has: programs have room for it."""
-        return replace(self, max_switches=max(self.possible_switches, default=0))
 
 
 def build_library(
@@ -297,7 +288,7 @@ class Rules(NamedTuple):
     def of(cls, library: Library, modes: Sequence[str]) -> Rules:
         """Return the rules of a library."""
         allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
-        shortest = np.array([library.min_duration(mode) for mode in modes])
+        shortest = np.array([library.durations[mode] for mode in modes])
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
         return cls(np.arange(len(modes)), shortest, begins, ends[0], _list_follows(allowed, ends), None)
