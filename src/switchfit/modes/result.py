@@ -612,12 +612,11 @@ class ModeSearch(SearchRecord, Displayed):
 
 def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
     """Raise ValueError unless a search that was loaded from a file may be that of a problem."""
-    missing = [mode for mode in record.modes if mode not in problem.system.modes]
-    if missing:
-        raise ValueError(f"{path} has the mode {missing[0]!r}, which the problem lacks: it is another problem's.")
-    runs, ends = problem.experiments, list(zip(record.starts, record.ends, strict=True))
-    if name_runs(runs) != record.run_names or [(run.t0, run.end) for run in runs] != ends:
+    runs, modes, ends = problem.experiments, problem.system.modes, list(zip(record.starts, record.ends, strict=True))
+    same_runs = name_runs(runs) == record.run_names and [(run.t0, run.end) for run in runs] == ends
+    if not (same_runs and set(record.modes) <= set(modes)):
         raise ValueError(
-            f"{path} holds the runs {join_names(record.run_names)}, the problem has {join_names(name_runs(runs))}, or "
-            "their horizons differ: it is another problem's."
+            f"{path} holds the runs {join_names(record.run_names)} with the modes {join_names(record.modes)}, the "
+            f"problem has {join_names(name_runs(runs))} with {join_names(modes)}, or their horizons differ: it is "
+            "another problem's."
         )
