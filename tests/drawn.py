@@ -45,7 +45,7 @@ NAMES = {
     "io/logs": "logs log_formats units real_logs gps_drive dates",
     "io/problem_file": "io files dates saved_problem bad_input cli_modes jumps",
     "models": "vehicles vehicle_mechanics",
-    "modes": "modes schedule pulses insertion sharing",
+    "modes": "modes schedule insertion",
     "online": "online online_cli",
     "optimize": "sqp qp equalities arrow batch strategy runs",
     "paper": "paper closed_form",
@@ -53,7 +53,7 @@ NAMES = {
     "report": "online_report report plots verdict tables_out modes validation verdict_many",
     "report/html": "html",
     "runtime": "progress save files threads bad_input",
-    "strategy": "validate strategy known_order beam validation starts final_time",
+    "strategy": "validate strategy beam validation starts final_time",
     "uncertainty": "uncertainty profile prediction verdict",
 }
 TESTS = {room: names.split() for room, names in NAMES.items()}

@@ -231,7 +231,7 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('first = "rise"', 'first = "up"', "changed.toml: library: first names the mode 'up'; the library has the mod"),
+        ('first = "rise"', 'first = "up"', "changed.toml: library: first names the unknown mode 'up'; the modes are"),
         ('first = "rise"', "first = 3", "'library.first[1]' must be a string; got 3 (mode or modes with which a seque"),
         ("min_duration = 0.2", "min_duration = -1", "'library.min_duration' must be greater than or equal to 0; got"),
         ('first = "rise"', 'first = "drift"\nlast = "rise"', "no mode of last (rise) can be reached from first (dr"),

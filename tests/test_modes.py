@@ -19,9 +19,9 @@ from switchfit.modes.conclusion import list_neighbours
 from switchfit.modes.criterion import CORRELATED, Score, compute_weights, measure_whiteness
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.hunt import propose_starts
-from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.report.formats import format_rounded
+from switchfit.strategy.library import build_library
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -120,11 +120,6 @@ def test_mode_probabilities_are_those_of_the_alternatives(found):
         found.mode_probability([9.0])
     with pytest.raises(ValueError, match="experiment"):
         found.mode_probability([1.0], experiment=1)
-
-
-def test_criteria_are_those_computed_by_hand(found):
-    for row in found.fitted:
-        assert abs(row.bic - (2 * row.cost + (1 + row.switches) * np.log(162))) < 1e-5 * row.cost
 
 
 @pytest.mark.parametrize(
@@ -334,14 +329,6 @@ def test_a_mode_of_few_samples_is_warned_of():
 # --- structure, several runs, costs -----------------------------------------------------------------------------------
 
 
-def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
-    found = sf.find_modes(make_problem(), first="rise", last="fall", min_duration={"turn": 3.5}, max_switches=2)
-    assert found.mode_sequence == SEQUENCE
-    first, second = found.transition_times[0]
-    assert abs(second - first - 3.5) < 1e-9
-    assert found.best.problem.min_duration == {"rise": 0.0, "fall": 0.0, "turn": 3.5}
-
-
 def test_a_log_that_begins_in_the_middle_of_a_mode():
     """min_duration holds for the first and the last mode as well, as in a fit; the search says where that matters."""
     run = make_run(times=(0.6, 5.0))
@@ -353,6 +340,7 @@ def test_a_log_that_begins_in_the_middle_of_a_mode():
     free = sf.find_modes(problem, max_switches=2, min_duration={"rise": 0.0})
     assert free.mode_sequence == SEQUENCE
     np.testing.assert_allclose(free.transition_times[0], [0.6, 5.0], atol=0.1)
+    assert free.best.problem.min_duration == {"rise": 0.0, "fall": 2.0, "turn": 2.0}
     assert not kinds_of(free.warnings, "cut off")
 
 
@@ -490,28 +478,28 @@ def test_parameters_far_off_are_found_from_other_starts():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"library": ("rise", "jump")}, "library names the mode 'jump'; the system has the modes"),
+        ({"library": ("rise", "jump")}, "library names the unknown mode 'jump'; the modes are"),
         ({"library": ()}, "library is empty"),
-        ({"first": "jump"}, "first names the mode 'jump'"),
+        ({"first": "jump"}, "first names the unknown mode 'jump'"),
         ({"first": ()}, "first is empty"),
-        ({"library": ("rise", "fall"), "last": "turn"}, "last names the mode 'turn'; the library has the modes"),
-        ({"successions": {"jump": "rise"}}, "successions names the mode 'jump'"),
-        ({"successions": {"rise": "jump"}}, "successions of 'rise' names the mode 'jump'"),
+        ({"library": ("rise", "fall"), "last": "turn"}, "last names the unknown mode 'turn'; the modes are"),
+        ({"successions": {"jump": "rise"}}, "successions names the unknown mode 'jump'"),
+        ({"successions": {"rise": "jump"}}, "successions of 'rise' names the unknown mode 'jump'"),
         ({"successions": {"rise": "rise"}}, "names the mode itself"),
         ({"first": "rise", "last": "turn", "successions": {"rise": "fall"}}, "can be reached from first"),
         ({"min_duration": -1.0}, "min_duration must be zero or positive; got -1.0"),
-        ({"min_duration": {"rise": -1.0}}, "min_duration of 'rise' must be zero or positive"),
-        ({"min_duration": {"jump": 1.0}}, "min_duration names the mode 'jump'"),
+        ({"min_duration": {"rise": -1.0}}, "min_duration must be zero or positive; got {'rise': -1.0}"),
+        ({"min_duration": {"jump": 1.0}}, "min_duration names the unknown mode 'jump'"),
         ({"max_switches": -1}, "max_switches"),
-        ({"width": 2}, "width is 2, but the library has 3 modes"),
+        ({"width": 2}, "width must be 3 or more; got 2"),
         ({"grid": 0.0}, "grid"),
         ({"criterion": "aic"}, "criterion must be one of"),
         ({"criterion": "cost"}, "criterion='cost' needs switch_cost"),
         ({"criterion": "mbic", "switch_cost": 1.0}, "switch_cost is the cost of a switch for criterion='cost'"),
         ({"switch_cost": -1.0}, "switch_cost must be zero or positive"),
         ({"method": "guess"}, "method must be 'auto', 'beam' or 'insertion'"),
-        ({"starts": [[1.0, 2.0]]}, "starts must have a row for each start with 1 values"),
-        ({"starts": [[np.inf]]}, "starts must be one or more rows of finite numbers"),
+        ({"starts": [[1.0, 2.0]]}, "starts must have a row for each start with 1 finite values"),
+        ({"starts": [[np.inf]]}, "starts must have a row for each start with 1 finite values"),
         ({"library": 3}, "library"),
         ({"successions": ["rise"]}, "successions must be a dict"),
         ({"callback": 3}, "callback"),
@@ -592,7 +580,7 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         sf.ModeSearch.load(path, problem=sf.Problem(SYSTEM, other, FREE))
     for changes, message in (
         ({"format": "switchfit fit"}, "is not a saved search"),
-        ({"version": 1}, "of version 1; this switchfit reads version 3"),
+        ({"version": 1}, "of version 1; this switchfit reads version 4"),
         ({"search": content["search"] | {"fits": "many"}}, "is damaged"),
     ):
         path.write_text(json.dumps(content | changes))

@@ -221,7 +221,7 @@ def test_residuals_that_depend_on_the_input_are_found():
     assert found.inputs[0].probability < 1e-6
     assert any(reason.kind == "input not explained" for reason in found.verdict.reasons)
     assert "Correlation with inputs" in str(found)
-    with pytest.raises(ValueError, match="the fit has an input, and another run has its own: give validate an"):
+    with pytest.raises(ValueError, match=r"inputs, or other data than .*: give validate an sf\.Experiment"):
         fit.validate(other.experiments[0].data[0])
 
 
@@ -267,8 +267,8 @@ def test_what_cannot_be_validated():
             r"refit names 'b', which is no unknown of the other run's own; these",
         ),
         (fit, two, {}, ValueError, "of the fit have 1 channels, those of the other run 2"),
-        (fit, [data] * 2, {}, ValueError, "the fit has 1 data in its experiment, 1 of them Measurements; got 2"),
-        (both, data, {}, ValueError, r"the fit has 2 experiments: give validate an sf.Experiment"),
+        (fit, [data] * 2, {}, ValueError, "the fit has 1 Measurements; got 2 for the other run"),
+        (both, data, {}, ValueError, "the fit has several experiments, inputs, or other data"),
         (each, data, {}, ValueError, "sigma differs from sample to sample in the fit"),
     ):
         with pytest.raises(error, match=said):
@@ -430,7 +430,7 @@ def test_what_cannot_be_compared():
     # 1 is the scale if none is given: the tail of Cauchy's loss falls as 1 / |z|, whose integral is infinite.
     heavy = run(TIMES, values(TIMES, 0), loss="cauchy", loss_scale=1.0)
     for estimates, settings, error, said in (
-        ([one, one.problem], {}, TypeError, "compare needs results of sf.estimate; got Problem"),
+        ([one, one.problem], {}, TypeError, r"each of estimates must be a result of sf\.estimate; got Problem"),
         ([one], {}, ValueError, "compare needs two estimates or more; got 1"),
         ([one, one], {"names": ("a",)}, ValueError, "names must have one entry for each of the 2 estimates"),
         ([one, fit(1, runs=area)], {}, ValueError, "model2 has no likelihood: its cost has other terms than Measure"),

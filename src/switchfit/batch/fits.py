@@ -2,7 +2,7 @@
 
 Ten thousand fits cannot be simulated one by one. Each is judged by what its program returns (status, J, theta, the
 Hessian) and by the share of its data's variance that J leaves, by the rules of single fits
-(`switchfit.uncertainty.answers`), as if its residuals could not be tested. Not looked at are the correlation of the
+(`switchfit.uncertainty.verdict`), as if its residuals could not be tested. Not looked at are the correlation of the
 residuals, single channels, other starts, and checks of derivatives: fit one by itself for these.
 
 With J half a sum of squares, and V that of the data about their means, the share of the variance that is explained is

@@ -92,11 +92,11 @@ def online(
         loaded = load_problem(problem, replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
-        from switchfit.modes.library import build_library
         from switchfit.online.log import build_log
         from switchfit.problem.data import Measurements
         from switchfit.problem.structure import select_kind
         from switchfit.runtime.presentation import format_count
+        from switchfit.strategy.library import build_library
 
         terminal.make_folder(out)
         for file in filter(None, (state, journal)):
@@ -132,7 +132,7 @@ def _start(
 ) -> OnlineEstimator:
     """Return the estimator: a new one, or that of a state and a journal."""
     import switchfit as sf
-    from switchfit.online.saved import read_journal
+    from switchfit.online.tracker import read_journal
 
     written = journal if journal is not None and journal.exists() else None
     if state is not None and state.exists():

@@ -8,20 +8,26 @@ with all of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise, takewhile
 from typing import Any
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.criterion import INFORMATION, UNEXPLAINED, compute_weights, is_far_from_noise, measure_whiteness
-from switchfit.modes.fitter import Fitted, find_read
-from switchfit.modes.hunt import Hunt, Improver, Sequences, compute_criterion
+from switchfit.modes.criterion import (
+    INFORMATION,
+    UNEXPLAINED,
+    CriterionName,
+    compute_weights,
+    is_far_from_noise,
+    measure_whiteness,
+)
+from switchfit.modes.fitter import Fitted, Fitter, find_read
+from switchfit.modes.hunt import Improver, Pool, Sequences
 from switchfit.modes.result import Certifier, ModeEnding, ModeFit, ModeStatus, ModeWarning
 from switchfit.modes.schedule import Schedule, list_insertions, list_removals, list_substitutions, merge_neighbours
-from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_number
 from switchfit.strategy.beam import list_sample_times
 from switchfit.strategy.library import Library
@@ -90,10 +96,9 @@ def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, 
         schedule = best.schedules[e]
         if changed.switches > schedule.switches and abs(cost - best.cost) <= ROUNDING * best.cost:
             mode, begin, end = _find_change(schedule, changed)
-            before = untraced.get((e, mode))
-            if before is None or end - begin > before.end - before.begin:
-                name, unit = problem.run_names[e] if several else "", problem.experiments[e].time_unit
-                untraced[e, mode] = ModeWarning("no trace", mode, name, begin, end, unit=unit)
+            name, unit = problem.run_names[e] if several else "", problem.experiments[e].time_unit
+            note = ModeWarning("no trace", mode, name, begin, end, unit=unit)
+            untraced[e, mode] = max(untraced.get((e, mode), note), note, key=lambda each: each.end - each.begin)
     for cost, given in improver.choose_lowest(best, every):
         if cost < known.get(tuple(each.sequence for each in given), np.inf):
             if several and improver.is_ruled_out(best, given):
@@ -111,10 +116,8 @@ def _find_change(schedule: Schedule, changed: Schedule) -> tuple[str, float, flo
     before = [schedule.sequence[k] for k in np.searchsorted(schedule.times, middles)]
     after = [changed.sequence[k] for k in np.searchsorted(changed.times, middles)]
     first = next(k for k in range(len(middles)) if before[k] != after[k])
-    last = first
-    while last + 1 < len(middles) and after[last + 1] == after[first] != before[last + 1]:
-        last += 1
-    return after[first], float(knots[first]), float(knots[last + 1])
+    span = list(takewhile(lambda k: after[k] == after[first] != before[k], range(first, len(middles))))
+    return after[first], float(knots[first]), float(knots[span[-1] + 1])
 
 
 AMBIGUOUS = 2.0
@@ -133,65 +136,68 @@ FEW_SAMPLES = 5
 """Samples below which a mode may make up for an error of the model."""
 
 
+@dataclass(frozen=True)
 class Judge:
     """Chooses the number of switches, and judges the best sequence.
 
-    Parameters
+    Attributes
     ----------
-    hunt : Hunt
-        What was fitted, and the score, which is not discounted.
+    pool : Pool
+        What was fitted.
+    fitter : Fitter
     certifier : Certifier
+    chooser : str or callable
+        The criterion that chooses the number.
     interrupted : bool
     untraced : list of ModeWarning
         Modes that could be put into the best and leave no trace.
     """
 
-    def __init__(self, hunt: Hunt, certifier: Certifier, interrupted: bool, untraced: list[ModeWarning]) -> None:
-        self.problem, self.library, self.certifier = certifier.given, certifier.library, certifier
-        self.score, self.chooser, self.pool, self.fitter = hunt.score, hunt.settings.chooser, hunt.pool, hunt.fitter
-        self.as_it_stands, self.interrupted, self.untraced = hunt.pool.as_it_stands, interrupted, untraced
+    pool: Pool
+    fitter: Fitter
+    certifier: Certifier
+    chooser: CriterionName | Callable[[Estimate], float]
+    interrupted: bool
+    untraced: list[ModeWarning]
 
     def conclude(self) -> dict[str, Any]:
         """Choose the number of switches, and return what was found: these fields of `ModeSearch`."""
         ranked = self._rank()
         if not ranked:
-            return {"ending": ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)}
+            return {"ending": ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.certifier.library.max_switches)}
         best = ranked[0][0]
         estimate = self.certifier.estimate(best) if best.has_unknowns else None
-        near, weights = self._weigh(ranked)
-        chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
-        values = {fit.sequences: value for fit, value in ranked}
-        known = {row.sequences: row for row in chosen}
+        weights, values = self._weigh(ranked), {fit.sequences: value for fit, value in ranked}
         shown = [best if fit.switches == best.switches else fit for fit in self.pool.by_switches.values()]
         return {
-            "fitted": tuple(
-                known.get(fit.sequences) or self._describe(fit, values.get(fit.sequences, np.nan), 0.0) for fit in shown
-            ),
-            "chosen": chosen,
+            "fitted": tuple(self._describe(fit, values, weights) for fit in shown),
+            "chosen": tuple(self._describe(fit, values, weights) for fit, _ in ranked if fit.sequences in weights),
             "best": estimate,
-            "ending": self._end(ranked, estimate, float(weights[0])),
+            "ending": self._end(ranked, estimate, weights[best.sequences]),
             "warnings": () if estimate is None else tuple(self._list_warnings(best, estimate)),
         }
 
     @property
     def _chooses_by_cost(self) -> bool:
-        return self.score.sigma_known is None or self.chooser == "cost"
+        return not self.pool.is_likelihood or self.chooser == "cost"
 
-    def _weigh(self, ranked: list[tuple[Fitted, float]]) -> tuple[list[tuple[Fitted, float]], FloatArray]:
-        """Return the best and its alternatives, and their weights.
+    def _weigh(self, ranked: list[tuple[Fitted, float]]) -> dict[Sequences, float]:
+        """Return the weights of the best and its alternatives.
 
         Weights are those of mBIC where BIC or mBIC chooses: BIC does not count that the place of a switch was searched
         for, and is no approximation of a probability of sequences with different numbers of switches.
         """
         if self._chooses_by_cost or not np.isfinite(ranked[0][1]):
-            return ranked[:1], np.ones(1)
+            return {ranked[0][0].sequences: 1.0}
         values = [self.pool.compute(fit, "mbic") if self._weighs_by_mbic else value for fit, value in ranked]
         kept = [k for k, value in enumerate(values) if k == 0 or value <= min(values) + ALTERNATIVE]
-        return [ranked[k] for k in kept], compute_weights([values[k] for k in kept])
+        weights = compute_weights([values[k] for k in kept]).tolist()
+        return {ranked[k][0].sequences: weight for k, weight in zip(kept, weights, strict=True)}
 
     @property
     def _weighs_by_mbic(self) -> bool:
-        return self.score.has_information(self.chooser) and (self.chooser != "aicc" or self.as_it_stands is not None)
+        of_number = self.chooser != "aicc" or self.pool.as_it_stands is not None
+        return of_number and self.pool.score.has_information(self.chooser)
 
     def _rank(self) -> list[tuple[Fitted, float]]:
         """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
@@ -201,15 +207,22 @@ class Judge:
         pairs = [(fit, as_number(self.chooser(self.certifier.estimate(fit)), "criterion(estimate)")) for fit in fits]
         return sorted((pair for pair in pairs if np.isfinite(pair[1])), key=lambda pair: pair[1])
 
-    def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:
-        likely = self.score.sigma_known is not None
-        bic, mbic, aicc = (compute_criterion(self.score, fit, name) if likely else np.nan for name in INFORMATION)
-        known = self.certifier.find(fit.sequences)
-        times = tuple(schedule.times for schedule in fit.schedules)
-        cost = fit.cost
-        if known is not None and [len(t) for t in known.transition_times] == [len(t) for t in times]:
-            times, cost = tuple(np.array(t) for t in known.transition_times), known.cost
-        return ModeFit(fit.sequences, times, fit.parameters, fit.acting, cost, criterion, bic, mbic, aicc, weight)
+    def _describe(self, fit: Fitted, values: dict[Sequences, float], weights: dict[Sequences, float]) -> ModeFit:
+        pool, known = self.pool, self.certifier.find(fit.sequences)
+        cost, times = fit.cost, tuple(schedule.times for schedule in fit.schedules)
+        if known is not None:
+            cost, times = known.cost, tuple(np.array(t) for t in known.transition_times)
+        likely = {name: pool.compute(fit, name, discounted=False) for name in INFORMATION} if pool.is_likelihood else {}
+        return ModeFit(
+            sequences=fit.sequences,
+            transition_times=times,
+            parameters=fit.parameters,
+            acting=fit.acting,
+            cost=cost,
+            criterion=values.get(fit.sequences, np.nan),
+            weight=weights.get(fit.sequences, 0.0),
+            **likely,
+        )
 
     def _end(self, ranked: list[tuple[Fitted, float]], estimate: Estimate | None, weight: float) -> ModeEnding:
         """Return how the search ended; `weight` is that of the best."""
@@ -218,7 +231,7 @@ class Judge:
             "sequences": best.sequences,
             "criterion": self.chooser if isinstance(self.chooser, str) else "criterion",
             "held": self._list_held(best, read=False),
-            "limit": self.library.max_switches,
+            "limit": self.certifier.library.max_switches,
         }
         if self.interrupted:
             return ModeEnding(ModeStatus.INTERRUPTED, **facts)
@@ -244,8 +257,8 @@ class Judge:
     def _find_doubt(self, ranked: list[tuple[Fitted, float]], weight: float) -> dict[str, Any]:
         """Return the sequence that makes the best ambiguous, and by what; empty if there is none."""
         best, lowest = ranked[0]
-        if self.as_it_stands is not None and self.as_it_stands.sequences != best.sequences:
-            return {"other": self.as_it_stands.sequences, "prefers_other": "as it stands"}
+        if self.pool.as_it_stands is not None and self.pool.as_it_stands.sequences != best.sequences:
+            return {"other": self.pool.as_it_stands.sequences, "prefers_other": "as it stands"}
         gaps: dict[Sequences, float] = {}
         for other, value in ranked[1:]:
             by_mbic = self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic")
@@ -260,52 +273,52 @@ class Judge:
         preferred = self.pool.list_best("mbic")[0].sequences
         if preferred != best.sequences:
             return {"other": preferred, "prefers_other": "mbic", "difference": gaps.get(preferred, gap)}
-        if gap < AMBIGUOUS or (self.score.has_information(self.chooser) and weight < UNLIKELY):
+        if gap < AMBIGUOUS or (self.pool.score.has_information(self.chooser) and weight < UNLIKELY):
             return {"other": nearest, "difference": gap}
         return {}
 
     def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
         """Return the probability by which the data are not explained, and of what; None if they are."""
-        if self.score.sigma_known is None:
+        if not self.pool.is_likelihood:
             return None
         probability = self.pool.measure_probability(best)
         if probability < UNEXPLAINED:
             return probability, "chi-square"
-        if estimate is not None and is_far_from_noise(estimate, self.score):
+        if estimate is not None and is_far_from_noise(estimate, self.pool.score):
             return measure_whiteness(estimate), "correlated residuals"
         return None
 
     def _is_at_limit(self, best: Fitted) -> bool:
         """Return whether an experiment has as many switches as allowed, and could have more."""
-        most = self.library.max_switches
+        most = self.certifier.library.max_switches
         if not any(schedule.switches == most for schedule in best.schedules):
             return False
-        longer = replace(self.library, max_switches=most + len(self.library.modes) + 1)
+        longer = replace(self.certifier.library, max_switches=most + len(self.certifier.library.modes) + 1)
         return any(switches > most for switches in longer.possible_switches)
 
     def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
         """Yield what may be wrong with the best sequence."""
-        names = self.problem.run_names if len(best.schedules) > 1 else ("",)
-        for label, schedule, run in zip(names, best.schedules, self.problem.experiments, strict=True):
+        pool = self.pool
+        names = self.certifier.given.run_names if len(best.schedules) > 1 else ("",)
+        for label, schedule, run in zip(names, best.schedules, self.certifier.given.experiments, strict=True):
             yield from self._list_cut(schedule, label, run.time_unit)
             times = list_sample_times(run)
             for mode, begin, end in zip(schedule.sequence, schedule.knots[:-1], schedule.knots[1:], strict=True):
                 count = int(np.sum((times >= begin) & (times <= end)))
                 if schedule.switches and count < FEW_SAMPLES and len(times):
                     yield ModeWarning("short segment", mode, label, float(begin), float(end), count, unit=run.time_unit)
-        if self.score.sigma_known is not None and estimate.status.successful:
+        if pool.is_likelihood and estimate.status.successful:
             residuals = estimate.residuals
             pairs = zip(residuals.labels, residuals.correlated, strict=True)
             correlated = tuple(name for name, bad in pairs if bad)
             if correlated:
                 yield ModeWarning("correlated residuals", channels=correlated)
             for name in ("bic", "mbic"):
-                _, switches = min((compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool)
+                _, switches = min((pool.compute(fit, name, discounted=False), fit.switches) for fit in pool)
                 if switches != best.switches:
                     yield ModeWarning("criteria differ", criterion=name, switches=switches)
-        if self.as_it_stands is not None:
-            score = self.pool.score
-            worth, dispersion = round(score.worth * score.values), score.dispersion
+        if pool.as_it_stands is not None:
+            worth, dispersion = round(pool.score.worth * pool.score.values), pool.score.dispersion
             yield ModeWarning("discounted", samples=worth, dispersion=dispersion, switches=best.switches)
         yield from self.untraced
         held = self._list_held(best, read=True)
@@ -316,7 +329,7 @@ class Judge:
         """Yield the first and the last mode if min_duration makes them longer: a log may begin in the middle of one."""
         for i in {0, schedule.switches} if schedule.switches else ():
             mode, (begin, end) = schedule.sequence[i], schedule.knots[i : i + 2].tolist()
-            least = self.library.min_duration(mode)
+            least = self.certifier.library.durations[mode]
             if least > 0 and end - begin <= least * (1 + AT_BOUND):
                 yield ModeWarning("cut off", mode, run, begin, end, unit=unit)
 

@@ -11,10 +11,8 @@ Evaluators of mode sequences: on meshes, data and machine code that all sequence
 
 Arguments and experiments of machine code take longer to build than the problem of a sequence, and do not depend on it.
 
-The cost of any schedule of a library, in the microseconds that its simulation takes.
-
-A problem for each sequence takes a millisecond to build, more than many simulations: a scan over hundreds of schedules
-changes the sequence inside one experiment of machine code instead.
+The cost of any schedule, in the microseconds that its simulation takes: a problem for each sequence takes a millisecond
+to build, so that a scan over hundreds of schedules changes the sequence inside one experiment of machine code instead.
 """
 
 from __future__ import annotations
@@ -142,138 +140,6 @@ class SharedEngine(NativeEngine):
         return found
 
 
-def share_evaluator(evaluator: Evaluator, problem: Problem, experiments: Sequence[Experiments]) -> Evaluator:
-    """Return the evaluator of a problem with other sequences, without guards, terminal constraints and jumps.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Whose data and meshes it has.
-    problem : Problem
-        By `Problem.with_sequences`.
-    experiments : sequence of dict
-        Of `SharedEngine`, one for each experiment.
-    """
-    found = object.__new__(Evaluator)
-    found.problem, found.meshes, found.arguments = problem, evaluator.meshes, evaluator.arguments
-    given = zip(problem.structures, found.arguments, found.meshes, experiments, strict=True)
-    found.engines = [SharedEngine(*each) for each in given]
-    return found
-
-
-class ScheduleCosts:
-    """Costs of schedules of one problem, on fixed meshes.
-
-    Parameters
-    ----------
-    problem : Problem
-        With `max_transitions`.
-    evaluator : Evaluator
-        Of any of its sequences.
-    """
-
-    def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
-        self.problem, self._evaluator = problem, evaluator
-        self._sequences: dict[tuple[int, tuple[str, ...]], tuple[Structure, dict[str, NDArray[np.int64]]]] = {}
-        self._trace = cache(lambda e, pair: trace_transition(problem, problem.experiments[e], pair))
-        self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
-        times = sum(len(run.transition_times) for run in problem.experiments)
-        counts = [len(run.times) + len(run.jump_times) for run in problem.experiments]
-        self._places = [places[N:] - times for places, N in zip(problem.places, counts, strict=True)]
-
-    def _build(self, e: int, mesh: Mesh) -> NativeExperiment | None:
-        """Return an experiment that simulates any sequence; None where there is none in machine code."""
-        problem = self.problem
-        if len(problem.experiments[e].jump_times) or self._evaluator.engines[e].engine.name != "native":
-            return None
-        return native_experiment(problem.structures[e], self._evaluator.arguments[e], mesh.times, Order.COST)
-
-    @property
-    def is_native(self) -> bool:
-        """Whether machine code simulates every sequence."""
-        return all(experiment is not None for experiment in self._native)
-
-    def __call__(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
-        """Return J of one schedule for each experiment; infinite where it cannot be simulated.
-
-        Parameters
-        ----------
-        schedules : sequence of Schedule
-        parameters : (M,)
-            Free parameters and initial states, in the order of theta.
-        """
-        return float(self.compute_all(schedules, 0, schedules[:1], parameters)[0])
-
-    def compute_all(
-        self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
-    ) -> FloatArray:
-        """Return J with each of some schedules in the place of that of experiment e: (B,).
-
-        Parameters
-        ----------
-        schedules : sequence of Schedule, one for each experiment
-        e : int
-        moved : sequence of Schedule
-        parameters : (M,)
-        """
-        with np.errstate(all="ignore"):
-            found = self._simulate(e, moved, parameters)
-            for k, schedule in enumerate(schedules):
-                if k != e:
-                    found += self._simulate(k, [schedule], parameters)
-            priors = self.problem.unknowns.priors
-            if priors.any:
-                times = self.problem.initial_theta[: len(self.problem.theta_names) - len(parameters)]
-                found += priors.evaluate(np.concatenate([times, parameters]))[0]
-            for i in np.flatnonzero(np.isnan(found)).tolist():
-                found[i] = self._evaluate([*schedules[:e], moved[i], *schedules[e + 1 :]], parameters)
-            return np.where(np.isfinite(found), found, np.inf)
-
-    def _simulate(self, e: int, schedules: Sequence[Schedule], parameters: FloatArray) -> FloatArray:
-        """Return what an experiment adds to J with each of some schedules; NaN where machine code cannot say: (B,)."""
-        native, p = self._native[e], parameters[self._places[e]]
-        found = np.full(len(schedules), np.nan)
-        if native is not None:
-            # Those of one sequence together: to assign one takes half as long as J.
-            for i, schedule in sorted(enumerate(schedules), key=lambda each: each[1].sequence):
-                structure, places = self._find_places(e, schedule.sequence)
-                if structure is not native.structure:
-                    native.assign_sequence(structure, places)
-                with suppress(FailedCheckError):
-                    found[i] = native.cost(schedule.times, p)
-        return found
-
-    def _find_places(self, e: int, sequence: tuple[str, ...]) -> tuple[Structure, dict[str, NDArray[np.int64]]]:
-        """Return the structure of an experiment with another sequence, and what is active where in it."""
-        if (e, sequence) not in self._sequences:
-            structure = self.structure_of(e, sequence)
-            self._sequences[e, sequence] = structure, places_in_library(structure)
-        return self._sequences[e, sequence]
-
-    def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
-        """Return J by a problem of its own."""
-        if not len(parameters) and not any(schedule.switches for schedule in schedules):
-            # A problem needs an unknown: a transition from a mode to itself has no effect.
-            first = schedules[0]
-            middle = np.array([0.5 * (first.t0 + first.tf)])
-            schedules = [first.replace(first.sequence * 2, middle), *schedules[1:]]
-        given = zip(schedules, self.problem.experiments, strict=True)
-        times = [keep_off(schedule, run.jump_times).times for schedule, run in given]
-        problem = self.problem.with_sequences([schedule.sequence for schedule in schedules], times)
-        evaluator = Evaluator(problem, meshes=self._evaluator.meshes)
-        return evaluator.cost(np.concatenate([*times, parameters]))
-
-    def structure_of(self, e: int, sequence: tuple[str, ...]) -> Structure:
-        """Return the structure of an experiment with another sequence."""
-        base = self.problem.structures[e]
-        modes = tuple(base.mode_names.index(mode) for mode in sequence)
-        if base.jumps:  # among whose reset maps those of the jumps stand
-            return replace(base, mode_of_segment=modes)
-        found = [self._trace(e, pair) for pair in pairwise(sequence)]
-        resets, costs, guards = zip(*found, strict=True) if found else ((), (), ())
-        return replace(base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs)
-
-
 COLLAPSED = 1e-6
 """Duration, as a part of the horizon, below which a mode is left out."""
 
@@ -363,6 +229,10 @@ class Fitter:
         self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
+        self._sequences: dict[tuple[int, tuple[str, ...]], tuple[Structure, dict[str, NDArray[np.int64]]]] = {}
+        self._trace = cache(lambda e, pair: trace_transition(self.problem, self.problem.experiments[e], pair))
+        counts = [len(run.times) + len(run.jump_times) for run in self.problem.experiments]
+        self._places = [places[N:] - self.first for places, N in zip(self.problem.places, counts, strict=True)]
 
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -430,16 +300,97 @@ class Fitter:
         return Evaluator(self.problem, meshes=self.meshes)
 
     @cached_property
-    def costs(self) -> ScheduleCosts:
-        """Costs of schedules without a fit."""
-        return ScheduleCosts(self.problem, self.evaluator)
+    def _simulators(self) -> list[NativeExperiment | None]:
+        """What simulates any sequence of each experiment in machine code; None where that cannot be."""
+        found = []
+        for e, (run, engine) in enumerate(zip(self.runs, self.evaluator.engines, strict=True)):
+            is_native = engine.engine.name == "native" and not len(run.jump_times)
+            given = self.problem.structures[e], self.evaluator.arguments[e], self.meshes[e].times
+            found.append(native_experiment(*given, Order.COST) if is_native else None)
+        return found
+
+    def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
+        """Return J of one schedule for each experiment; infinite where it cannot be simulated.
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule
+        parameters : (M,)
+            Free parameters and initial states, in the order of theta.
+        """
+        return float(self.compute_costs(schedules, 0, schedules[:1], parameters)[0])
+
+    def compute_costs(
+        self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
+    ) -> FloatArray:
+        """Return J with each of some schedules in the place of that of experiment e: (B,).
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule, one for each experiment
+        e : int
+        moved : sequence of Schedule
+        parameters : (M,)
+        """
+        with np.errstate(all="ignore"):
+            found = self._simulate(e, moved, parameters)
+            for k, schedule in enumerate(schedules):
+                if k != e:
+                    found += self._simulate(k, [schedule], parameters)
+            priors = self.problem.unknowns.priors
+            if priors.any:
+                found += priors.evaluate(np.concatenate([self.problem.initial_theta[: self.first], parameters]))[0]
+            for i in np.flatnonzero(np.isnan(found)).tolist():
+                found[i] = self._evaluate([*schedules[:e], moved[i], *schedules[e + 1 :]], parameters)
+            return np.where(np.isfinite(found), found, np.inf)
+
+    def _simulate(self, e: int, schedules: Sequence[Schedule], parameters: FloatArray) -> FloatArray:
+        """Return what an experiment adds to J with each of some schedules; NaN where machine code cannot say: (B,)."""
+        native, p = self._simulators[e], parameters[self._places[e]]
+        found = np.full(len(schedules), np.nan)
+        if native is not None:
+            # Those of one sequence together: to assign one takes half as long as J.
+            for i, schedule in sorted(enumerate(schedules), key=lambda each: each[1].sequence):
+                key = e, schedule.sequence
+                if key not in self._sequences:
+                    structure = self._build_structure(*key)
+                    self._sequences[key] = structure, places_in_library(structure)
+                if self._sequences[key][0] is not native.structure:
+                    native.assign_sequence(*self._sequences[key])
+                with suppress(FailedCheckError):
+                    found[i] = native.cost(schedule.times, p)
+        return found
+
+    def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
+        """Return J by the evaluator of a sequence."""
+        if not len(parameters) and not any(schedule.switches for schedule in schedules):
+            # A problem needs an unknown: a transition from a mode to itself has no effect.
+            first = schedules[0]
+            middle = np.array([0.5 * (first.t0 + first.tf)])
+            schedules = [first.replace(first.sequence * 2, middle), *schedules[1:]]
+        times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
+        return self.get_evaluator(schedules).cost(np.concatenate([*times, parameters]))
+
+    def _build_structure(self, e: int, sequence: tuple[str, ...]) -> Structure:
+        """Return the structure of an experiment with another sequence."""
+        base = self.problem.structures[e]
+        modes = tuple(base.mode_names.index(mode) for mode in sequence)
+        if base.jumps:  # among whose reset maps those of the jumps stand
+            return replace(base, mode_of_segment=modes)
+        found = [self._trace(e, pair) for pair in pairwise(sequence)]
+        resets, costs, guards = zip(*found, strict=True) if found else ((), (), ())
+        return replace(base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs)
+
+    @property
+    def _is_native(self) -> bool:
+        return None not in self._simulators
 
     @property
     def shares_programs(self) -> bool:
         """Whether another sequence compiles nothing: always in machine code, and with JAX one program for each number
         of switches if no functions act at transitions.
         """
-        return self.costs.is_native or not any(
+        return self._is_native or not any(
             structure.reset_library or structure.guard_library or structure.transition_cost_library or structure.known
             for structure in self.problem.structures
         )
@@ -479,7 +430,7 @@ class Fitter:
     def _fit(self, schedules: list[Schedule], theta: FloatArray, failed: Fitted) -> Fitted:
         if not failed.has_unknowns:
             self.evaluations += 1
-            return replace(failed, cost=self.costs(schedules, failed.parameters))
+            return replace(failed, cost=self.cost(schedules, failed.parameters))
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             evaluator = self.get_evaluator(schedules)
         held = self._hold(evaluator.problem.constraints, theta, failed.acting)
@@ -496,9 +447,13 @@ class Fitter:
             even = None if len(run.jump_times) else space_evenly(s.sequence, s.t0, s.tf, self.library)
             guesses.append(even or spread(s, self.library) or s)
         problem = self._build_problem(guesses)
-        if not self.costs.is_native or problem.system.guards or problem.constraint_names:
+        if not self._is_native or problem.system.guards or problem.constraint_names:
             return Evaluator(problem, meshes=self.meshes)
-        return share_evaluator(self.evaluator, problem, self._experiments)
+        found = object.__new__(Evaluator)
+        found.problem, found.meshes, found.arguments = problem, self.evaluator.meshes, self.evaluator.arguments
+        given = zip(problem.structures, found.arguments, found.meshes, self._experiments, strict=True)
+        found.engines = [SharedEngine(*each) for each in given]
+        return found
 
     @staticmethod
     def _hold(constraints: LinearConstraints, theta: FloatArray, acting: NDArray[np.bool_]) -> LinearConstraints:
@@ -546,7 +501,7 @@ class Fitter:
         acting = self.find_acting([schedule.sequence for schedule in schedules])
         free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
         if not free.any():
-            return self.costs(schedules, parameters)
+            return self.cost(schedules, parameters)
         try:
             with np.errstate(all="ignore"):
                 here = self.get_evaluator(schedules)(theta)
@@ -570,6 +525,6 @@ class Fitter:
         """
         key = tuple(sequences)
         if key not in self._acting:
-            structures = [self.costs.structure_of(e, sequence) for e, sequence in enumerate(key)]
+            structures = [self._build_structure(e, sequence) for e, sequence in enumerate(key)]
             self._acting[key] = find_read(self.problem, structures, library=False)
         return self._acting[key]

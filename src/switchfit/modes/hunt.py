@@ -1,7 +1,4 @@
-"""The search among the schedules of one problem: starts, generators, moves, and more of them if nothing explains the
-data.
-
-The best fit of each sequence that a search has found, and its criteria.
+"""The best fit of each sequence that a search has found, and its criteria.
 
 Search among the schedules of the runs of one problem: polish what generators propose, then move until nothing helps.
 
@@ -25,13 +22,11 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.rates import compute_rates
@@ -44,13 +39,10 @@ from switchfit.modes.schedule import (
     spread,
 )
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
-from switchfit.strategy.beam import REPLAYS, Beam, Proposal, Quadratic, prepare
+from switchfit.strategy.beam import Proposal
 from switchfit.strategy.hops import choose_hops, is_lower
-from switchfit.strategy.known_order import Beams
-from switchfit.strategy.library import Library, Rules
-from switchfit.strategy.starts import draw_starts
+from switchfit.strategy.library import Library
 
 EXPLAINED = 1e-3
 """Probability of chi-square above which the data are explained, and no further start is needed."""
@@ -69,12 +61,14 @@ class Pool:
 
     Attributes
     ----------
+    undiscounted : Score
     as_it_stands : Fitted or None
         The best before the criteria were discounted; None if they were not.
     """
 
     def __init__(self, score: Score, criterion: CriterionName) -> None:
-        self.score, self.criterion = score, criterion
+        self.score = self.undiscounted = score
+        self.criterion = criterion
         self._found: dict[Sequences, Fitted] = {}
         self.as_it_stands: Fitted | None = None
 
@@ -87,9 +81,16 @@ class Pool:
         if not fitted.failed and (known is None or fitted.cost < known.cost):
             self._found[fitted.sequences] = fitted
 
-    def compute(self, fitted: Fitted, criterion: CriterionName | None = None) -> float:
+    def compute(self, fitted: Fitted, criterion: CriterionName | None = None, *, discounted: bool = True) -> float:
         """Return a criterion of a fit, by default that of the search."""
-        return compute_criterion(self.score, fitted, self.criterion if criterion is None else criterion)
+        name, score = criterion or self.criterion, self.score if discounted else self.undiscounted
+        switches = fitted.switches if name == "cost" else fitted.free_switches
+        return score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
+
+    @property
+    def is_likelihood(self) -> bool:
+        """Whether the cost is one."""
+        return self.score.sigma_known is not None
 
     def discount(self, score: Score) -> None:
         """Compare by mBIC with a discounted score from now on.
@@ -105,6 +106,11 @@ class Pool:
     def best(self) -> Fitted | None:
         """The fit with the lowest criterion; None if there is none."""
         return min(self, key=self.compute, default=None)
+
+    @property
+    def lowest(self) -> float:
+        """The criterion of the best; infinite if there is none."""
+        return min(map(self.compute, self), default=np.inf)
 
     def is_explained(self) -> bool | None:
         """Return whether chi-square says that the best explains the data; None where it cannot say."""
@@ -128,19 +134,6 @@ class Pool:
     def measure_probability(self, fitted: Fitted) -> float:
         """Return the probability of chi-square at its cost, NaN where 2 J has no such distribution."""
         return self.score.measure_probability(fitted.cost, int(fitted.acting.sum()) + fitted.free_switches)
-
-
-def compute_criterion(score: Score, fitted: Fitted, name: CriterionName) -> float:
-    """Return a criterion of a fit.
-
-    Parameters
-    ----------
-    score : Score
-    fitted : Fitted
-    name : {"bic", "mbic", "aicc", "cost"}
-    """
-    switches = fitted.switches if name == "cost" else fitted.free_switches
-    return score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
 
 
 LOWER = 1e-6
@@ -229,7 +222,11 @@ class Improver:
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
             if proposal.sequences not in taken and len(taken) < most and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
-                self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
+                given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
+                schedules = [
+                    Schedule(sequence, np.asarray(times, dtype=float), *span) for sequence, times, span in given
+                ]
+                self.polish(schedules, proposal.parameters, "fits of proposals")
 
     def _is_hopeless(self, proposal: Proposal) -> bool:
         """Return whether data that are explained leave a proposal no hope: its linear model's cost is far above J."""
@@ -238,11 +235,6 @@ class Improver:
             return False
         penalty = self.pool.score.measure_penalty(self.pool.criterion)
         return proposal.cost > best.cost + penalty * best.switches + HOPELESS * (penalty + 1.0)
-
-    def build_schedules(self, proposal: Proposal) -> list[Schedule]:
-        """Return the schedules of a proposal."""
-        given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
-        return [Schedule(sequence, np.asarray(times, dtype=float), *span) for sequence, times, span in given]
 
     def improve(self) -> None:
         """Move from the best until no move lowers the criterion."""
@@ -263,8 +255,7 @@ class Improver:
         """Try the moves of a kind; return whether the best is better."""
         before = self.pool.compute(best)
         move(best)
-        now = self.pool.best
-        return now is not None and self.pool.compute(now) < before - LOWER * max(abs(before), 1.0)
+        return self.pool.lowest < before - LOWER * max(abs(before), 1.0)
 
     def _hop(self, best: Fitted) -> None:
         """Fit from other sample intervals until that does not help; the time of a transition with a guard follows."""
@@ -292,7 +283,7 @@ class Improver:
         found = []
         for e, schedule in enumerate(best.schedules):
             every = list(list_moves(schedule, self.library))
-            costs = self.fitter.costs.compute_all(best.schedules, e, every, best.parameters)
+            costs = self.fitter.compute_costs(best.schedules, e, every, best.parameters)
             found += [Move(*each, e) for each in zip(costs.tolist(), every, strict=True)]
         return found
 
@@ -506,128 +497,3 @@ def propose_starts(fitter: Fitter) -> list[FloatArray]:
         places = np.arange(len(guess))
         starts += [np.where(places == i, moved, guess) for i in places for moved in changed]
     return list({start.tobytes(): start for start in starts}.values())
-
-
-Method = Literal["auto", "beam", "insertion"]
-METHODS: tuple[Method, ...] = get_args(Method)
-
-WIDER = 4
-"""Factor of the width where nothing explains the data."""
-
-PATIENCE = 3
-"""Random starts in a row that lead to nothing better, after which it is the model that is doubted."""
-
-LOWER_BY_START = 1e-3
-"""Part of the criterion by which a start has to lower it to count as better."""
-
-MORE_STARTS = 8
-"""Random starts of the parameters where nothing explains the data."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a search is asked for; see `find_modes`. During it, sequences are compared by `criterion`."""
-
-    library: Library
-    chooser: CriterionName | Callable[[Estimate], float]
-    criterion: CriterionName
-    method: Method
-    width: int
-    grid: float | None
-    starts: tuple[FloatArray, ...] | None
-    seed: int
-    callback: Callable[[Any], object] | None
-
-
-class Hunt:
-    """Search among the schedules of a problem.
-
-    Parameters
-    ----------
-    problem : Problem
-    score : Score
-    settings : Settings
-    report : callable
-        Called with what is under way; it may raise to end the search.
-    """
-
-    def __init__(self, problem: Problem, score: Score, settings: Settings, report: Callable[[str], None]) -> None:
-        self.library, self.score, self.settings = settings.library.trimmed, score, settings
-        self.fitter = Fitter(problem, self.library)
-        self.pool = Pool(score, settings.criterion)
-        self.improver = Improver(self.fitter, self.pool, report)
-        self.report, self.runs = report, problem.experiments
-
-    def search(self) -> None:
-        """Search from all starts of the parameters, or until the data are explained."""
-        given = self.settings.starts
-        starts = propose_starts(self.fitter) if given is None else list(given)
-        if any(len(run.mode_sequence) > 1 for run in self.runs):
-            self._fit_given()
-        for start in starts:
-            self.search_from(start, self.settings.width)
-            if given is None and self.pool.is_explained():
-                break
-        if self.pool.best is None:
-            self._fit_given()
-
-    def widen(self) -> None:
-        """Search from more starts, with more hypotheses."""
-        width = WIDER * self.settings.width
-        starts = draw_starts(self.fitter.problem, 1 + MORE_STARTS, self.settings.seed)[1:, self.fitter.first :]
-        best, waited = self.pool.best, 0
-        for start in starts if best is None else [best.parameters, *starts]:
-            before = np.inf if self.pool.best is None else self.pool.compute(self.pool.best)
-            self.search_from(start, width)
-            now = np.inf if self.pool.best is None else self.pool.compute(self.pool.best)
-            waited = 0 if now < before - LOWER_BY_START * abs(before) else waited + 1
-            if self.pool.is_explained() or waited == PATIENCE:
-                break
-
-    def _fit_given(self) -> None:
-        """Fit the sequence that the problem was given."""
-        self.improver.polish(self._list_given(), self.fitter.start, "fit of the given sequence")
-
-    def _list_given(self) -> list[Schedule]:
-        """Return the schedule that each experiment was given; one of the library if that is not admitted."""
-        pairs = zip(self.runs, self.fitter.problem.experiments, strict=True)
-        runs = [given if self.library.admits(given.mode_sequence) else own for given, own in pairs]
-        return [Schedule(tuple(run.mode_sequence), run.initial_times, run.t0, run.end) for run in runs]
-
-    def search_from(self, start: FloatArray, width: int) -> None:
-        """Search with a generator at a start of the parameters, then move.
-
-        Parameters
-        ----------
-        start : (M,)
-        width : int
-        """
-        runs = self._prepare_beams()
-        penalty = self.score.measure_penalty(self.settings.criterion)
-
-        def follow_run(e: int, q: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
-            return runs[e].run(Rules.of(self.library, runs[e].modes), q, penalty, width, REPLAYS, evidence)
-
-        if runs:
-            self.report("beam")
-            beams = Beams(self.fitter.problem, [each.own for each in runs])
-            self.improver.polish_proposals(beams.join(*beams.follow(start, follow_run)))
-        else:
-            self.report("insertion")
-            best = self.pool.best
-            insert_modes(self.improver, self._list_given() if best is None else best.schedules, start)
-        self.improver.improve()
-
-    def _prepare_beams(self) -> list[Beam]:
-        """Return the beams of all runs; none for other costs than data, and where a beam cannot follow an experiment,
-        unless it is asked for.
-        """
-        method, problem = self.settings.method, self.fitter.problem
-        if method == "insertion" or (method == "auto" and self.score.sigma_known is None):
-            return []
-        try:
-            return [prepare(problem, e, self.library, self.settings.grid) for e in range(len(self.runs))]
-        except ValueError:
-            if method != "auto":
-                raise
-            return []

@@ -27,8 +27,8 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
 from switchfit.runtime.files import from_json, read_document, to_json, write_document
 from switchfit.runtime.presentation import Displayed, Printed, draw_figure, format_line
+from switchfit.strategy.known_order import fix_unknowns
 from switchfit.strategy.library import Library
-from switchfit.strategy.other_run import fix_unknowns
 
 
 class ModeStatus(Enum):
@@ -204,7 +204,7 @@ class Certifier:
         for schedule, run in zip(fitted.schedules, searched.experiments, strict=True):
             times = keep_off(spread(schedule, library) or schedule, run.jump_times).times
             runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(times)))
-        durations = {mode: library.min_duration(mode) for mode in searched.system.modes}
+        durations = dict(library.durations)
         shortest = durations if len(set(durations.values())) > 1 else max(durations.values())
         rtol, atol = self.given.rtol, self.given.atol
         problem = replace(searched, experiments=runs, min_duration=shortest, rtol=rtol, atol=atol)
@@ -238,7 +238,7 @@ class Certifier:
 
 
 FORMAT = "switchfit modes"
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,33 +280,15 @@ class ModeFit:
     acting: NDArray[np.bool_]
     cost: float
     criterion: float
-    bic: float
-    mbic: float
-    aicc: float
     weight: float
+    bic: float = np.nan
+    mbic: float = np.nan
+    aicc: float = np.nan
 
     @property
     def switches(self) -> int:
         """Number of switches of all experiments."""
         return sum(len(sequence) - 1 for sequence in self.sequences)
-
-    def modes_at(self, t: FloatArray, e: int) -> list[str]:
-        """Return the mode of experiment e at each of the times t (L,); at a transition, the later one.
-
-        See Also
-        --------
-        ModeSearch.mode_probability
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> search = sf.find_modes(heater_problem(), max_switches=2)
-        >>> search.fitted[1].modes_at(np.array([1.0, 5.0]), 0)
-        ['on', 'off']
-        """
-        return [self.sequences[e][k] for k in np.searchsorted(self.transition_times[e], t, "right").tolist()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,9 +304,7 @@ class SearchRecord:
     time_units: tuple[str, ...]
     starts: tuple[float, ...]
     ends: tuple[float, ...]
-    values: int
     sigma_known: bool | None
-    switch_cost: float
     ending: ModeEnding
     fits: int
     evaluations: int
@@ -352,11 +332,8 @@ class ModeSearch(SearchRecord, Displayed):
     run_names, time_units : tuple of str, one for each experiment
     starts, ends : tuple of float, one for each experiment
         t0 and tf.
-    values : int
-        Measured values.
     sigma_known : bool or None
         None if the cost is no likelihood.
-    switch_cost : float
     ending : ModeEnding
         The status with what belongs to it, as data.
     fits, evaluations : int
@@ -431,7 +408,7 @@ class ModeSearch(SearchRecord, Displayed):
     @property
     def transition_times(self) -> tuple[FloatArray, ...]:
         """Transition times of the best, one (N,) array for each experiment."""
-        return self._require_best().transition_times if self.best is None else self.best.transition_times
+        return self._require_best().transition_times
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
@@ -530,7 +507,8 @@ class ModeSearch(SearchRecord, Displayed):
         found = np.zeros((len(times), len(self.modes)))
         rows = np.arange(len(times))
         for fit in self.chosen:
-            found[rows, [self.modes.index(mode) for mode in fit.modes_at(times, e)]] += fit.weight
+            sequence = [self.modes.index(mode) for mode in fit.sequences[e]]
+            found[rows, np.take(sequence, np.searchsorted(fit.transition_times[e], times, "right"))] += fit.weight
         return found
 
     def plot(self) -> Any:
@@ -634,12 +612,11 @@ class ModeSearch(SearchRecord, Displayed):
 
 def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
     """Raise ValueError unless a search that was loaded from a file may be that of a problem."""
-    missing = [mode for mode in record.modes if mode not in problem.system.modes]
-    if missing:
-        raise ValueError(f"{path} has the mode {missing[0]!r}, which the problem lacks: it is another problem's.")
-    runs, ends = problem.experiments, list(zip(record.starts, record.ends, strict=True))
-    if name_runs(runs) != record.run_names or [(run.t0, run.end) for run in runs] != ends:
+    runs, modes, ends = problem.experiments, problem.system.modes, list(zip(record.starts, record.ends, strict=True))
+    same_runs = name_runs(runs) == record.run_names and [(run.t0, run.end) for run in runs] == ends
+    if not (same_runs and set(record.modes) <= set(modes)):
         raise ValueError(
-            f"{path} holds the runs {join_names(record.run_names)}, the problem has {join_names(name_runs(runs))}, or "
-            "their horizons differ: it is another problem's."
+            f"{path} holds the runs {join_names(record.run_names)} with the modes {join_names(record.modes)}, the "
+            f"problem has {join_names(name_runs(runs))} with {join_names(modes)}, or their horizons differ: it is "
+            "another problem's."
         )

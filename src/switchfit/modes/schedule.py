@@ -176,7 +176,7 @@ def spread(schedule: Schedule, library: Library, room: float = 1e-9) -> Schedule
         Shortest duration, as a part of the horizon, also where modes may have none.
     """
     length = schedule.tf - schedule.t0
-    least = np.array([library.min_duration(mode) for mode in schedule.sequence]) * (1 + 1e-9) + room * length
+    least = np.array([library.durations[mode] for mode in schedule.sequence]) * (1 + 1e-9) + room * length
     if least.sum() >= length:
         return None
     return schedule.replace(schedule.sequence, keep_apart(schedule.times, least, schedule.t0, schedule.tf))
@@ -198,7 +198,7 @@ def keep_off(schedule: Schedule, jump_times: FloatArray, room: float = 1e-6) -> 
 
 def space_evenly(sequence: tuple[str, ...], t0: float, tf: float, library: Library) -> Schedule | None:
     """Return the schedule whose modes last equally long beyond what they must; None if there is no room."""
-    least = np.array([library.min_duration(mode) for mode in sequence])
+    least = np.array([library.durations[mode] for mode in sequence])
     rest = (tf - t0) - least.sum()
     if rest <= 0:
         return None

@@ -1,11 +1,14 @@
-"""`find_modes`: which modes, in which order, and when."""
+"""`find_modes`: which modes, in which order, and when: starts, generators, moves, and more of them if nothing explains
+the data.
+"""
 
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,9 +28,9 @@ from switchfit.modes.criterion import (
     measure_worth,
 )
 from switchfit.modes.fitter import Fitter
-from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
-from switchfit.modes.library import build_library, check_room
+from switchfit.modes.hunt import Improver, Pool, insert_modes, propose_starts
 from switchfit.modes.result import Certifier, ModeEnding, ModeSearch, ModeStatus, ModeWarning
+from switchfit.modes.schedule import Schedule
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem, require_samples
@@ -44,7 +47,10 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.runtime.progress import show_detail, show_line
-from switchfit.strategy.library import Library
+from switchfit.strategy.beam import REPLAYS, Beam, Proposal, Quadratic, prepare
+from switchfit.strategy.known_order import Beams
+from switchfit.strategy.library import Library, Rules, build_library
+from switchfit.strategy.starts import draw_starts
 from switchfit.uncertainty.residuals import measure_quality
 
 MOST_PLACES = 1_000_000
@@ -53,6 +59,22 @@ MOST_PLACES = 1_000_000
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
 Selection and Multimodel Inference, 2002, section 2.5)."""
+
+
+Method = Literal["auto", "beam", "insertion"]
+METHODS: tuple[Method, ...] = get_args(Method)
+
+WIDER = 4
+"""Factor of the width where nothing explains the data."""
+
+PATIENCE = 3
+"""Random starts in a row that lead to nothing better, after which it is the model that is doubted."""
+
+LOWER_BY_START = 1e-3
+"""Part of the criterion by which a start has to lower it to count as better."""
+
+MORE_STARTS = 8
+"""Random starts of the parameters where nothing explains the data."""
 
 
 class SearchProgress(NamedTuple):
@@ -202,16 +224,17 @@ def find_modes(
         problem, library, first=first, last=last, successions=successions, min_duration=min_duration,
         max_switches=max_switches,
     )  # fmt: skip
-    check_room(problem, modes)
+    _check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
-    method, width = as_choice(method, "method", METHODS), _check_width(width, modes)
+    method = as_choice(method, "method", METHODS)
+    width = as_count(width, "width", at_least=len(modes.modes))  # each of which may come first
     grid = None if grid is None else _check_grid(grid, problem)
     given = None if starts is None else _check_starts(problem, starts)
-    settings = Settings(modes, chooser, base, method, width, grid, given, as_seed(seed), callback)
+    settings = Settings(modes, chooser, base, method, width, grid, given, as_seed(seed), callback, began)
     if not modes.possible_switches:
         ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=modes.max_switches)
-        return _build_result(problem, score, settings, began, None, ending=ending)
-    return _Search(problem, score, settings, began).run()
+        return _build_result(problem, score, settings, None, ending=ending)
+    return _Search(problem, score, settings).run()
 
 
 def _check_experiments(problem: Problem) -> None:
@@ -228,21 +251,24 @@ def _check_experiments(problem: Problem) -> None:
                 )
 
 
+def _check_room(problem: Problem, library: Library) -> None:
+    """Warn if the shortest durations leave no room for the largest number of switches."""
+    shortest = min(library.durations.values())
+    length = min(run.end - run.t0 for run in problem.experiments)
+    if shortest > 0 and (library.max_switches + 1) * shortest > length:
+        warnings.warn(
+            f"max_switches is {library.max_switches}, but modes that last {shortest:g} or longer leave room for "
+            f"{max(int(np.ceil(length / shortest)) - 2, 0)} switches in a horizon of {length:g}. Lower max_switches or "
+            "min_duration.",
+            stacklevel=3,
+        )
+
+
 def _check_grid(grid: Any, problem: Problem) -> float:
     length, least = as_positive(grid, "grid"), max(run.end - run.t0 for run in problem.experiments) / MOST_PLACES
     if length < least:
         raise ValueError(f"grid must be at least {least:g}, a millionth of the longest experiment; got {length:g}.")
     return length
-
-
-def _check_width(width: Any, library: Library) -> int:
-    found = as_count(width, "width", at_least=1)
-    if found < len(library.modes):
-        raise ValueError(
-            f"width is {found}, but the library has {len(library.modes)} modes, each of which may come first: give "
-            f"width={len(library.modes)} or more."
-        )
-    return found
 
 
 def _check_criterion(
@@ -261,39 +287,49 @@ def _check_criterion(
                 "it. Leave one of them out."
             )
         return "cost", score, "cost"
-    if chooser == "cost":
-        raise ValueError("criterion='cost' needs switch_cost, the cost of a switch in units of J.")
+    if chooser == "cost" or (score.sigma_known is None and not callable(chooser)):
+        needed = "switch_cost" if chooser == "cost" else "Measurements alone: a running cost is no likelihood"
+        raise ValueError(f"criterion={chooser!r} needs {needed}. Give switch_cost, the cost of a switch in units of J.")
     if score.sigma_known is None:
-        if callable(chooser):
-            return chooser, score, "cost"
-        raise ValueError(
-            f"criterion={chooser!r} needs a likelihood, and the cost has other terms than Measurements: a running cost "
-            "is no likelihood. Give switch_cost, the cost of a switch in units of J."
-        )
+        return chooser, score, "cost"
     return chooser, score, chooser if chooser in INFORMATION else "bic"
 
 
 def _check_starts(problem: Problem, given: ArrayLike) -> tuple[FloatArray, ...]:
     found = np.atleast_2d(as_array(given, "starts"))
     names = problem.theta_names[int(problem.unknowns.is_time.sum()) :]
-    if found.ndim != 2 or found.shape[1] != len(names):
+    if found.ndim != 2 or found.shape[1] != len(names) or not len(found) or not np.all(np.isfinite(found)):
         raise ValueError(
-            f"starts must have a row for each start with {len(names)} values: {join_names(names) or 'none'}; got "
-            f"shape {np.shape(given)}."
+            f"starts must have a row for each start with {len(names)} finite values: {join_names(names) or 'none'}; "
+            f"got {shorten(found)}."
         )
-    if not len(found) or not np.all(np.isfinite(found)):
-        raise ValueError(f"starts must be one or more rows of finite numbers; got {shorten(found)}.")
     return tuple(found)
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What a search is asked for; see `find_modes`. During it, sequences are compared by `criterion`."""
+
+    library: Library
+    chooser: CriterionName | Callable[[Estimate], float]
+    criterion: CriterionName
+    method: Method
+    width: int
+    grid: float | None
+    starts: tuple[FloatArray, ...] | None
+    seed: int
+    callback: Callable[[SearchProgress], object] | None
+    began: float
+
+
 def _build_result(
-    problem: Problem, score: Score, settings: Settings, began: float, fitter: Fitter | None, **found: Any
+    problem: Problem, score: Score, settings: Settings, fitter: Fitter | None, **found: Any
 ) -> ModeSearch:
     """Return the result of a search with what was found, fields of `ModeSearch`."""
     runs, library, chooser = problem.experiments, settings.library, settings.chooser
     return ModeSearch(
         modes=library.modes,
-        durations=tuple(library.min_duration(mode) for mode in library.modes),
+        durations=tuple(library.durations[mode] for mode in library.modes),
         max_switches=library.max_switches,
         criterion=chooser if isinstance(chooser, str) else getattr(chooser, "__name__", "criterion"),
         parameter_names=() if fitter is None else fitter.parameter_names,
@@ -301,12 +337,10 @@ def _build_result(
         time_units=tuple(run.time_unit for run in runs),
         starts=tuple(run.t0 for run in runs),
         ends=tuple(run.end for run in runs),
-        values=score.values,
         sigma_known=score.sigma_known,
-        switch_cost=score.switch_cost,
         fits=0 if fitter is None else fitter.fits,
         evaluations=0 if fitter is None else fitter.evaluations,
-        seconds=time.perf_counter() - began,
+        seconds=time.perf_counter() - settings.began,
         problem=problem,
         **found,
     )
@@ -315,10 +349,12 @@ def _build_result(
 class _Search:
     """One call of `find_modes`."""
 
-    def __init__(self, problem: Problem, score: Score, settings: Settings, began: float) -> None:
-        self.problem, self.score, self.settings, self.began = problem, score, settings, began
-        self.hunt = Hunt(problem, score, settings, self._report)
-        self.pool, self.fitter = self.hunt.pool, self.hunt.fitter
+    def __init__(self, problem: Problem, score: Score, settings: Settings) -> None:
+        self.problem, self.score, self.settings = problem, score, settings
+        # Programs have room for the largest number of switches that a sequence has.
+        self.library = replace(settings.library, max_switches=max(settings.library.possible_switches))
+        self.fitter, self.pool = Fitter(problem, self.library), Pool(score, settings.criterion)
+        self.improver = Improver(self.fitter, self.pool, self._report)
         self.certifier = Certifier(self.fitter.problem, problem, settings.library)
 
     def _report(self, stage: str) -> None:
@@ -337,25 +373,89 @@ class _Search:
         untraced, interrupted = list[ModeWarning](), False
         with show_line("search for the mode sequence"):
             try:
-                self.hunt.search()
+                self._search()
                 if self._is_explained() is False:
                     found = self._assume_other_noise()
                     if found is not None:
                         return found
-                    self.hunt.widen()
-                self.hunt.improver.fill_numbers()
+                    self._widen()
+                self.improver.fill_numbers()
                 if self._discount():
-                    self.hunt.improver.improve()
-                    self.hunt.improver.fill_numbers()
+                    self.improver.improve()
+                    self.improver.fill_numbers()
                 if self.pool.is_explained() is not False and self.score.sigma_known is not None:
-                    untraced = look_around(self.hunt.improver)
+                    untraced = look_around(self.improver)
             except (KeyboardInterrupt, _StoppedError):
                 interrupted = True
                 if self.pool.best is None:
                     raise KeyboardInterrupt from None
-            judge = Judge(self.hunt, self.certifier, interrupted, untraced)
-            given = self.problem, self.score, self.settings, self.began, self.fitter
-            return _build_result(*given, **judge.conclude())
+            judge = Judge(self.pool, self.fitter, self.certifier, self.settings.chooser, interrupted, untraced)
+            return _build_result(self.problem, self.score, self.settings, self.fitter, **judge.conclude())
+
+    def _search(self) -> None:
+        """Search from all starts of the parameters, or until the data are explained."""
+        given = self.settings.starts
+        if any(len(run.mode_sequence) > 1 for run in self.problem.experiments):
+            self._fit_given()
+        for start in propose_starts(self.fitter) if given is None else given:
+            self._search_from(start, self.settings.width)
+            if given is None and self.pool.is_explained():
+                break
+        if self.pool.best is None:
+            self._fit_given()
+
+    def _widen(self) -> None:
+        """Search from more starts, with more hypotheses."""
+        starts = list(draw_starts(self.fitter.problem, 1 + MORE_STARTS, self.settings.seed)[1:, self.fitter.first :])
+        best, waited = self.pool.best, 0
+        for start in starts if best is None else [best.parameters, *starts]:
+            before = self.pool.lowest
+            self._search_from(start, WIDER * self.settings.width)
+            waited = 0 if self.pool.lowest < before - LOWER_BY_START * abs(before) else waited + 1
+            if self.pool.is_explained() or waited == PATIENCE:
+                break
+
+    def _fit_given(self) -> None:
+        """Fit the sequence that the problem was given."""
+        self.improver.polish(self._list_given(), self.fitter.start, "fit of the given sequence")
+
+    def _list_given(self) -> list[Schedule]:
+        """Return the schedule that each experiment was given; one of the library if that is not admitted."""
+        pairs = zip(self.problem.experiments, self.fitter.problem.experiments, strict=True)
+        runs = [given if self.library.admits(given.mode_sequence) else own for given, own in pairs]
+        return [Schedule(tuple(run.mode_sequence), run.initial_times, run.t0, run.end) for run in runs]
+
+    def _search_from(self, start: FloatArray, width: int) -> None:
+        """Search with a generator at a start (M,) of the parameters, then move."""
+        runs = self._prepare_beams()
+        penalty = self.score.measure_penalty(self.settings.criterion)
+
+        def follow_run(e: int, q: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
+            return runs[e].run(Rules.of(self.library, runs[e].modes), q, penalty, width, REPLAYS, evidence)
+
+        if runs:
+            self._report("beam")
+            beams = Beams(self.fitter.problem, [each.own for each in runs])
+            self.improver.polish_proposals(beams.join(*beams.follow(start, follow_run)))
+        else:
+            self._report("insertion")
+            best = self.pool.best
+            insert_modes(self.improver, self._list_given() if best is None else best.schedules, start)
+        self.improver.improve()
+
+    def _prepare_beams(self) -> list[Beam]:
+        """Return the beams of all runs; none for other costs than data, and where a beam cannot follow an experiment,
+        unless it is asked for.
+        """
+        method, problem = self.settings.method, self.fitter.problem
+        if method == "insertion" or (method == "auto" and self.score.sigma_known is None):
+            return []
+        try:
+            return [prepare(problem, e, self.library, self.settings.grid) for e in range(len(problem.experiments))]
+        except ValueError:
+            if method != "auto":
+                raise
+            return []
 
     def _assume_other_noise(self) -> ModeSearch | None:
         """Search with a robust loss, or with another sigma, if that is what the residuals ask for.
@@ -372,7 +472,7 @@ class _Search:
             return None
         problem = assume(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)
-        found = _Search(problem, score, self.settings, self.began).run()
+        found = _Search(problem, score, self.settings).run()
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None
         warnings, ending = found.warnings, found.ending

@@ -26,10 +26,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.library import build_library
-from switchfit.online.saved import Journal, Kept, build_kept_problem, pack, read, read_journal, unpack
-from switchfit.online.state import Alarm, Best, Now, OnlineStatus, calibrate, hold, read_sigma
-from switchfit.online.tracker import Feed, Settings, Start, StoppedError, Tracker, invert
+from switchfit.online.state import Alarm, Best, Now, OnlineStatus, build_kept_problem, calibrate, hold, read_sigma
+from switchfit.online.tracker import (
+    Feed,
+    Settings,
+    Start,
+    StoppedError,
+    Tracker,
+    append_update,
+    drop_artificial,
+    invert,
+    read,
+    read_journal,
+    shift_cubic,
+)
 from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
@@ -43,13 +53,14 @@ from switchfit.problem.validation import (
     as_path,
     as_positive,
     join_names,
+    require_known,
     shorten,
 )
 from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
 from switchfit.strategy.choice import estimate
-from switchfit.strategy.library import Rules, Sequences
+from switchfit.strategy.library import Rules, Sequences, build_library
 
 THRESHOLD = 12.0
 """Of 200 drives of 20 s without a change 5 % exceed it."""
@@ -165,8 +176,10 @@ class OnlineEstimator:
         walks = _read_table(drift, "drift", "a parameter and the standard deviation of its random walk: {'mu': 0.01}")
         self._sensors = _check_problem(problem)
         run = problem.experiments[0]
-        given = {"successions": successions, "min_duration": min_duration, "max_switches": births}
+        given: dict[str, Any] = {"successions": successions, "min_duration": min_duration, "max_switches": births}
         library = build_library(problem, first=run.mode_sequence[0], **given)
+        self._given_settings = given | {"renews": renews, "drift": drift, "window": window, "width": width}
+        self._given_settings["capacity"] = self.capacity
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
         entries, slots = problem.structures[0].n if window is not None or renewed else 0, max(births, 1)
@@ -176,40 +189,31 @@ class OnlineEstimator:
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
-        changing = {"renews": renews, "drift": drift}
-        rooms = {"window": window, "capacity": self.capacity, "width": width}
-        self._given_settings: dict[str, Any] = given | changing | rooms
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
-        unknown = next((mode for mode in renewed if mode not in problem.system.modes), None)
-        if unknown is not None:
-            known = join_names(problem.system.modes)
-            raise ValueError(f"renews has {shorten(unknown)}, which is no mode of the system; there are: {known}.")
+        require_known(renewed, "renews", problem.system.modes)
         self._renews = {mode: self._find_places(names, f"renews of {mode!r}") for mode, names in renewed.items()}
-        self._walks = [
-            (name, self._find_places(name, "drift"), as_positive(walks[name], f"drift of {name}")) for name in walks
-        ]
+        self._walks = np.zeros(self._beam.into.shape[1])  # variances of random walks after one time unit
+        for name in walks:
+            self._find_places(name, "drift")
+            self._walks[self._slices[name]] = as_positive(walks[name], f"drift of {name}") ** 2
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
-        self._journal: Journal | None = None
+        self._journal: Path | None = None
         self.reset()
         if false_alarms is not None:
             self.set_threshold(calibrate(self, false_alarms).threshold)
 
     def _find_places(self, names: Any, what: str) -> NDArray[np.intp]:
         """Return the positions of free parameters, a name or several, among the D unknowns of the engine."""
-        beam, unknowns = self._beam, self.problem.unknowns
-        offset, found = int(unknowns.is_time.sum()), []
         chosen = as_names((names,) if isinstance(names, str) else names, what, "the name of a parameter, or several")
         if not chosen:
             raise ValueError(f"{what} is empty: name a parameter, or leave it out.")
         for name in chosen:
-            of = unknowns.parameters.get(name)
-            if of is None:
-                known = join_names(unknowns.parameters)
+            if name not in self._slices:
+                known = join_names(self._slices)
                 raise ValueError(f"{what} has {shorten(name)}, which is no free parameter; there are: {known}.")
-            own = beam.own[beam.places] + offset
-            found.append(beam.births + np.flatnonzero((own >= of.start) & (own < of.stop)))
-        return np.concatenate(found)
+        own = np.r_[tuple(self._slices[name] for name in chosen)]
+        return np.flatnonzero(self._beam.into[:, own].any(axis=1))
 
     def build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
         """Return an estimator of another problem with the same settings, without a budget.
@@ -325,7 +329,7 @@ class OnlineEstimator:
             raise StoppedError(self._stopped)
         samples = self._read(y)
         if self._journal is not None:
-            self._journal.write(t, y, u)
+            append_update(self._journal, t, samples, u)
         before = None if self.now is None else self._tracker.at(self._feed.count - 1)
         changed = self._place(t, samples, u)
         try:
@@ -364,13 +368,9 @@ class OnlineEstimator:
         usual = self._costs[what]
         self._costs[what] = 0.8 * usual + 0.2 * (clock.perf_counter() - began) if done else 0.95 * usual
 
-    def _read(self, y: Any) -> list[tuple[int, FloatArray, FloatArray]]:
-        """Return the samples of an update: the place of the sensor, its values (q,), and their weights, both zero where
-        one is missing.
-        """
-        if y is None:
-            return []
-        if not isinstance(y, Mapping):
+    def _read(self, y: Any) -> dict[int, FloatArray]:
+        """Return the values (q,) of the sensors of an update by their places, NaN where one is missing."""
+        if y is not None and not isinstance(y, Mapping):
             if len(self._sensors) > 1:
                 raise ValueError(
                     f"there are {len(self._sensors)} sensors: give y as a dict, by the names of channels, or by the "
@@ -378,39 +378,32 @@ class OnlineEstimator:
                 )
             y = {0: y}
         found: dict[int, FloatArray] = {}
-        for key, value in y.items():
-            if not isinstance(key, str):
-                k = as_count(key, "the position of a sensor")
-                if k >= len(self._sensors):
-                    raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
-                found[k] = as_array(value, f"y of sensor {k}").reshape(-1)
-                if found[k].size != len(self._weights[k]):
-                    raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
+        for key, value in ({} if y is None else y).items():
+            if isinstance(key, str):
+                k = next((k for k, item in enumerate(self._sensors) if key in (item.names or ())), -1)
+                if k < 0:
+                    known = ", ".join(name for item in self._sensors for name in item.names or ()) or "none has a name"
+                    raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
+                row = found.setdefault(k, np.full(len(self._weights[k]), np.nan))
+                row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
                 continue
-            k = next((k for k, item in enumerate(self._sensors) if key in (item.names or ())), -1)
-            if k < 0:
-                known = ", ".join(name for item in self._sensors for name in item.names or ()) or "none has a name"
-                raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
-            row = found.setdefault(k, np.full(len(self._weights[k]), np.nan))
-            row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
-        samples = []
-        for k, row in sorted(found.items()):
-            there = np.isfinite(row)
-            if there.all():
-                samples.append((k, row, self._weights[k]))
-                continue
+            k = as_count(key, "the position of a sensor")
+            if k >= len(self._sensors):
+                raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
+            found[k] = as_array(value, f"y of sensor {k}").reshape(-1)
+            if found[k].size != len(self._weights[k]):
+                raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
+        for row in found.values():
             if np.isinf(row).any():
                 raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
-            if there.any():
-                samples.append((k, np.where(there, row, 0.0), np.where(there, self._weights[k], 0.0)))
-        return samples
+        return {k: row for k, row in found.items() if np.isfinite(row).any()}
 
-    def _place(self, t: float, samples: list[tuple[int, FloatArray, FloatArray]], u: Any) -> int:
+    def _place(self, t: float, samples: dict[int, FloatArray], u: Any) -> int:
         """Put the samples of an update into the log, and return the first node that is to be computed."""
         feed, tracker = self._feed, self._tracker
-        seen = [t - float(self._sensors[k].delay) for k, *_ in samples]
+        seen = [(t - float(self._sensors[k].delay), k) for k in samples]
         begin = float(feed.nodes[tracker.first])
-        for time, k in [(t, None), *zip(seen, (k for k, *_ in samples), strict=True)]:
+        for time, k in [(t, None), *seen]:
             node = feed.find(time)
             if time < begin or (time == begin and tracker.start is not None):
                 raise ValueError(
@@ -431,20 +424,16 @@ class OnlineEstimator:
                 node = feed.append(time)
                 self._write_signal(node - 1, held)
         elif feed.nodes[feed.find(t)] != t:
-            changed = min(changed, self._insert(t))
-        for (k, row, weights), time in zip(samples, seen, strict=True):
+            changed = min(changed, feed.insert(t))
+        for time, k in seen:
             node = feed.find(time)
             if feed.nodes[node] != time:
-                node = self._insert(time)
-            feed.add(k, node, row, weights)
-            self._values += int(np.count_nonzero(weights))
+                node = feed.insert(time)
+            there = np.isfinite(samples[k])
+            feed.add(k, node, np.where(there, samples[k], 0.0), np.where(there, self._weights[k], 0.0))
+            self._values += int(there.sum())
             changed = min(changed, node)
         return changed
-
-    def _insert(self, time: float) -> int:
-        node = self._feed.find(time) + 1
-        self._feed.insert(node, time)
-        return node
 
     def _list_times(self, begin: float, end: float, count: int, held: FloatArray | None) -> list[float]:
         """Return `end`, and times before it: evenly spaced ones, and the knots of inputs that are not held."""
@@ -478,15 +467,14 @@ class OnlineEstimator:
         whole: PiecewisePolynomial | None = self._signal
         if whole is None:
             return
-        into, (begin, end) = self._feed.signal(cell), self._feed.nodes[cell : cell + 2].tolist()
+        into, (begin, end) = self._feed.signals[cell], self._feed.nodes[cell : cell + 2].tolist()
         if held is not None:
             into[0], into[1:] = held, 0.0
             return
         if end > whole.knots[-1] and whole.coefficients[-1, 1:].any():
             raise ValueError(f"the inputs of the problem end at {whole.knots[-1]:.9g}: give u from then on.")
         k = int(whole.interval(np.array([0.5 * (begin + end)]))[0])
-        s, (c0, c1, c2, c3) = begin - whole.knots[k], whole.coefficients[k]
-        into[:] = c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3
+        into[:] = shift_cubic(whole.coefficients[k], begin - whole.knots[k])
 
     def _slide(self) -> None:
         """Let nodes leave the window."""
@@ -494,10 +482,10 @@ class OnlineEstimator:
         while tracker.first + 2 < feed.count and feed.nodes[tracker.first + 1] < feed.last - self.window:
             tracker.leave()
         begins = float(feed.nodes[tracker.first])
-        if self._walks and begins - self._renewed >= DRIFT_AFTER * self.window:
-            elapsed = begins - self._renewed
-            variances = [np.full(len(places), elapsed * sd**2) for _, places, sd in self._walks]
-            tracker.renew(np.concatenate([places for _, places, _ in self._walks]), np.concatenate(variances))
+        if self._walks.any() and begins - self._renewed >= DRIFT_AFTER * self.window:
+            variances = self._beam.into @ self._walks * (begins - self._renewed)
+            places = np.flatnonzero(variances)
+            tracker.renew(places, variances[places])
             self._renewed = begins
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
             tracker.drop_nodes()
@@ -534,7 +522,8 @@ class OnlineEstimator:
         """
         if self.now is None or not self._values:
             raise ValueError("nothing has been measured yet: give samples to `update` first.")
-        return estimate(build_kept_problem(self.problem, self._collect(self.now)), **{"strategy": "local", **settings})
+        kept = build_kept_problem(self.problem, self.now, *self._collect(self.now), self._describe_arrival())
+        return estimate(kept, **{"strategy": "local", **settings})
 
     # --- files -----------------------------------------------------------------------------------------------------
 
@@ -569,12 +558,12 @@ class OnlineEstimator:
         """
         if self._stopped is not None:
             raise StoppedError(self._stopped)
-        names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
+        names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold", "spacing")
         others = {name: getattr(self, name) for name in names}
-        others |= {"held": None if self.held is None else self.held.tolist(), "_spacing": self.spacing}
-        write_atomically(pack(self._tracker, others), as_path(path, "path"))
+        others["held"] = None if self.held is None else self.held.tolist()
+        write_atomically(self._tracker.pack(others), as_path(path, "path"))
         if self._journal is not None:
-            self._journal.clear()
+            write_atomically(b"", self._journal)  # the saved state has what was in it
 
     def keep_journal(self, path: str | Path) -> None:
         """Write each update to a file before it is done, so that nothing is lost if the process is killed.
@@ -601,9 +590,12 @@ class OnlineEstimator:
         ...     online.keep_journal(Path(folder) / "journal")
         ...     now = online.update(0.1, [0.5])
         ...     (Path(folder) / "journal").read_text()
-        '{"t": 0.1, "y": [0.5], "u": null}\\n'
+        '{"t": 0.1, "y": {"0": [0.5]}, "u": null}\\n'
         """
-        self._journal = Journal(as_path(path, "path"))
+        self._journal = as_path(path, "path")
+        written = self._journal.read_bytes() if self._journal.exists() else b""
+        with self._journal.open("ab") as file:
+            file.truncate(written.rfind(b"\n") + 1)  # without a line that was cut off
 
     @classmethod
     def load(
@@ -648,24 +640,22 @@ class OnlineEstimator:
         file = as_path(path, "path")
         numbers, arrays = read(file)
         online = cls(problem, **settings, threshold=numbers["threshold"])
-        online.spacing, online._values = numbers["_spacing"], numbers["_values"]
+        online.spacing, online._values, online._renewed = (numbers[n] for n in ("spacing", "_values", "_renewed"))
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
         online._tracker.step(0, births=False)  # gives the engine its settings
-        unpack(online._tracker, numbers, arrays, file)
+        online._tracker.unpack(numbers, arrays, file)
         if online._tracker.has(online._feed.count - 1):  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
-        online._renewed = numbers["_renewed"]
-        online._fitted, online._lost = tuple(numbers["_fitted"]), numbers["_lost"]
-        online._recent = [tuple(each) for each in numbers["_recent"]]
+        online._fitted, online._lost, online._recent = (numbers[name] for name in ("_fitted", "_lost", "_recent"))
         for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
             with suppress(ValueError):  # the update that was refused then
                 online.update(t, y, u=u)
         return online
 
-    def _collect(self, now: Now) -> Kept:
-        """Return what is kept."""
+    def _collect(self, now: Now) -> tuple[list[Measurements], dict[str, Any]]:
+        """Return what has been measured since the start of the window, and what else the run has since then."""
         tracker, feed, first = self._tracker, self._feed, self._tracker.first
         data = []
         for k, item in enumerate(self._sensors):
@@ -675,32 +665,23 @@ class OnlineEstimator:
             if np.isfinite(shown).any():
                 sigma = self._weights[k] ** -0.5
                 data.append(replace(item, times=times[there] + item.delay, values=shown, sigma=sigma))
-        inputs, run = None, self.problem.experiments[0]
-        if run.inputs is not None:
-            inputs = run.inputs
-            if self.held is not None:
-                held = np.array([feed.signal(cell)[0] for cell in range(first, feed.count - 1)])
-                inputs = hold(run.inputs, feed.nodes[first:-1].copy(), held)
-        past, horizon = len(tracker.left), (float(feed.nodes[first]), feed.last)
+        inputs = self.problem.experiments[0].inputs
+        if inputs is not None and self.held is not None:
+            inputs = hold(inputs, feed.nodes[first:-1].copy(), feed.signals[first : feed.count - 1, 0].copy())
+        past, t0 = len(tracker.left), float(feed.nodes[first])
         sequence, times = now.mode_sequence[past:], now.transition_times[past:]
-        return Kept(data, inputs, horizon, sequence, times, now.best.theta, self._describe_arrival())
+        given = {"inputs": inputs, "mode_sequence": sequence, "transition_times": times}
+        return data, given | {"t0": t0, "tf": feed.last}
 
     def _describe_arrival(self) -> Start | None:
         start, A, S = self._tracker.start, self._settings.entries, self._beam.births
         if start is None:
             return None
         acting = np.flatnonzero((start.tangent[:, :A] != 0).any(0))
-        into = self._into[:, np.concatenate([acting, np.arange(S, self._into.shape[1])])]
+        into = self._beam.into
+        into = into[:, np.concatenate([acting, np.arange(S, into.shape[1])])]
         matrix, theta = into.T @ start.matrix @ into, self._read_theta(start.moved)
         return Start(theta, start.cost, start.gradient @ into, matrix, start.state, start.tangent @ into)
-
-    @cached_property
-    def _into(self) -> FloatArray:
-        """How the D unknowns of the engine follow from its times and the problem's U parameters: (D, S + U)."""
-        beam, S, U = self._beam, self._beam.births, len(self._beam.own)
-        into = np.zeros((S + len(beam.places), S + U))  # two names of the model may refer to one parameter
-        into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
-        return into
 
     @cached_property
     def _slices(self) -> dict[str, slice]:
@@ -731,7 +712,7 @@ class OnlineEstimator:
         own, count = kept.take(slice(b, b + 1)), int(kept.switches[b])
         modes, times = own.modes[0, : count + 1], tracker.times(own, found.moved[b : b + 1])[0, :count]
         best = self._describe(count, found, b)
-        walked = self._measure_walks(best) if self._walks else 0.0
+        walked = self._measure_walks(best) if self._walks.any() else 0.0
         past = tuple(tracker.left)
         alarm, retracted = self._declare(t, modes, times, statistic, best)
         if alarm is not None and alarm.mode in self._renews:
@@ -824,10 +805,10 @@ class OnlineEstimator:
         """Return the linearised cost of a hypothesis with so many times in the window, in these and the problem's
         parameters.
         """
-        of_engine, A = (found.matrices[b].copy(), found.tangents[b].copy()), self._settings.entries
-        theta, times = self._read_theta(found.moved[b]), slice(A, A + count)
-        artificial = self._tracker.artificial
-        return Best(theta, found.states[b].copy(), times, self._slices, of_engine, artificial, self._into)
+        A, into = self._settings.entries, self._beam.into
+        matrix = into.T @ drop_artificial(found.matrices[b], self._tracker.artificial) @ into
+        state, tangent = found.states[b].copy(), found.tangents[b] @ into
+        return Best(self._read_theta(found.moved[b]), state, tangent, slice(A, A + count), self._slices, matrix)
 
     def _measure_walks(self, best: Best) -> FloatArray:
         """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).
@@ -835,25 +816,19 @@ class OnlineEstimator:
         The estimate misses what comes at a time s by the share W(s) of the information that there was before. That
         grows from its value W at the start of the window to 1; evenly, the mean of W(s)^2 is ``(1 + W + W^2) / 3``.
         """
-        start, matrix, found = self._tracker.start, best.matrix, np.zeros(len(best.matrix))
-        begins = float(self._feed.nodes[self._tracker.first])
-        share = np.zeros(len(matrix))
+        start, W, into = self._tracker.start, np.zeros(len(self._walks)), self._beam.into
         if start is not None:
-            before = np.diag(invert(self._into.T @ start.matrix @ self._into))
-            np.divide(np.diag(invert(matrix)), before, out=share, where=np.isfinite(before))
-        for name, _, sd in self._walks:
-            W = np.minimum(share[best.parameters[name]], 1.0)
-            found[best.parameters[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
-        return found
+            before = np.diag(invert(into.T @ start.matrix @ into))
+            np.divide(np.diag(invert(best.matrix)), before, out=W, where=np.isfinite(before))
+            W = np.minimum(W, 1.0)
+        return self._walks * (self._feed.last - self._feed.nodes[self._tracker.first]) * (1 + W + W**2) / 3
 
     def _read_parameters(self, best: Best) -> dict[str, FloatArray]:
         """Return the values of all parameters, the fixed ones too."""
-        found = {}
-        for name, parameter in self.problem.parameters.items():
-            given, of = np.asarray(parameter.value, dtype=np.float64), best.parameters.get(name)
-            S = self._beam.births
-            found[name] = given if of is None else best.theta[of.start - S : of.stop - S].reshape(given.shape)
-        return found
+        given = {name: np.asarray(each.value, dtype=np.float64) for name, each in self.problem.parameters.items()}
+        S = self._beam.births
+        found = {name: best.theta[of.start - S : of.stop - S] for name, of in best.parameters.items()}
+        return given | {name: value.reshape(given[name].shape) for name, value in found.items()}
 
 
 @lru_cache
@@ -871,18 +846,20 @@ def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:
 
 def _check_problem(problem: Problem) -> list[Measurements]:
     """Return the sensors of a problem that can be estimated online; ValueError for others."""
-    if len(problem.experiments) != 1:
-        raise ValueError(f"an online estimator follows one run; the problem has {len(problem.experiments)}.")
     run = problem.experiments[0]
     sensors = list(select_kind(run.data, Measurements))
-    if len(sensors) < len(run.data):
-        raise ValueError("an online estimator takes samples alone: data of the experiment other than sf.Measurements.")
-    if run.jumps:
-        raise ValueError("an online estimator takes no jumps at known times; the experiment has some.")
-    for item in sensors:
-        if item.sigma is None or item.sigma_names:
-            what = "is left out" if item.sigma is None else "is a parameter"
-            raise ValueError(f"sigma {what}: an online estimator needs a number to tell a change of mode from noise.")
-        if isinstance(item.delay, str):
-            raise ValueError(f"the delay {item.delay!r} is a parameter: an online estimator needs a number.")
+    wrong = {
+        f"{len(problem.experiments)} runs": len(problem.experiments) > 1,
+        "other data": len(sensors) < len(run.data),
+        "jumps at known times": bool(run.jumps),
+        "a sigma that is left out": any(item.sigma is None for item in sensors),
+        "a sigma that is a parameter": any(item.sigma_names for item in sensors),
+        "a delay that is a parameter": any(isinstance(item.delay, str) for item in sensors),
+    }
+    found = [what for what, is_there in wrong.items() if is_there]
+    if found:
+        raise ValueError(
+            "an online estimator takes one run of sf.Measurements whose sigma and delay are numbers, which tell a "
+            f"change of mode from noise; the problem has {join_names(found)}."
+        )
     return sensors

@@ -1,25 +1,28 @@
 """What an online estimator says after each sample.
 
 The threshold for a rate of false alarms, by simulation of a system whose mode does not change.
+
+The problem of the samples that an online estimator keeps, for `sf.estimate`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import compare
-from switchfit.online.tracker import drop_artificial, invert
+from switchfit.online.tracker import Start, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
+from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_count, as_number, as_positive, shorten
+from switchfit.problem.validation import as_count, as_number, as_positive, shorten
 from switchfit.runtime.presentation import format_line
 
 
@@ -84,39 +87,24 @@ class Alarm(NamedTuple):
     statistic: float
 
 
-@dataclass(frozen=True, eq=False)
-class Best:
+class Best(NamedTuple):
     """The linearised cost of the best hypothesis, and its state, in D unknowns.
 
     Attributes
     ----------
     theta : (U,), parameters and initial states in the order of the problem's theta
-    state : (n,)
+    state, tangent : (n,), (n, D), the state and its derivatives
     times : slice, of the transition times that are not past
     parameters : dict of str to slice, of the free parameters
-    of_engine, artificial : ((E, E), (n, E)), (E,)
-        Second derivatives and tangent in the engine's E unknowns, and what the diagonal has that is no knowledge.
-    into : (E, D)
-        How these unknowns follow from the D.
+    matrix : (D, D), second derivatives of the cost
     """
 
     theta: FloatArray
     state: FloatArray
+    tangent: FloatArray
     times: slice
     parameters: dict[str, slice]
-    of_engine: tuple[FloatArray, FloatArray]
-    artificial: FloatArray
-    into: FloatArray
-
-    @cached_property
-    def matrix(self) -> FloatArray:
-        """Second derivatives of the cost, (D, D)."""
-        return self.into.T @ drop_artificial(self.of_engine[0], self.artificial) @ self.into
-
-    @property
-    def tangent(self) -> FloatArray:
-        """Derivatives of the state, (n, D)."""
-        return self.of_engine[1] @ self.into
+    matrix: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +266,6 @@ def calibrate(
     runs: int = 100,
     correlation: float = 0.0,
     seed: int = 0,
-    callback: Callable[[int, float], object] | None = None,
 ) -> Calibration:
     """Find the threshold for a rate of false alarms.
 
@@ -300,8 +287,6 @@ def calibrate(
     correlation : float
         Of the noise from one sample to the next: a sensor whose noise is correlated raises more alarms.
     seed : int
-    callback : callable, optional
-        ``callback(run, maximum)`` after each run; it stops if that returns true, with the runs so far.
 
     Returns
     -------
@@ -335,14 +320,12 @@ def calibrate(
     phi = as_number(correlation, "correlation")
     if not 0 <= phi < 1:
         raise ValueError(f"correlation must be at least 0 and below 1; got {phi}.")
-    if callback is not None:
-        as_callable(callback, "callback", "a function callback(run, maximum)", arguments=2)
     problem = build_quiet_problem(online, length)
     theta = problem.initial_theta
     comparisons = compare(Evaluator(problem, theta), theta)[1][0]
     trial = online.build_like(problem, NEVER)
     rng, maxima = np.random.default_rng(seed), []
-    for run in range(runs):
+    for _ in range(runs):
         trial.reset()
         noisy = []
         for item, comparison in zip(problem.experiments[0].data, comparisons, strict=True):
@@ -356,8 +339,6 @@ def calibrate(
             if now.status is not OnlineStatus.WAITING:
                 largest = max(largest, now.statistic)
         maxima.append(largest)
-        if callback is not None and callback(run, largest):
-            break
     found = np.array(maxima)
     middle = float(np.median(found))
     tail = float((found[found > middle] - middle).mean()) / EXCESS if (found > middle).any() else 0.0
@@ -400,11 +381,10 @@ def build_quiet_problem(online: Any, length: float) -> Problem:
     changes: dict[str, Any] = {"mode_sequence": run.mode_sequence[:1]}
     if online.held is not None and run.inputs is not None:
         changes["inputs"] = hold(run.inputs, np.array([t0]), online.held[None])
-    parameters = dict(problem.parameters)
+    parameters = problem.parameters
     if now is not None:
         changes |= {"mode_sequence": (now.mode,), "initial_state": now.state}
-        for name in problem.unknowns.parameters:
-            parameters[name] = replace(parameters[name], value=now.parameters[name])
+        parameters = {name: replace(each, value=now.parameters[name]) for name, each in parameters.items()}
     quiet = replace(run, data=tuple(data), transition_times=(), t0=t0, tf=t0 + length, **changes)
     return replace(problem, experiments=(quiet,), parameters=parameters)
 
@@ -413,3 +393,87 @@ def hold(inputs: Input, times: FloatArray, values: FloatArray) -> Input:
     """Return inputs like those of an experiment that hold values (K, q) from times (K,) on."""
     names = inputs.names
     return Input(times, dict(zip(names, values.T, strict=True)) if names else values.reshape(-1, *inputs.shape))
+
+
+ENTRIES, STATES = "state at the start of the window", "initial state"
+"""Names of the parameters that stand for what is before a window."""
+
+NO_EFFECT = 1e-12
+"""Part of the largest second derivative below which one counts as none."""
+
+
+def build_kept_problem(
+    problem: Problem, now: Now, data: list[Measurements], given: dict[str, Any], arrival: Start | None
+) -> Problem:
+    """Return the problem of what has been measured since the start of the window, which begins at what was found.
+
+    Parameters
+    ----------
+    problem : Problem
+    now : Now
+    data : list of Measurements
+    given : dict of str to value
+        What else the run has since then: its inputs, its modes and their times, t0 and tf.
+    arrival : Start or None, if nothing has left the window
+        In U parameters and A entries for the state, the parameters being where it has moved.
+    """
+    run, states, offset = problem.experiments[0], problem.unknowns.initial_states[0], problem.unknowns.is_time.sum()
+    own = problem.system.initial_state if run.initial_state is None else run.initial_state
+    parameters = {name: replace(each, value=now.parameters[name]) for name, each in problem.parameters.items()}
+    initial: Any = own
+    if arrival is not None:
+        initial, sensor = _describe_arrival(problem, arrival, given["t0"])
+        data = [sensor, *data]
+        known = {ENTRIES: len(arrival.gradient) - len(arrival.moved), STATES: int((states >= 0).sum())}
+        parameters = {name: replace(parameter, prior=None) for name, parameter in parameters.items()}
+        parameters |= {name: Parameter(np.zeros(size)) for name, size in known.items() if size}
+    elif (states >= 0).any():
+        values = [float(now.best.theta[place - offset]) if place >= 0 else None for place in states.tolist()]
+        initial = [
+            entry if value is None else replace(entry, value=value) for entry, value in zip(own, values, strict=True)
+        ]
+    times = np.clip(given["transition_times"], given["t0"], given["tf"]).tolist()
+    sequence, times = _drop_empty_modes(given["mode_sequence"], times, given["t0"], given["tf"])
+    begins = given | {"mode_sequence": sequence, "transition_times": times, "initial_state": initial}
+    return replace(problem, experiments=(replace(run, data=tuple(data), **begins),), parameters=parameters)
+
+
+def _drop_empty_modes(
+    sequence: tuple[str, ...], times: list[float], t0: float, tf: float
+) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Return a sequence and its times without modes of no length, which a wrong model or outliers make."""
+    names: list[str] = []
+    begins: list[float] = []
+    for name, begin, end in zip(sequence, [t0, *times], [*times, tf], strict=True):
+        if end > begin and names[-1:] != [name]:
+            names.append(name)
+            begins.append(begin)
+    return tuple(names), tuple(begins[1:])
+
+
+def _describe_arrival(problem: Problem, arrival: Start, t0: float) -> tuple[Any, Measurements]:
+    """Return the initial state as a function of the parameters, and the cost of the samples before as a measurement.
+
+    With ``H = R'R`` and ``g = R's`` the cost is ``|R d + s|^2 / 2`` but for a constant: R d is measured to be -s.
+    """
+    unknowns, run = problem.unknowns, problem.experiments[0]
+    values, vectors = np.linalg.eigh(arrival.matrix)
+    there = values > NO_EFFECT * values[-1]
+    R = (vectors[:, there] * np.sqrt(values[there])).T
+    s = (vectors[:, there] / np.sqrt(values[there])).T @ arrival.gradient
+    own = {problem_name: name for name, problem_name in run.parameter_map.items()}
+    names = [own.get(name, name) for name in unknowns.parameters]
+    has_entries = len(arrival.gradient) > len(arrival.moved)
+    if (unknowns.initial_states[0] >= 0).any():
+        names.append(STATES)
+
+    def move(p: Any) -> Any:
+        parameters = [jnp.ravel(jnp.asarray(p[name])) for name in names]
+        entries = [p[ENTRIES]] if has_entries else []
+        return jnp.concatenate([*entries, jnp.concatenate([*parameters, jnp.zeros(0)]) - arrival.moved])
+
+    def begin(p: Any) -> Any:
+        return arrival.state + arrival.tangent @ move(p)
+
+    sensor = Measurements([t0], [-s], observe=lambda t, x, p: R @ move(p), sigma=1.0)
+    return begin, sensor

@@ -11,15 +11,20 @@ The start of a window: a state whose uncertainty is that of unknowns that the sa
 
 Samples before the window stay as J, g and H, the value, gradient and Gauss-Newton matrix of their cost (the arrival
 cost), in the unknowns ``d = (e, tau, p)``: A = n entries e that shift the state at the start of the window, the
-transition times in the window, and the parameters, ``x = x_w + Z d``. A transition time that leaves the window becomes
-a further entry of e; as n + 1 directions cannot all move n entries of the state, one combination has no effect on the
-state, and the cost takes its minimum along it (the Schur complement).
+transition times in the window, and the parameters, ``x = x_w + Z d``. Transition times that leave the window become
+further entries of e; as more than n directions cannot all move n entries of the state, there are combinations without
+effect on the state, and the cost takes its minimum along them (the Schur complement).
+
+The state of an online estimator in a file, and the journal of the samples since then.
 """
 
 from __future__ import annotations
 
+import io
+import json
 from itertools import accumulate
 from math import nextafter
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,11 +50,16 @@ class Feed:
         First node.
     capacity : int
         Of nodes, and of samples of each sensor.
+
+    Attributes
+    ----------
+    signals : (capacity, 4, S)
+        Coefficients of the signals in the cell after each node.
     """
 
     def __init__(self, engine: NativeHypotheses, t0: float, capacity: int) -> None:
         self.capacity, self.count = capacity, 1
-        self._nodes, self._signals, self._samples = engine.reserve(capacity, capacity)
+        self._nodes, self.signals, self._samples = engine.reserve(capacity, capacity)
         self._nodes[0] = t0
 
     @property
@@ -68,10 +78,6 @@ class Feed:
         end = first[self.count]
         return times[:end], values[:end], weights[:end]
 
-    def signal(self, node: int) -> FloatArray:
-        """Return the coefficients of the signals in the cell after a node, (4, S), to be written."""
-        return self._signals[node]
-
     def find(self, time: float) -> int:
         """Return the last node that is not later than a time; -1 if all are."""
         if time >= self._nodes[self.count - 1]:
@@ -89,17 +95,18 @@ class Feed:
             first[node + 1] = first[node]
         return node
 
-    def insert(self, node: int, time: float) -> None:
-        """Put a node between two others; it becomes `node`, and later ones move on. A cell is cut in two."""
+    def insert(self, time: float) -> int:
+        """Put a node between two others, and return it; later ones move on. A cell is cut in two."""
+        node = self.find(time) + 1
         self.append(self.last)
         end = self.count
         self._nodes[node + 1 : end] = self._nodes[node : end - 1].copy()
-        self._signals[node : end - 1] = self._signals[node - 1 : end - 2].copy()
+        self.signals[node : end - 1] = self.signals[node - 1 : end - 2].copy()
         self._nodes[node] = time
-        s, (c0, c1, c2, c3) = time - self._nodes[node - 1], self._signals[node - 1]
-        self._signals[node] = c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3
+        self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
         for first, *_ in self._samples:
             first[node + 1 : end + 1] = first[node:end].copy()
+        return node
 
     def add(self, k: int, node: int, value: FloatArray, weight: FloatArray) -> None:
         """Add a sample (q,) of sensor k at a node."""
@@ -122,7 +129,7 @@ class Feed:
         """Forget all nodes before one, which becomes the first, and the samples up to and at it."""
         end = self.count
         self._nodes[: end - node] = self._nodes[node:end].copy()
-        self._signals[: end - 1 - node] = self._signals[node : end - 1].copy()
+        self.signals[: end - 1 - node] = self.signals[node : end - 1].copy()
         self.count -= node
         for first, *arrays in self._samples:
             gone, last = first[node + 1], first[end]
@@ -133,7 +140,7 @@ class Feed:
 
     def copy_arrays(self) -> dict[str, Any]:
         """Return what is in the log, by name, for `set_arrays`."""
-        found: dict[str, Any] = {"nodes": self.nodes.copy(), "signals": self._signals[: self.count].copy()}
+        found: dict[str, Any] = {"nodes": self.nodes.copy(), "signals": self.signals[: self.count].copy()}
         for k, (first, *_) in enumerate(self._samples):
             arrays = zip(("times", "values", "weights"), self.samples(k), strict=True)
             found |= {f"{name} {k}": array.copy() for name, array in arrays}
@@ -143,11 +150,17 @@ class Feed:
     def set_arrays(self, given: dict[str, FloatArray]) -> None:
         """Replace the log by one that was copied."""
         self.count = len(given["nodes"])
-        self._nodes[: self.count], self._signals[: self.count] = given["nodes"], given["signals"]
+        self._nodes[: self.count], self.signals[: self.count] = given["nodes"], given["signals"]
         for k, (first, *arrays) in enumerate(self._samples):
             for name, array in zip(("times", "values", "weights"), arrays, strict=True):
                 array[: len(given[f"{name} {k}"])] = given[f"{name} {k}"]
             first[: self.count + 1] = given[f"first {k}"]
+
+
+def shift_cubic(coefficients: FloatArray, s: float) -> FloatArray:
+    """Return the coefficients (4, S) of cubics in the time since a moment that is s later."""
+    c0, c1, c2, c3 = coefficients
+    return np.stack([c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3])
 
 
 NO_EFFECT = 1e-13
@@ -187,22 +200,23 @@ class Start(NamedTuple):
 
 
 def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: FloatArray) -> tuple[Start, FloatArray]:
-    """Return a start at which parameters have new values, each around its old one.
+    """Return a start at which parameters have new values, each around its old one, or at which transition times have
+    left the window, whose slots are then free for other births.
 
-    The old values join e, since the state depends on them; what has no effect on the state is eliminated, as in `Past`.
-    They are joined to the new ones by ``(p_new - p_old)^2 / (2 variance)``.
+    The old values join e, since the state depends on them; what has no effect on the state is eliminated. They are
+    joined to the new ones by ``(p_new - p_old)^2 / (2 variance)``.
 
     Parameters
     ----------
     start : Start
     entries : int, A
-    chosen : (m,) int, positions of the parameters among the D unknowns
+    chosen : (m,) int, positions of these among the D unknowns
     variances : (m,), infinite where the old value says nothing about the new one
 
     Returns
     -------
     start : Start
-    turn : (A + m, A), how the new entries e follow from the old ones and the old parameters
+    turn : (A + m, A), how the new entries e follow from the old ones and the old values
     """
     D, m = len(start.gradient), len(chosen)
     old, new = np.concatenate([np.arange(entries), chosen]), np.arange(D, D + m)
@@ -236,66 +250,6 @@ def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: Floa
     return found, np.pad(turn, ((0, 0), (0, entries - rank)))
 
 
-class Past(NamedTuple):
-    """How the first transition time of a window joins the A entries e before it.
-
-    Attributes
-    ----------
-    rotation : (A + 1, A + 1), orthonormal: of the columns of Z, the last has no effect on the state
-    births : int, transition times that there is room for
-    """
-
-    rotation: FloatArray
-    births: int
-
-    @classmethod
-    def of(cls, tangent: FloatArray, entries: int, births: int) -> Past:
-        """Return it for a tangent (n, D) at the start of the window."""
-        return cls(np.linalg.svd(tangent[:, : entries + 1])[2].T, births)
-
-    def turn(self, values: FloatArray) -> FloatArray:
-        """Return values (..., D) along the unknowns in the new ones; the one without effect becomes the last time."""
-        A = len(self.rotation) - 1
-        first, rest, p = np.split(values, [A + 1, A + self.births], axis=-1)
-        turned = first @ self.rotation
-        return np.concatenate([turned[..., :A], rest, turned[..., A:], p], axis=-1)
-
-    def absorb(self, found: Hypotheses, prior: float) -> None:
-        """Let the first time of B hypotheses join e, in place; its slot is then free for another birth.
-
-        Parameters
-        ----------
-        found : Hypotheses
-            Views of records.
-        prior : float
-            The second derivative that a birth begins with, which the absorbed time loses and the free slot gets.
-        """
-        A = len(self.rotation) - 1
-        free = A + self.births - 1
-        H = np.array(found.matrices)
-        # H_0 of the birth has done its work, to keep the time near its node, unless the data say too little about it.
-        lost = np.zeros(H.shape[1])
-        lost[A] = prior
-        reduced = H - np.diag(lost)
-        certain = np.linalg.eigvalsh(reduced[:, : A + 1, : A + 1])[:, 0] > 1e-9 * prior
-        H = np.where(certain[:, None, None], reduced, H)
-        H = self.turn(self.turn(H).swapaxes(1, 2))
-        g = self.turn(np.array(found.gradients))
-        # Schur complement of the combination without effect, now last among the times; infinity leaves all as it is.
-        pivot = np.where(H[:, free, free] > 0, H[:, free, free], np.inf)
-        row, slope = H[:, free].copy(), g[:, free].copy()
-        found.costs[:] -= 0.5 * slope**2 / pivot
-        g -= row * (slope / pivot)[:, None]
-        H -= row[:, :, None] * row[:, None, :] / pivot[:, None, None]
-        # Its slot is empty: no slope, the curvature of H_0 for the next birth, and no effect on the state.
-        g[:, free], H[:, free], H[:, :, free], H[:, free, free] = 0.0, 0.0, 0.0, prior
-        found.gradients[:], found.matrices[:] = g, H
-        found.tangents[:] = self.turn(np.array(found.tangents))
-        found.tangents[..., free] = 0.0
-        found.moved[:] = self.turn(np.array(found.moved))
-        found.moved[:, free] = 0.0
-
-
 KEPT = 32
 """Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
 
@@ -310,8 +264,11 @@ LONGEST_APART = 2.0
 """How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
 
 REPEATED = 12
-"""Hypotheses that go on where all are propagated anew over the window: parameters get new values, or a sample comes so
-late that the hypotheses at the node before it are not kept."""
+"""Hypotheses that go on where all are propagated anew over the window: parameters get new values, a transition leaves
+it, or a sample comes so late that the hypotheses at the node before it are not kept."""
+
+CERTAIN = 1e-9
+"""Curvature, as a part of what a birth begins with, above which the data have determined its time."""
 
 NOTHING = 1e-9
 """Part of the artificial terms of H below which what is left without them is rounding."""
@@ -394,12 +351,10 @@ class Tracker:
         self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self.behind = np.zeros((KEPT, settings.entries))
-        self._views = [beam.engine.view(records[: settings.width]) for records in self.records]
-        self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
         self._coded: tuple[Any, list[int]] = (None, [])
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
-        self.birth_information = float(12.0 * (beam.noise / beam.slots.measure_width(beam.grid)[0]) ** 2)
+        self.birth_information = float(12.0 * (beam.noise / beam.reaches[0]) ** 2)
         weak = np.where(beam.priors.precision > 0, 0.0, (beam.noise / self._pass.spread) ** 2)[beam.places]
         of_births = np.full(beam.births, self.birth_information)
         of_births[: settings.entries] = 0.0
@@ -425,9 +380,7 @@ class Tracker:
 
     def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses whose records are at a place."""
-        count = len(kept.mode)
-        usual = count == self.settings.width
-        return kept, self._views[place] if usual else self.beam.engine.view(self.records[place, :count])
+        return kept, self.beam.engine.view(self.records[place, : len(kept.mode)])
 
     def has(self, node: int) -> bool:
         """Return whether the hypotheses at a node are kept."""
@@ -448,12 +401,10 @@ class Tracker:
         """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
         which of those that have more after it.
         """
-        if self._known[0] is not kept or self._known[1] is not self.declared:
-            last = len(self.declared) - 1
-            same = (kept.modes[:, : last + 1] == self.declared).all(1)
-            ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
-            self._known = kept, self.declared, ways
-        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in self._known[2])
+        last = len(self.declared) - 1
+        same = (kept.modes[:, : last + 1] == self.declared).all(1)
+        ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
+        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in ways)
         return int(value.argmin()), exact, more
 
     def step(self, node: int, births: bool) -> None:
@@ -562,67 +513,51 @@ class Tracker:
         known = drop_artificial(found.matrices[b], self.artificial)
         errors = np.sqrt(np.diag(invert(known)))[A : A + gone] if gone else np.zeros(0)
         there.moved[:, : A + S] = 0.0
-        pasts = []
-        # Transitions that are behind the new start become entries e, one after the other; for each one combination of n
-        # + 1 directions has no effect on the state, and is eliminated (`window`).
-        for _ in range(gone):
-            pasts.append(Past.of(there.tangents[0], A, S))
-            pasts[-1].absorb(there, self.birth_information)
         x, Z, g = there.states[0].copy(), there.tangents[0].copy(), there.gradients[0].copy()
         H = there.matrices[0] - self._artificial
         self.start = Start(there.moved[0].copy(), float(there.costs[0]), g, H, x, Z)
-        modes = own.modes[0, : gone + 1]
-        self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
+        modes, times = own.modes[0, : gone + 1], times[0, :gone]
+        self.left += map(Left, modes[:gone].tolist(), times.tolist(), errors.tolist())
         self.behind -= moved[:, :A]
-        # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
-        for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
-            self._follow(node, pasts, modes, times[0, :gone], end)
+        kept, found = self.at(last)
+        is_early = kept.times[:, 0] + found.moved[:, A] < end
+        chosen = np.arange(len(kept.mode))
+        if gone or kept.switches[is_early].any():
+            # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
+            chosen = self._find_agreeing(kept, found.moved, modes, times, end)
         self.first = following
         if gone:
-            self.declared = self.declared[gone:]
+            self._absorb(self.start, kept.take(chosen), found.take(chosen), times)
+        elif len(chosen) < len(kept.mode):
+            self.keep(last, kept.take(chosen), found.records[chosen], np.arange(len(chosen)))
 
-    def _follow(self, node: int, pasts: list[Past], modes: NDArray[np.int64], times: FloatArray, end: float) -> None:
-        """Drop the hypotheses of a node that disagree about what has left the window, and express the others by its
-        new start.
-
-        Parameters
-        ----------
-        node : int
-        pasts : list of Past, for each of k transitions that have left
-        modes, times : (k + 1,) int, (k,)
-        end : float, time of the start
+    def _find_agreeing(
+        self, kept: Sequences, moved: FloatArray, modes: NDArray[np.int64], times: FloatArray, end: float
+    ) -> NDArray[np.intp]:
+        """Return the hypotheses that have the same modes (k + 1,) before the new start of the window, at about the same
+        times (k,), and no birth of others before it.
         """
-        place, A, k = (node + self.dropped) % KEPT, self.settings.entries, len(pasts)
-        there = self.kept[place]
-        if there is None:
-            return
-        kept, found = there
-        self.catch_up(place, found)
-        is_early = kept.times[:, 0] + found.moved[:, A] < end
-        if not pasts and not kept.switches[is_early].any():
-            return
-        own = self.times(kept, found.moved)
-        is_born = self._slots < kept.switches[:, None]
-        # The same modes before the new start, at about the same times, and no birth of the others before it.
+        k, begin, own = len(times), float(self.feed.nodes[self.first]), self.times(kept, moved)
         agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
-        begin = float(self.feed.nodes[self.first])  # times may have moved to before it
+        # Times may have moved to before the window.
         agrees &= (np.abs(np.maximum(own[:, :k], begin) - times) <= LONGEST_APART * self.spacing).all(1)
-        agrees &= ~(is_born & (own < end))[:, k:].any(1)
-        chosen = np.flatnonzero(agrees)
-        if not len(chosen):
-            self.kept[place] = None
-            return
-        kept, found = kept.take(chosen), self.beam.engine.view(found.records[chosen])
-        # Times that have left are measured from those of the best hypothesis, at which the new start was made.
-        found.moved[:, A : A + k] = own[chosen, :k] - times
-        for past in pasts:
-            past.absorb(found, self.birth_information)
-        if k:
-            rolled = np.roll(kept.modes, -k, axis=1), np.roll(kept.times, -k, axis=1)
-            for array in rolled:
-                array[:, -k:] = 0
-            kept = kept._replace(modes=rolled[0], times=rolled[1], switches=kept.switches - k)
-        self.keep(node, kept, found.records, np.arange(len(chosen)))
+        is_born = self._slots < kept.switches[:, None]
+        return np.flatnonzero(agrees & ~(is_born & (own < end))[:, k:].any(1))
+
+    def _absorb(self, start: Start, kept: Sequences, found: Hypotheses, times: FloatArray) -> None:
+        """Let the first times (k,) of all hypotheses join the entries e: they have left the window."""
+        A, k = self.settings.entries, len(times)
+        # H_0 of a birth has done its work, to keep the time near its node, unless the data say too little about it.
+        if np.linalg.eigvalsh(start.matrix[: A + k, : A + k])[0] <= CERTAIN * self.birth_information:
+            start.matrix[range(A, A + k), range(A, A + k)] += self.birth_information
+        self.start, turn = forget(start, A, np.arange(A, A + k), np.full(k, np.inf))
+        # They are measured from those of the best hypothesis, at which the new start was made.
+        own = self.times(kept, found.moved)
+        found.moved[:, :A] = np.hstack([found.moved[:, :A], own[:, :k] - times]) @ turn
+        found.moved[:, A : A + self.settings.births] = 0.0
+        modes, own = np.roll(kept.modes, -k, axis=1), np.roll(own, -k, axis=1)
+        self.declared = self.declared[k:]
+        self.repeat(kept._replace(modes=modes, times=own, switches=kept.switches - k), found)
 
     def renew(self, chosen: NDArray[np.intp], variances: FloatArray) -> None:
         """Give parameters new values from the start of the window on, which differ from the old ones by `variances`.
@@ -635,9 +570,11 @@ class Tracker:
         """
         if self.start is None:
             raise ValueError("nothing has left the window yet")
-        A, center = self.settings.entries, self.start.moved
+        A, center, new = self.settings.entries, self.start.moved, chosen[np.isinf(variances)]
         self.start, turn = forget(self.start, A, chosen, variances)
-        self._add_priors(chosen[np.isinf(variances)])
+        begun = self._pass.build_start(center[None])  # of new values, their priors are known
+        self.start.gradient[new] += begun.gradients[0, new]
+        self.start.matrix[new, new] += (np.diag(begun.matrices[0]) - self.artificial)[new]
         kept, found = self.at(self.feed.count - 1)
         found.moved[:, :A] = np.hstack([found.moved[:, :A], found.moved[:, chosen] - center[chosen]]) @ turn
         self.repeat(kept, found)
@@ -655,15 +592,6 @@ class Tracker:
         self.kept = [None] * KEPT
         kept = kept._replace(times=times, last=latest)
         self.keep(last, kept.take(good), anew.records, good)
-
-    def _add_priors(self, chosen: NDArray[np.intp]) -> None:
-        """Add the priors of parameters, positions among the D unknowns, to the start of the window."""
-        start = self.start
-        if start is None:
-            return
-        begun = self._pass.build_start(start.moved[None])
-        start.gradient[chosen] += begun.gradients[0, chosen]
-        start.matrix[chosen, chosen] += (np.diag(begun.matrices[0]) - self.artificial)[chosen]
 
     def _place_births(self, kept: Sequences, moved: FloatArray, end: float) -> tuple[FloatArray, FloatArray]:
         """Return where births have `moved` (B, D) between the start of the window and an end, in order, (B, S), and
@@ -683,6 +611,43 @@ class Tracker:
         self.feed.drop(self.first)
         self.dropped += self.first
         self.first = 0
+
+    # --- files -----------------------------------------------------------------------------------------------------
+
+    def pack(self, others: dict[str, Any]) -> bytes:
+        """Return all arrays, and other numbers, as a file."""
+        arrays: dict[str, Any] = {f"feed {name}": array for name, array in self.feed.copy_arrays().items()}
+        for place, there in enumerate(self.kept):
+            if there is not None:
+                self.catch_up(place, there[1])
+                arrays |= {f"kept {place} {name}": array for name, array in there[0]._asdict().items()}
+        arrays |= {"records": self.records, "declared": self.declared}
+        if self.start is not None:
+            arrays |= {f"start {name}": np.asarray(array) for name, array in self.start._asdict().items()}
+        numbers = others | {"format": FORMAT, "first": self.first, "dropped": self.dropped, "left": self.left}
+        buffer = io.BytesIO()
+        np.savez(buffer, numbers=np.frombuffer(json.dumps(numbers).encode(), dtype=np.uint8), **arrays)
+        return buffer.getvalue()
+
+    def unpack(self, numbers: dict[str, Any], arrays: dict[str, FloatArray], path: Path) -> None:
+        """Take what was saved; ValueError if that is of another problem or other settings."""
+        if arrays["records"].shape != self.records.shape:
+            raise ValueError(f"{path} was saved for another problem, or with other settings: give the same ones.")
+
+        def part(name: str) -> dict[str, Any]:
+            begin = f"{name} "
+            return {key.removeprefix(begin): array for key, array in arrays.items() if key.startswith(begin)}
+
+        self.feed.set_arrays(part("feed"))
+        self.records[:] = arrays["records"]
+        self.declared = arrays["declared"].astype(np.int64)
+        for place in range(len(self.kept)):
+            found = part(f"kept {place}")
+            self.kept[place] = self.view(place, Sequences(**found)) if found else None
+        if start := part("start"):
+            self.start = Start(**start)._replace(cost=float(start["cost"]))
+        self.first, self.dropped = numbers["first"], numbers["dropped"]
+        self.left = [Left(*each) for each in numbers["left"]]
 
 
 def drop_artificial(matrix: FloatArray, artificial: FloatArray) -> FloatArray:
@@ -705,4 +670,39 @@ def invert(matrix: FloatArray) -> FloatArray:
         found[there, there] = np.inf
     diagonal = np.diag(found)
     np.fill_diagonal(found, np.where(diagonal > 0, diagonal, np.inf))
+    return found
+
+
+FORMAT = "switchfit online 2"
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+    """Return the numbers and the arrays of a file; ValueError for any other."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        numbers = json.loads(arrays.pop("numbers").tobytes())
+    except (ValueError, KeyError, EOFError) as error:
+        raise ValueError(f"{path} is not a saved online estimator ({error}).") from error
+    if numbers.get("format") != FORMAT:
+        raise ValueError(f"{path} is of another version: it has {numbers.get('format')!r}, not {FORMAT!r}.")
+    return numbers, arrays
+
+
+def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> None:
+    """Write an update to a journal, with the values of each sensor; it leaves the process before the update begins."""
+    line = json.dumps({"t": t, "y": y, "u": u}, default=lambda value: np.asarray(value, dtype=np.float64).tolist())
+    with path.open("ab", buffering=0) as file:
+        file.write(line.encode() + b"\n")
+
+
+def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
+    """Return the updates of a journal; the last one may have been cut off, and is left out then."""
+    found = []
+    for line in path.read_bytes().split(b"\n")[:-1]:
+        try:
+            each = json.loads(line)
+            found.append((each["t"], {int(k): values for k, values in each["y"].items()}, each["u"]))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path} is not the journal of an online estimator ({error}).") from error
     return found

@@ -64,8 +64,7 @@ from switchfit.strategy.library import (
     list_jumps,
     refuse_unsupported,
     select_lowest,
-    trace_library,
-    trace_order,
+    trace_transitions,
 )
 from switchfit.strategy.starts import check_time
 
@@ -195,6 +194,9 @@ REPLAYS, REPLAYS_OF_ORDER, LAST_REPLAYS = 4, 24, 3
 SMALLEST_WIDTH = 1e-6
 """Part of the grid by which a time that is fixed may move: H_0 stays finite."""
 
+LIKELY = 5.0
+"""Standard deviations of the prior of a time within which a beam looks for it."""
+
 STIFFNESS = 1e12
 """Weight of what keeps names of one parameter equal, in units of what a parameter without a prior has: far above what
 data say, and its rounding is far below 1."""
@@ -223,46 +225,24 @@ def follow_order(
     shortest = np.array([get_min_duration(problem.min_duration, mode) for mode in run.mode_sequence])
     count = len(modes) - 1
     # A birth moves by up to the grid.
-    earliest, latest = found.slots.lower[:count] - found.grid, found.slots.upper[:count] + found.grid
+    earliest, latest = found.limits[:count, 0] - found.grid, found.limits[:count, 1] + found.grid
     rules = Rules.of_order(modes, shortest, earliest, latest)
     return found.run(rules, parameters, 0.0, PER_SEQUENCE * len(modes), replays, evidence)
 
 
-class Slots(NamedTuple):
-    """Where the times of the transitions of an experiment may be: bounds, (S,) each, and priors.
+def limit_times(times: Sequence[Parameter], births: int) -> FloatArray:
+    """Return between which values a beam looks for each time of a transition, by its bounds and its prior: (S, 2).
 
-    Only those of a given order of modes have any.
+    Only those of a given order of modes have any; of the fit that follows, a prior is a part of J.
     """
-
-    lower: FloatArray
-    upper: FloatArray
-    priors: PriorTerms
-
-    @classmethod
-    def of(cls, times: Sequence[Parameter], births: int) -> Slots:
-        """Return those of the times of an experiment, and of as many further ones as there are births."""
-        bounds = np.array([[-np.inf, np.inf]] * births)
-        for own, tau in zip(bounds, times, strict=False):
-            own[:] = (tau.value, tau.value) if tau.fixed else (tau.lower, tau.upper)
-        priors = [PriorTerms.of(None if tau.fixed else tau.prior, ()) for tau in times]
-        return cls(bounds[:, 0], bounds[:, 1], PriorTerms.join([*priors, PriorTerms.of(None, (births - len(times),))]))
-
-    def measure_width(self, grid: float) -> FloatArray:
-        """Return how far each may be from its birth on a grid: (S,)."""
-        return np.clip(self.upper - self.lower, SMALLEST_WIDTH * grid, grid)
-
-    def list_marks(self, grid: float) -> FloatArray:
-        """Return the middles between bounds that are nearer to each other than the grid."""
-        near = self.upper - self.lower < grid
-        return 0.5 * (self.lower[near] + self.upper[near])
-
-    def compute_costs(self, times: FloatArray, switches: Integers) -> FloatArray:
-        """Return the cost of priors on the times (B, S) of hypotheses, as many as have happened: (B,)."""
-        # -log of a Gaussian prior on tau, or on log tau; only births that have happened count.
-        center, precision, log = self.priors
-        away = np.where(log, np.log(times), times) - center
-        is_born = np.arange(times.shape[1]) < switches[:, None]
-        return np.asarray(0.5 * np.where(is_born & (precision > 0), precision * away**2, 0.0).sum(1))
+    found = np.array([[-np.inf, np.inf]] * births)
+    for own, tau in zip(found, times, strict=False):
+        own[:] = (tau.value, tau.value) if tau.fixed else (tau.lower, tau.upper)
+        if tau.prior is not None and not tau.fixed:
+            (center,), (precision,), (log,) = PriorTerms.of(tau.prior, (1,))
+            ends = center + LIKELY * precision**-0.5 * np.array([-1.0, 1.0])
+            own[:] = np.clip(np.exp(ends) if log else ends, *own)
+    return found
 
 
 class Beam:
@@ -299,7 +279,9 @@ class Beam:
     places : (M,) int
         Position of each entry of p among these: two names of the model may refer to one parameter.
     ties : (M, M)
-        The part of a change of p in which entries of one parameter differ, as a matrix.
+        The part of a change of p in which entries of one parameter differ, what it has beside their mean, as a matrix.
+    into : (S + M, S + U)
+        How births and the entries of p, which may be one parameter under two names, follow from births and parameters.
     lower, upper : (U,)
     priors : PriorTerms
     spread : (U,)
@@ -310,7 +292,8 @@ class Beam:
         Where sigma is unknown: number of measured values up to each node.
     noise : float
         Standard deviation that residuals may be expected to have, in units of sqrt(J).
-    slots : Slots
+    limits : (S, 2)
+        Between which values each time of a transition is.
     tolerances : Tolerances
     lock : Lock
         Held during a pass, whose settings and scratch space are the engine's.
@@ -320,12 +303,12 @@ class Beam:
         run, unknowns = problem.experiments[e], problem.unknowns
         refuse_unsupported(problem, e)
         self.births = max(len(run.transition_times) if library is None else library.max_switches, 1)
-        traced = trace_order(problem, e) if library is None else trace_library(problem, e, library, self.births)
-        structure, self.functions = traced
+        structure, self.functions = trace_transitions(problem, e, library, self.births)
         self.modes = structure.mode_names
-        self.slots = Slots.of(run.times if library is None else (), self.births)
+        self.limits = limit_times(run.times if library is None else (), self.births)
         self.grid = choose_grid(run) if grid is None else grid
-        marks = self.slots.list_marks(self.grid)
+        is_near = np.diff(self.limits)[:, 0] < self.grid
+        marks = self.limits[is_near].mean(axis=1)  # births there, where limits are nearer to each other than the grid
         if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
             seen = list_sample_times(run)
             marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
@@ -341,8 +324,11 @@ class Beam:
         # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
         # repetitions.
         in_theta, self.places = np.unique(place_parameters(problem, e, structure), return_inverse=True)
-        self.ties = _tie(self.places)
+        same, S = self.places[:, None] == self.places, self.births
+        self.ties = np.eye(len(same)) - same / same.sum(1)
         self.own = in_theta - int(unknowns.is_time.sum())
+        self.into = np.zeros((S + len(same), S + len(in_theta)))
+        self.into[:S, :S], self.into[S:, S:] = np.eye(S), self.places[:, None] == np.arange(len(in_theta))
         self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
         self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
@@ -353,6 +339,11 @@ class Beam:
         guards = (self.noise / (GUARD_SD * self.grid)) ** 2
         self.tolerances = Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)
         self.lock = threading.Lock()
+
+    @property
+    def reaches(self) -> FloatArray:
+        """How far each time may be from its birth on the grid: (S,)."""
+        return np.clip(np.diff(self.limits)[:, 0], SMALLEST_WIDTH * self.grid, self.grid)
 
     def run(
         self, rules: Rules, parameters: FloatArray, penalty: float, width: int, replays: int, evidence: Quadratic | None
@@ -404,14 +395,14 @@ class Pass:
         self, beam: Beam, rules: Rules, parameters: FloatArray, penalty: float, evidence: Quadratic | None = None
     ) -> None:
         self.beam, self.rules, self.parameters, self.penalty, self.evidence = beam, rules, parameters, penalty, evidence
-        self.reaches = beam.slots.measure_width(beam.grid)
+        self.reaches = beam.reaches
         half = 0.5 * (beam.upper - beam.lower)
         bounded = np.isfinite(half) & (half > 0)
         # Size of each unknown: its value; at zero, half its bounds; without either, 1. Bounds limit the spread too.
         size = np.where(parameters != 0, np.abs(parameters), np.where(bounded, half, 1.0))
         self.spread = np.minimum(beam.spread * size, np.where(bounded, half, np.inf))
         self.weak = (beam.noise / self.spread) ** 2
-        self.has_priors, self.has_prior_times = beam.priors.any, beam.slots.priors.any
+        self.has_priors = beam.priors.any
         self.matrix = self._build_matrix()
 
     def run(self, width: int, replays: int) -> list[Proposal]:
@@ -435,7 +426,7 @@ class Pass:
         for _ in range(LAST_REPLAYS if len(chosen) else 0):
             kept, left = self._replay(kept.take(best), left, best, node)
             # Where they converge, hypotheses with the same sequence become one.
-            value = self._value(left.scores, kept.switches, node, kept.times)
+            value = self._value(left.scores, kept.switches, node)
             best = select_lowest(value, kept.code, kept.switches, width, 1)
         return self._propose(kept, left)
 
@@ -457,10 +448,7 @@ class Pass:
             # stop.
             children = kept.list_children(*rules.list_births(kept, t, tf))
             states = beam.engine.advance(states, self.build_table(kept, children, chosen), begin, stop)
-            times = None
-            if self.has_prior_times:
-                times = kept.follow(children, np.arange(len(children.mode)), t).times
-            value = self._value(states.scores, children.switches, stop, times)
+            value = self._value(states.scores, children.switches, stop)
             # Sequences that may not end here drop out.
             if stop == beam.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
@@ -470,9 +458,9 @@ class Pass:
 
     @cached_property
     def order(self) -> OrderTables | None:
-        """The order of modes, where it is given and nothing but their scores counts of its hypotheses; else None."""
+        """The order of modes, where it is given; else None."""
         rules, windows = self.rules, self.rules.list_windows()
-        if windows is None or self.has_prior_times:
+        if windows is None:
             return None
         places = np.arange(len(rules.modes))
         children = self.steps[places, np.minimum(places + 1, places[-1])]
@@ -493,7 +481,7 @@ class Pass:
         t0, t = float(beam.times[0]), float(beam.times[stop])
         # Times where the linear model has moved them, in order and before this node: a birth later than the node would
         # never happen, and its derivative be zero. Slots without a birth are 0.
-        low, high = np.maximum(beam.slots.lower, t0), np.minimum(beam.slots.upper, np.nextafter(t, t0))
+        low, high = np.maximum(beam.limits[:, 0], t0), np.minimum(beam.limits[:, 1], np.nextafter(t, t0))
         times = np.minimum(np.maximum(kept.times + moved[:, :S], low), high)
         times = np.where(is_born, np.maximum.accumulate(times, axis=1), 0.0)
         last = np.where(kept.switches > 0, times[np.arange(B), kept.switches - 1], t0)
@@ -575,14 +563,12 @@ class Pass:
         table[:, PARENT], table[B:, SLOT] = chosen[children.parent], children.switches[B:] - 1
         return table
 
-    def _value(self, scores: FloatArray, switches: Integers, node: int, times: FloatArray | None) -> FloatArray:
-        """Return the scores of hypotheses at a node with the priors of their times and the penalty of switches.
+    def _value(self, scores: FloatArray, switches: Integers, node: int) -> FloatArray:
+        """Return the scores of hypotheses at a node with the penalty of switches.
 
         Where sigma is unknown, it is ``n/2 log(2 J / n)``, with a few samples of the assumed noise.
         """
         beam = self.beam
-        if self.has_prior_times and times is not None:
-            scores = scores + beam.slots.compute_costs(times, switches)
         if beam.counts is not None:
             # -log L with sigma^2 = 2 J / n put in. The few samples of the assumed noise keep it from minus infinity
             # where a model with many unknowns meets the first few samples exactly.
@@ -598,10 +584,7 @@ class Pass:
         them.
         """
         beam, B, S = self.beam, len(kept.mode), self.beam.births
-        U = len(beam.own)
-        into = np.zeros((S + len(beam.places), S + U))  # derivatives along all names of a parameter add up
-        into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
-        # From entries of p, which may be one parameter under two names, to unknowns (times, q): H -> I' H I, g -> I' g.
+        into, U = beam.into, len(beam.own)  # H -> I' H I, g -> I' g: derivatives along all names of a parameter add up
         H, g = into.T @ states.matrices @ into, states.gradients @ into
         before_q = self._move(states.moved)
         # All unknowns free, then the parameters inside their bounds, then the times for these parameters: conditional
@@ -618,12 +601,12 @@ class Pass:
             at = kept.modes[k, : N + 1]
             times[k, :N] = keep_apart(times[k, :N], self.rules.shortest[at], t0, tf)
             names.append(tuple(beam.modes[mode] for mode in self.rules.modes[at].tolist()))
-        times = np.clip(times, beam.slots.lower, beam.slots.upper)
+        times = np.clip(times, *beam.limits.T)
         is_born = np.arange(S) < kept.switches[:, None]
         d[:, :S] = np.where(is_born, times - before, 0.0)
         # J + g'd + d'H d / 2 at the times that are possible, not at the minimum.
         costs = states.costs + ((g + 0.5 * (H @ d[..., None])[..., 0]) * d).sum(1)
-        value = self._value(costs, kept.switches, int(beam.stops[-1]), kept.times)
+        value = self._value(costs, kept.switches, int(beam.stops[-1]))
         order = np.argsort(value, kind="stable").tolist()
         found = [Proposal((names[k],), (times[k, : kept.switches[k]],), q[k], float(value[k])) for k in order]
         for k in order[:1]:
@@ -636,12 +619,6 @@ class Pass:
             evidence = Quadratic(np.append(times[k], q[k]), slope, alone).restrict(np.arange(S, S + U))
             found[0] = found[0]._replace(evidence=evidence)
         return found
-
-
-def _tie(places: Integers) -> FloatArray:
-    """Return what a change of p (M,) has beside the mean of the entries with the same place, as a matrix (M, M)."""
-    same = places[:, None] == places
-    return np.eye(len(places)) - same / same.sum(1)
 
 
 def prepare(problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> Beam:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -270,23 +270,20 @@ def estimate(
             if strategy == "local":
                 raise
             failure = error
-        if best is not None and (strategy == "local" or (strategy == "auto" and hessian != "auto")):
-            return best
         other = None
-        if best is not None and strategy == "auto" and _is_settled(problem, best, max_iterations):
-            other = find_other_minimum(best)
-            if other is None:
-                return best
-        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, other)
-        search.run(line, callback, budget)
+        if best is not None and strategy == "auto":
+            is_cut = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # only a few were asked for
+            if hessian == "auto" and not is_cut and is_enough(problem, best):
+                other = find_other_minimum(best)
+                is_cut = other is None
+            strategy = "local" if hessian != "auto" or is_cut else strategy
+        if best is not None and strategy == "local":
+            return best
+        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, other)
+        search.run(callback, budget)
         if failure is not None and search.best is None:
             raise failure
         return search.finish()
-
-
-def _is_settled(problem: Problem, best: Estimate, max_iterations: int) -> bool:
-    """Return whether the first fit is all that "auto" makes: it is enough, or only a few iterations were asked for."""
-    return (best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS) or is_enough(problem, best)
 
 
 def find_other_minimum(fit: Estimate) -> FloatArray | None:
@@ -326,42 +323,35 @@ def was_interrupted(fit: Estimate) -> bool:
     return searching or fit.status is Status.INTERRUPTED
 
 
+@dataclass
 class Search:
     """A search by several strategies in turn: the best fit so far, and a record of each step."""
 
+    problem: Problem
+    best: Estimate | None
+    theta: FloatArray
+    strategy: Strategy
+    fit: Callable[..., Estimate]
+    began: float
+    line: Line
+    other: FloatArray | None = None
+    starts: Starts | None = None
     running: ClassVar[int] = 0
 
-    def __init__(
-        self,
-        problem: Problem,
-        best: Estimate | None,
-        theta: FloatArray,
-        strategy: Strategy,
-        fit: Callable[..., Estimate],
-        began: float,
-        other: FloatArray | None,
-    ) -> None:
-        self.problem, self.best, self.theta = problem, best, theta
-        self.strategy, self.fit, self.began, self.other = strategy, fit, began, other
-        self.evaluations = 0 if best is None else best.evaluations
-        proposed = any(run.is_guess_proposed for run in problem.experiments)
+    def __post_init__(self) -> None:
+        self.evaluations = 0 if self.best is None else self.best.evaluations
+        proposed = any(run.is_guess_proposed for run in self.problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
-        self.steps = [Step(name, self.lowest, self.evaluations, time.perf_counter() - began)]
-        self.first_cost = np.nan if best is None else best.initial_cost
-        self.starts: Starts | None = None
+        self.steps = [Step(name, self.lowest, self.evaluations, time.perf_counter() - self.began)]
+        self.first_cost = np.nan if self.best is None else self.best.initial_cost
 
-    def run(self, line: Line, callback: Callable[[IterationRecord], object] | None, budget: float | None) -> None:
+    def run(self, callback: Callable[[IterationRecord], object] | None, budget: float | None) -> None:
         """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
-        self.line = line
         Search.running += 1
         try:
             strategies = self._list_strategies()  # compiles
-            spent = time.perf_counter() - self.began
-            if budget is None:
-                left = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * self.steps[0].seconds)
-            else:
-                left = budget - spent
-            with limit_time(left, callback):
+            most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * self.steps[0].seconds)
+            with limit_time(most if budget is None else budget - (time.perf_counter() - self.began), callback):
                 for name, find in strategies:
                     if is_late() or not self._try(name, find):
                         break

@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,20 +32,9 @@ from switchfit.problem.data import FloatArray, Measurements, robust
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
-from switchfit.problem.validation import as_names, as_sequence, shorten
+from switchfit.problem.validation import as_instance, as_labels, as_sequence
 from switchfit.runtime import special
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
-
-
-def find_improper_scale(problem: Problem) -> float | None:
-    """Return the scale of a Cauchy loss that is no density, as its integral is infinite; None if there is none.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    items = problem.measurements
-    return next((item.loss_scale for item in items if item.loss == "cauchy" and item.loss_scale <= 1), None)
 
 
 def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comparison]]) -> float:
@@ -80,7 +68,7 @@ def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comp
 def compute_log_norm(loss: str, scale: float) -> float:
     """Return the logarithm of the integral of ``exp(-rho / 2)`` over residuals in sigmas, by which a loss is a density.
 
-    Infinite for a Cauchy loss with a scale up to 1, which is no density (`find_improper_scale`).
+    Infinite for a Cauchy loss with a scale up to 1, which is no density.
 
     Parameters
     ----------
@@ -259,7 +247,12 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
     >>> table.best, table.delta_bic.round(1).tolist()
     ('on, off', [8476.6, 0.0])
     """
-    fits, labels = _check_estimates(estimates, names)
+    fits = list(as_sequence(estimates, "estimates", "a sequence of results of sf.estimate"))
+    for fit in fits:
+        as_instance(fit, "each of estimates", Estimate, "a result of sf.estimate")
+    if len(fits) < 2:
+        raise ValueError(f"compare needs two estimates or more; got {len(fits)}.")
+    labels = as_labels(names, "names", "estimate", len(fits)) or tuple(f"model{k + 1}" for k in range(len(fits)))
     problems = [fit.evaluator_at_solution().problem for fit in fits]
     _check_data(labels, problems)
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
@@ -269,31 +262,17 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
     return ModelComparison(labels, count, unknowns, likelihoods, tuple(fits))
 
 
-def _check_estimates(estimates: Any, names: Any) -> tuple[list[Estimate], tuple[str, ...]]:
-    """Return the estimates and their names, checked."""
-    fits = list(as_sequence(estimates, "estimates", "a sequence of results of sf.estimate"))
-    wrong = [type(fit).__name__ for fit in fits if not isinstance(fit, Estimate)]
-    if wrong:
-        raise TypeError(f"compare needs results of sf.estimate; got {wrong[0]}.")
-    if len(fits) < 2:
-        raise ValueError(f"compare needs two estimates or more; got {len(fits)}.")
-    given = tuple(f"model{k + 1}" for k in range(len(fits))) if names is None else names
-    labels = as_names(given, "names", "a sequence of strings, one for each estimate")
-    if len(labels) != len(fits):
-        raise ValueError(f"names must have one entry for each of the {len(fits)} estimates; got {shorten(labels)}.")
-    return fits, labels
-
-
 def _check_data(labels: Sequence[str], problems: Sequence[Problem]) -> None:
     """Raise ValueError unless all models have a likelihood of the same data."""
     for label, problem in zip(labels, problems, strict=True):
         if problem.is_sigma_known is None:
             raise ValueError(f"{label} has no likelihood: its cost has other terms than Measurements.")
-        scale = find_improper_scale(problem)
-        if scale is not None:
-            raise ValueError(
-                f"{label} has no likelihood: loss='cauchy' is a density only with a loss_scale above 1; got {scale:g}."
-            )
+        for item in problem.measurements:
+            if item.loss == "cauchy" and item.loss_scale <= 1:  # its integral is infinite
+                raise ValueError(
+                    f"{label} has no likelihood: loss='cauchy' is a density only with a loss_scale above 1; got "
+                    f"{item.loss_scale:g}."
+                )
     for label, problem in zip(labels[1:], problems[1:], strict=True):
         difference = find_difference(problems[0], problem)
         if difference:

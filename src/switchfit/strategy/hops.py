@@ -104,30 +104,22 @@ def choose_hops(
     """
     unknowns = evaluator.problem.unknowns
     inside = (unknowns.lower < theta) & (theta < unknowns.upper)
-    hops = list(_list_hops(evaluator, theta, inside if free is None else inside & free, errors))
+    free, intervals = inside if free is None else inside & free, []
+    for e, run in enumerate(evaluator.problem.experiments):
+        if errors is None:
+            intervals.append(list(_list_intervals(run, unknowns.times[e], list_sample_times(run), theta)))
+        else:
+            intervals.append(list(_scan(evaluator, e, theta, errors)))
+    if not any(intervals):
+        return []
+    whole = evaluator(theta)
+    hops = [hop for e, own in enumerate(intervals) if own for hop in _list_hops(evaluator, e, whole, theta, free, own)]
     near = sorted(hops, key=lambda hop: hop[0])[:MOST]
     again = [find_lowest(start) for lowest, start, find_lowest in near if np.isfinite(lowest)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
 
 
 def _list_hops(
-    evaluator: Evaluator, theta: FloatArray, free: NDArray[np.bool_], errors: FloatArray | None
-) -> Iterator[tuple[float, FloatArray, FindLowest]]:
-    """Yield the lowest J of the quadratic model about the middle of each interval, theta there, and a function that
-    returns both of the model about another point.
-    """
-    whole = None
-    for e, run in enumerate(evaluator.problem.experiments):
-        if errors is None:
-            intervals = _list_intervals(run, evaluator.problem.unknowns.times[e], list_sample_times(run), theta)
-        else:
-            intervals = _scan(evaluator, e, theta, errors)
-        if found := list(intervals):
-            whole = evaluator(theta) if whole is None else whole
-            yield from _list_hops_of_run(evaluator, e, whole, theta, free, found)
-
-
-def _list_hops_of_run(
     evaluator: Evaluator,
     e: int,
     whole: Evaluation[FloatArray],
@@ -135,7 +127,8 @@ def _list_hops_of_run(
     free: NDArray[np.bool_],
     intervals: list[tuple[int, float, float]],
 ) -> Iterator[tuple[float, FloatArray, FindLowest]]:
-    """Yield what `_list_hops` does for one run.
+    """Yield for each of some intervals of a run the lowest J of the quadratic model about its middle, theta
+    there, and a function that returns both of the model about another point.
 
     The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
     point.

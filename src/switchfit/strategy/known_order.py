@@ -4,6 +4,8 @@ A beam (`beam`) needs no guess of the times: it follows hypotheses about them th
 along. It begins again at the parameters of the fit as long as that lowers J.
 
 Beams over all runs of a problem, each in turn: what the others say about shared parameters is a quadratic cost.
+
+Problems some of whose unknowns are fixed at their guesses.
 """
 
 from __future__ import annotations
@@ -231,6 +233,47 @@ def _list_settled(problem: Problem, beams: Beams, found: Sequence[Sequence[Propo
             if away < SETTLED * prepare(problem, e).grid and rise < len(q) * noise:
                 settled.add(e)
     return settled
+
+
+def fix_unknowns(problem: Problem, names: Sequence[str]) -> Problem:
+    """Return a problem with some of its unknowns fixed at their guesses.
+
+    Parameters
+    ----------
+    problem : Problem
+    names : sequence of str
+        Of all entries of a parameter, or of none.
+    """
+    at = problem.initial_theta
+    fixed = {problem.theta_names.index(name) for name in names}
+    unknowns = problem.unknowns
+
+    def fix(parameter: Any, place: int) -> Any:
+        return replace(parameter, value=at[place], fixed=True) if place in fixed else parameter
+
+    runs = []
+    for e, run in enumerate(problem.experiments):
+        times = tuple(fix(tau, i) for tau, i in zip(run.times, unknowns.times[e].tolist(), strict=True))
+        count = len(run.transition_times)
+        changes: dict[str, Any] = {"transition_times": times[:count]}
+        if len(times) > count:
+            changes["tf"] = times[count] if not times[count].fixed else float(times[count].value)
+        states = unknowns.initial_states[e]
+        if (states >= 0).any():
+            initial = problem.system.initial_state if run.initial_state is None else run.initial_state
+            changes["initial_state"] = [
+                fix(x, i) if i >= 0 else x for x, i in zip(initial, states.tolist(), strict=True)
+            ]
+        runs.append(replace(run, **changes))
+    parameters = dict(problem.parameters)
+    for name, span in unknowns.parameters.items():
+        held = [i in fixed for i in range(span.start, span.stop)]
+        if any(held) and not all(held):
+            raise ValueError(f"the entries of {name!r} are estimated all together, or none of them.")
+        if all(held):
+            given = parameters[name]
+            parameters[name] = replace(given, value=at[span].reshape(given.shape), fixed=True)
+    return replace(problem, experiments=runs, parameters=parameters)
 
 
 @keep_with_problem

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint, TransitionCost
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, check_durations
 from switchfit.problem.structure import Function, Structure, select_kind, trace_structure
+from switchfit.problem.unknowns import get_min_duration
+from switchfit.problem.validation import as_count, as_name, as_names, join_names, require_known, shorten
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Library:
     successions : mapping of str to tuple of str
         The modes that may follow each mode.
     durations : mapping of str to float
-        Shortest time that each mode lasts, 0 where it may be any.
+        Shortest time that each mode lasts, in the time unit of the experiments; 0 where it may be any.
     max_switches : int
         Largest number of switches of a sequence.
     """
@@ -51,10 +53,6 @@ class Library:
     def allows(self, before: str, after: str) -> bool:
         """Return whether one mode may follow another."""
         return after in self.successions.get(before, ())
-
-    def min_duration(self, mode: str) -> float:
-        """Return the shortest time that a mode lasts, in the time unit of the experiments."""
-        return self.durations.get(mode, 0.0)
 
     def admits(self, sequence: Sequence[str]) -> bool:
         """Return whether a mode sequence is one of the library, with at most `max_switches` switches."""
@@ -91,10 +89,90 @@ class Library:
         """The numbers of switches up to `max_switches` with which there is a sequence."""
         return tuple(k for k, modes in enumerate(self.ends_after) if modes & set(self.first))
 
-    @property
-    def trimmed(self) -> Library:
-        """The same sequences, with a largest number of switches that one of them has: programs have room for it."""
-        return replace(self, max_switches=max(self.possible_switches, default=0))
+
+def build_library(
+    problem: Problem,
+    library: Any = None,
+    *,
+    first: Any = None,
+    last: Any = None,
+    successions: Any = None,
+    min_duration: Any = None,
+    max_switches: Any = 8,
+) -> Library:
+    """Return the library of a search from the arguments of `find_modes`, checked.
+
+    Parameters
+    ----------
+    problem : Problem
+    library : sequence of str, optional
+    first, last : str or sequence of str, optional
+    successions : mapping of str to sequence of str, optional
+    min_duration : float or mapping of str to float, optional
+    max_switches : int
+
+    Raises
+    ------
+    ValueError
+        For names that the system lacks, successions from a mode that is not in the library, a `last` that cannot be
+        reached from any `first`, or a negative duration.
+    TypeError
+        If an argument is of the wrong type.
+    """
+    most = as_count(max_switches, "max_switches")
+    names = _choose_modes(library, "library", tuple(problem.system.modes))
+    begins, ends = _choose_modes(first, "first", names), _choose_modes(last, "last", names)
+    followers = _check_successions(successions, names)
+    found = Library(names, begins, ends, followers, _read_durations(problem, min_duration, names), most)
+    if not replace(found, max_switches=len(names)).possible_switches:  # however many switches there may be
+        raise ValueError(
+            f"no mode of last ({join_names(ends)}) can be reached from first ({join_names(begins)}) by the "
+            "successions: add the missing successions, or change first or last."
+        )
+    return found
+
+
+def _choose_modes(given: Any, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the given modes among some names, in their order; all if they are left out."""
+    if given is None:
+        return names
+    chosen = (as_name(given, what),) if isinstance(given, str) else as_names(given, what, "a mode or a list of modes")
+    if not chosen:
+        raise ValueError(f"{what} is empty: name at least one mode, or leave it out for all modes.")
+    require_known(chosen, what, names)
+    return tuple(name for name in names if name in chosen)
+
+
+def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Return the modes that may follow each mode; a mode that a mapping leaves out has none."""
+    if given is None:
+        return {name: tuple(other for other in names if other != name) for name in names}
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            "successions must be a dict of mode -> the modes that may follow it, such as "
+            f"{{'flight': ('slide',), 'slide': ('stick',)}}; got {shorten(given)}."
+        )
+    require_known(given, "successions", names)
+    found: dict[str, tuple[str, ...]] = dict.fromkeys(names, ())
+    for name, after in given.items():
+        what = f"successions of {shorten(name)}"
+        listed = (after,) if isinstance(after, str) else as_names(after, what, "a sequence of names of modes")
+        require_known(listed, what, names)
+        if name in listed:
+            raise ValueError(f"{what} names the mode itself: a switch leads to another mode. Leave it out.")
+        found[name] = tuple(other for other in names if other in listed)
+    return found
+
+
+def _read_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dict[str, float]:
+    """Return the shortest duration of each mode; that of the problem where it is left out."""
+    found = {name: get_min_duration(problem.min_duration, name) for name in names}
+    if given is not None:
+        asked = check_durations(given, problem.system)
+        found |= {name: asked.get(name, found[name]) if isinstance(asked, dict) else asked for name in names}
+    if not all(0 <= least < np.inf for least in found.values()):
+        raise ValueError(f"min_duration must be zero or positive; got {shorten(given)}.")
+    return found
 
 
 Integers = NDArray[np.int64]
@@ -128,42 +206,29 @@ def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -
     return found.reset_maps[0], found.transition_costs[0], found.guards[0]
 
 
-def trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers]:
+def trace_transitions(problem: Problem, e: int, library: Library | None, births: int) -> tuple[Structure, Integers]:
     """Return the structure of an experiment with the modes and transitions of a library, and the places of the reset
     map, of the cost and of the guard of each of its transitions: (3, K, K), -1 without one.
+
+    Without a library, those of the given order of modes, whose N + 1 places stand for the modes.
     """
-    modes = tuple(name for name in problem.system.modes if name in library.modes)
-    places = {pair: (modes.index(pair[0]), modes.index(pair[1])) for pair in product(modes, modes)}
-    steps = [(pair, place) for pair, place in places.items() if pair[0] != pair[1] and library.allows(*pair)]
-    return _trace(problem, e, modes, steps, births)
-
-
-def trace_order(problem: Problem, e: int) -> tuple[Structure, Integers]:
-    """Return what `trace_library` does for the given order of modes, whose N + 1 places stand for the modes."""
-    sequence = problem.experiments[e].mode_sequence
-    modes = tuple(name for name in problem.system.modes if name in sequence)
-    steps = [(pair, (k, k + 1)) for k, pair in enumerate(pairwise(sequence))]
-    return _trace(problem, e, modes, steps, len(steps))
-
-
-def _trace(
-    problem: Problem,
-    e: int,
-    modes: tuple[str, ...],
-    steps: Sequence[tuple[tuple[str, str], tuple[int, int]]],
-    births: int,
-) -> tuple[Structure, Integers]:
-    """Trace a run and its transitions, each of which is a step between two places."""
     run = problem.experiments[e]
-    structure = trace_structure(problem.system, run, problem._functions, problem.solver, max(births, 1))
+    sequence = run.mode_sequence
+    modes = tuple(m for m in problem.system.modes if m in (sequence if library is None else library.modes))
+    if library is None:
+        steps = [(pair, (k, k + 1)) for k, pair in enumerate(pairwise(sequence))]
+    else:
+        pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
+        steps = [(pair, (modes.index(pair[0]), modes.index(pair[1]))) for pair in pairs]
+    structure = trace_structure(problem.system, run, problem._functions, problem.solver, births)
     known: list[list[Any]] = [list(dict.fromkeys(structure.reset_maps[i] for i in structure.jumps)), [], []]
     size = max(len(modes), *(1 + max(place) for _, place in steps), 1)
     tables = np.full((3, size, size), -1, dtype=np.int64)
     for pair, place in steps:
-        for table, library, function in zip(tables, known, trace_transition(problem, run, pair), strict=True):
+        for table, functions, function in zip(tables, known, trace_transition(problem, run, pair), strict=True):
             if function is not None:
-                library += [] if function in library else [function]
-                table[place] = library.index(function)
+                functions += [] if function in functions else [function]
+                table[place] = functions.index(function)
     reset_maps, transition_costs, guards = map(tuple, known)
     structure = replace(
         structure,
@@ -223,7 +288,7 @@ class Rules(NamedTuple):
     def of(cls, library: Library, modes: Sequence[str]) -> Rules:
         """Return the rules of a library."""
         allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
-        shortest = np.array([library.min_duration(mode) for mode in modes])
+        shortest = np.array([library.durations[mode] for mode in modes])
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
         return cls(np.arange(len(modes)), shortest, begins, ends[0], _list_follows(allowed, ends), None)

@@ -326,7 +326,9 @@ def is_minimum_time(problem: Problem, fit: Estimate) -> bool:
     if len(problem.experiments) != 1 or not fit.history:
         return False
     run, where = problem.experiments[0], problem.unknowns.times[0]
-    if not run.has_free_tf or np.any(where < 0) or not all(_is_unbounded(tau) for tau in run.transition_times):
+    if not run.has_free_tf or np.any(where < 0):
+        return False
+    if any(np.isfinite(tau.lower) or np.isfinite(tau.upper) or tau.prior for tau in run.transition_times):
         return False
     place, first = int(where[-1]), fit.history[0]
     rate = float(fit.gradient[place])
@@ -368,8 +370,3 @@ def shorten_horizon(problem: Problem, theta: FloatArray) -> Problem:
         tf=replace(run.tf, value=tf, upper=min(run.t0 + MARGIN * (tf - run.t0), float(run.tf.upper))),
     )
     return replace(problem, experiments=(shorter,))
-
-
-def _is_unbounded(parameter: Parameter) -> bool:
-    """Return whether a transition time is free, and bounded by its neighbors alone."""
-    return not (parameter.fixed or np.isfinite(parameter.lower) or np.isfinite(parameter.upper) or parameter.prior)

@@ -4,6 +4,8 @@ Chi-square is ``z . z``, z being the residuals without the part that the error o
 (`switchfit.strategy.validation`). With sigma unknown both in the fit and here, ``z . z / (n s^2)`` is compared with F
 of (n, degrees of freedom of the fit).
 
+The problem of another run from a fit: its parameters, and what the run says of itself.
+
 Residuals of another run without the correlation that the error of the fitted parameters makes.
 
 With residuals and derivatives in units of sigma, e the noise of the new run, dp the error of the fitted parameters
@@ -36,15 +38,18 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, inverse_on
 from switchfit.fit.trajectory import Comparison, Trajectory, compare
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements, count_from
+from switchfit.problem.dates import Dates
+from switchfit.problem.experiment import Experiment, show_time
 from switchfit.problem.parameter import PriorTerms
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_level, as_names, join_names, shorten
+from switchfit.problem.structure import select_kind
+from switchfit.problem.validation import as_level, as_names, join_names, list_columns, shorten
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first, validate_on
 from switchfit.strategy.choice import estimate as fit_problem
-from switchfit.strategy.other_run import build_other_problem, fix_unknowns
+from switchfit.strategy.known_order import fix_unknowns
 from switchfit.uncertainty.prediction import (
     Prediction,
     Sensitivity,
@@ -65,6 +70,115 @@ from switchfit.uncertainty.residuals import (
     measure_widening,
 )
 from switchfit.uncertainty.verdict import Finding, Level, Verdict, build_verdict
+
+
+def build_other_problem(estimate: Estimate, other: Any) -> Problem:
+    """Return the problem of another run, in which the parameters of a fit begin at their fitted values, without priors.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    other : Experiment, list of Experiment, Problem, Measurements or Log
+    """
+    if isinstance(other, Problem):
+        given, runs = other, list(other.experiments)
+    else:
+        given = estimate.evaluator_at_solution().problem
+        runs = list(other) if isinstance(other, (list, tuple)) else [other]
+        if not runs or not all(isinstance(item, Experiment) for item in runs):
+            runs = [_build_experiment(estimate, given, other)]
+    parameters = {}
+    for name, parameter in given.parameters.items():
+        if name in estimate.parameters:
+            value = estimate.parameters[name]
+            bounds = {"lower": np.minimum(parameter.lower, value), "upper": np.maximum(parameter.upper, value)}
+            held = parameter.fixed or name in estimate.fixed
+            parameter = replace(parameter, value=value, **bounds, prior=None, fixed=held)
+        parameters[name] = parameter
+    return replace(given, experiments=runs, parameters=parameters)
+
+
+def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Experiment:
+    """Return the only experiment of a fit with the data of another log."""
+    run, given = problem.experiments[0], list(other) if isinstance(other, (list, tuple)) else [other]
+    items = select_kind(run.data, Measurements)
+    is_log = list_columns(other) is not None and hasattr(other, "times")
+    if not is_log and not (given and all(isinstance(item, Measurements) for item in given)):
+        raise TypeError(
+            "validate needs another run: an sf.Experiment or a list of them, an sf.Problem, sf.Measurements or a log; "
+            f"got {shorten(other)}."
+        )
+    if len(problem.experiments) > 1 or run.inputs is not None or len(items) != len(run.data):
+        raise ValueError(
+            "another log has measurements alone, but the fit has several experiments, inputs, or other data than "
+            "sf.Measurements: give validate an sf.Experiment, which says what the other run is."
+        )
+    if is_log:
+        given = [_read_channels(other, item) for item in items]
+    if len(given) != len(items):
+        raise ValueError(f"the fit has {len(items)} Measurements; got {len(given)} for the other run.")
+    data = _count_dates([_complete(new, item) for new, item in zip(given, items, strict=True)], run)
+    first, last = min(item.seen_times[0] for item in data), max(item.times[-1] for item in data)
+    t0 = first if "t0" in run.taken_from_data else run.t0
+    times = estimate.transition_times[0]
+    if np.any(np.diff([t0, *times, last]) <= 0):
+        times = np.linspace(t0, last, len(run.mode_sequence) + 1)[1:-1]
+    guesses = tuple(
+        replace(tau, value=np.clip(time, tau.lower, tau.upper), prior=None)
+        for tau, time in zip(run.transition_times, times, strict=True)
+    )
+    return replace(run, data=data, t0=t0, tf=run.tf if run.has_free_tf else last, transition_times=guesses)
+
+
+def _count_dates(data: list[Measurements], run: Experiment) -> list[Measurements]:
+    """Return Measurements of another log with dates as numbers since the origin of the run of the fit."""
+    dated = [item for item in data if isinstance(item.times, Dates)]
+    if dated and run.origin is None:
+        raise ValueError(
+            "the other log has dates, and the times of the fit are numbers: give validate an sf.Experiment, whose "
+            "origin says at which date its times are 0."
+        )
+    counted = data if run.origin is None else [count_from(item, run.origin, run.time_unit) for item in data]
+    if dated and "t0" not in run.taken_from_data and min(item.times[0] for item in counted) > run.end:
+        raise ValueError(
+            f"the other log begins at {dated[0].times[0]!r}, after the end of the fit's horizon at "
+            f"{show_time(run, run.end)}: give validate an sf.Experiment, which says when the other run begins."
+        )
+    return counted
+
+
+def _read_channels(log: Any, like: Measurements) -> Measurements:
+    """Return the Measurements of a log's columns that are called like the channels of others."""
+    if like.names is None:
+        raise ValueError(
+            "the channels of the fit have no names by which to find the columns of the log: give its Measurements "
+            "names, or give validate sf.Measurements."
+        )
+    missing = [name for name in like.names if name not in log]
+    if missing:
+        raise ValueError(f"the log has no column {join_names(missing)}; it has {join_names(list(log.columns))}.")
+    values = np.stack([np.asarray(log[name], dtype=np.float64) for name in like.names], axis=1)
+    return Measurements(log.times, values, names=like.names)
+
+
+def _complete(new: Measurements, like: Measurements) -> Measurements:
+    """Return Measurements with what is left out in them taken from others, where the channels are as many."""
+    if new.values.shape[1] != like.values.shape[1]:
+        raise ValueError(
+            f"the Measurements of the fit have {like.values.shape[1]} channels, those of the other run "
+            f"{new.values.shape[1]}."
+        )
+    names = ("sigma", "observe", "names", "units")
+    left_out = {name: getattr(like, name) for name in names if getattr(new, name) is None}
+    if "sigma" in left_out:
+        if isinstance(like.sigma, np.ndarray) and like.sigma.ndim == 2:
+            raise ValueError(
+                "sigma differs from sample to sample in the fit: give the Measurements of the other run their "
+                "own sigma."
+            )
+        left_out |= {"loss": like.loss, "loss_scale": like.loss_scale}
+    return replace(new, delay=new.delay or like.delay, **left_out)
+
 
 NEGLIGIBLE = 1e-10
 """Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
@@ -102,8 +216,7 @@ def whiten_residuals(
     """
     d = len(problem.theta_names)
     found = [[c.residuals.copy() for c in run] for run in comparisons]
-    sigma = _collect_sigma(comparisons) * noise
-    freedom = len(sigma)
+    freedom = sum(item.count for item in problem.measurements)
     Z = np.zeros((d, 0))
     if refit is not None:
         where = _find_places(problem, refit)
@@ -116,6 +229,7 @@ def whiten_residuals(
     if robust or problem.is_sigma_known is None or not (np.isfinite(C).all() and np.isfinite(noise)):
         return found, np.nan, freedom, np.full((d, d), np.nan)
     samples = collect_sample_derivatives(problem, sensitivities)
+    sigma = noise * samples.weight**-0.5
     X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
     if refit is not None and refit.priors:
         rows, error = _weigh_priors(problem, refit)
@@ -187,14 +301,6 @@ def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> F
     C = np.zeros((d, d))
     C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
     return C
-
-
-def _collect_sigma(comparisons: Sequence[Sequence[Comparison]]) -> FloatArray:
-    """Return the sigma of all samples that are not missing, in the order of their derivatives; 1 where unknown."""
-    measured = [c for run in comparisons for c in run if c.kind == "measurements"]
-    sizes = [np.ones(c.measured.shape) if c.sigma is None else c.sigma for c in measured]
-    there = [size[np.isfinite(c.measured)] for size, c in zip(sizes, measured, strict=True)]
-    return np.concatenate([np.zeros(0), *there])
 
 
 class InputCorrelation(NamedTuple):

@@ -25,10 +25,10 @@ from switchfit.io.problem_file.experiments import (
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
 from switchfit.io.user_files import build_at, load_object, replace_files
-from switchfit.modes.library import build_library
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError, Issue
+from switchfit.strategy.library import build_library
 
 
 def describe_sources(
