@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from switchfit.io import find_examples
-from switchfit.io.logs.log import SECONDS, Log
+from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import SECONDS
 from switchfit.runtime.errors import InputError
 
 TABLES = {"parameters", "inputs", "library", "successions", "options"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import inspect
 import os
 import re
 import sys
@@ -87,8 +88,13 @@ def replace_files(contents: Any, change: Callable[[str], str]) -> Any:
     return contents if match is None else f"{change(match[1])}:{match[2]}"
 
 
-def call(function: Any, what: str, **arguments: Any) -> Any:
-    """Call a user's factory; raise InputError with the place if it fails."""
+def call(function: Callable[..., Any], what: str, **arguments: Any) -> Any:
+    """Call a user's factory; raise InputError if it does not take the arguments, or with the place if it fails."""
+    try:
+        inspect.signature(function).bind(**arguments)
+    except TypeError as error:
+        takes = ", ".join(inspect.signature(function).parameters) or "no arguments"
+        raise InputError(f"{what}: {error}; it takes {takes}.") from error
     with _explain_failure(what):
         return function(**arguments)
 

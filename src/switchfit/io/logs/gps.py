@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.io.logs import import_library
-from switchfit.io.logs.log import Event, FloatArray, Log, Options
-from switchfit.io.logs.tables import build_log
+from switchfit.io.logs.log import Event, FloatArray, Log, Options, build_log
 from switchfit.io.logs.text import decode
 from switchfit.runtime.errors import InputError, Issue
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from switchfit.io.logs import BAGS
 from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
-from switchfit.io.logs.log import SECONDS, FloatArray, Log, Options
-from switchfit.problem.dates import LENGTHS
+from switchfit.io.logs.log import FloatArray, Log, Options
+from switchfit.problem.dates import LENGTHS, SECONDS
 from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
 from switchfit.runtime.files import explain_read_errors
@@ -346,10 +346,10 @@ class _Format(NamedTuple):
 _TEXT = _Format("text", "read_text", "a table of text", ("topic",))
 _NMEA = _Format("gps", "read_nmea", "an NMEA 0183 log", ("time", "topic"))
 _BAG = _Format("ros", "read_bag", "a ROS bag", ("time",))
-_PARQUET = _Format("tables", "read_parquet", "a Parquet file", ("topic",))
+_PARQUET = _Format("arrays", "read_parquet", "a Parquet file", ("topic",))
 _FORMATS = {
     ".gpx": _Format("gps", "read_gpx", "a GPX track", ("time", "topic")),
-    ".mat": _Format("matlab", "read_mat", "a .mat file"),
+    ".mat": _Format("arrays", "read_mat", "a .mat file"),
     ".nmea": _NMEA,
     ".nma": _NMEA,
     ".parquet": _PARQUET,

@@ -11,8 +11,7 @@ import numpy as np
 
 from switchfit.io.logs import explain_damage, import_library
 from switchfit.io.logs.geodesy import LOCAL, SIGMA
-from switchfit.io.logs.log import Event, Log, Options
-from switchfit.io.logs.tables import build_log
+from switchfit.io.logs.log import Event, Log, Options, build_log
 from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError, Issue
 

@@ -18,8 +18,18 @@ from numpy.typing import NDArray
 
 from switchfit.io.logs import explain_damage
 from switchfit.io.logs.geodesy import FRAME, find_position
-from switchfit.io.logs.log import Event, FloatArray, Log, Options, is_unit, split_unit, strip_brackets
-from switchfit.io.logs.tables import build_log, find_time_name, refuse_without_times
+from switchfit.io.logs.log import (
+    Event,
+    FloatArray,
+    Log,
+    Options,
+    build_log,
+    find_time_name,
+    is_unit,
+    refuse_without_times,
+    split_unit,
+    strip_brackets,
+)
 from switchfit.problem.dates import read_date_text
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue

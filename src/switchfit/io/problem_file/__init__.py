@@ -29,8 +29,7 @@ from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
 
 if TYPE_CHECKING:
-    from switchfit.io.problem_file.building import ProblemFile
-    from switchfit.io.problem_file.experiments import Runs
+    from switchfit.io.problem_file.building import ProblemFile, Runs
     from switchfit.io.problem_file.logs import Opened
 
 
@@ -203,9 +202,10 @@ def read_experiments(path: str | Path) -> Runs:
     """
     path = Path(path)
     contents, opened = _open(path, read_contents(path)[1], None)
-    from switchfit.io.problem_file.building import build_without_python
+    from switchfit.io.problem_file.building import build_experiments, build_parameters
 
-    return build_without_python(path, contents, opened)
+    build_parameters(path, contents)
+    return build_experiments(path, contents, opened, run=False)
 
 
 def _open(

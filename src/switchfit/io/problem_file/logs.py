@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs.log import SECONDS, Log, Options, normalize_time_unit
+from switchfit.io.logs.log import Log, Options, normalize_time_unit
 from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable, LogTable, is_date
 from switchfit.io.user_files import build_at
 from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Dates, as_date, make_origin
+from switchfit.problem.dates import SECONDS, Dates, as_date, make_origin
 from switchfit.runtime.errors import InputError
 
 
@@ -160,11 +160,10 @@ def _open_logs(
     path: Path, where: str, contents: Contents, table: ExperimentTable, streamed: bool
 ) -> list[Log] | ValueError:
     """Return the logs of data and inputs, in this order, whose dates begin together; or what is wrong with them."""
-    parameters = find_parameters(contents, table)
     try:
         return align_starts(
             [
-                build_at(f"{path}: {where}.{place}", _open_log, path.parent, item, parameters, streamed)
+                build_at(f"{path}: {where}.{place}", _open_log, path.parent, item, contents, table, streamed)
                 for place, item in table.list_logs().items()
             ]
         )
@@ -172,19 +171,10 @@ def _open_logs(
         return error
 
 
-def find_parameters(contents: Contents, table: ExperimentTable) -> frozenset[str]:
-    """Return the names of parameters in an experiment, which a sigma may have without being a column.
-
-    Parameters
-    ----------
-    contents : Contents
-    table : ExperimentTable
-    """
-    return frozenset(contents.parameters) | frozenset(table.parameter_map)
-
-
-def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str], streamed: bool) -> Log:
-    columns = list(dict.fromkeys(list_columns(table, parameters)))
+def _open_log(
+    folder: Path, table: DataTable | InputTable, contents: Contents, run: ExperimentTable, streamed: bool
+) -> Log:
+    columns = list(dict.fromkeys(list_columns(table, contents, run)))
     if table.file is None and streamed:
         return Log(np.zeros(0), dict.fromkeys(columns, np.zeros(0)), dict.fromkeys(columns, ""), "", "the stream")
     if table.file is None:
@@ -194,15 +184,16 @@ def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset
     return log if table.epoch is None else _count_from_1970(log, table.epoch)
 
 
-def list_columns(table: DataTable | InputTable, parameters: frozenset[str]) -> list[str]:
-    """Return the columns of a log with values, and after them those that hold sigma.
+def list_columns(table: DataTable | InputTable, contents: Contents, run: ExperimentTable) -> list[str]:
+    """Return the columns of a log with values, and after them those that hold sigma, unless it is that of parameters.
 
     Parameters
     ----------
     table : DataTable or InputTable
-    parameters : frozenset of str
-        Names that a sigma may have without being a column.
+    contents : Contents
+    run : ExperimentTable
     """
+    parameters = {*contents.parameters, *run.parameter_map}
     columns = list(table.columns.values() if isinstance(table.columns, dict) else table.columns)
     given = table.sigma if isinstance(table, DataTable) and isinstance(table.sigma, list) else []
     named = [entry for entry in given if isinstance(entry, str)]
