@@ -21,17 +21,17 @@ YOUNG_OBJECTS = 200_000
 cold fit goes into searching imported modules and traces, none of which is garbage."""
 
 COMMANDS = {
-    "init": "starting",
+    "init": "checking",
     "fit": "fitting",
-    "modes": "modes",
+    "modes": "fitting",
     "online": "online",
     "design": "checking",
     "check": "checking",
     "simulate": "checking",
-    "validate": "comparison",
-    "compare": "comparison",
-    "examples": "starting",
-    "paper": "comparison",
+    "validate": "fitting",
+    "compare": "fitting",
+    "examples": "checking",
+    "paper": "checking",
 }
 """Commands, in the order of --help, and the modules that have them."""
 

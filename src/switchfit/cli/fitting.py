@@ -1,4 +1,4 @@
-"""``switchfit fit``: one problem, or many logs with one problem file."""
+"""``switchfit fit``, of one problem or of many logs, and ``modes``, ``validate`` and ``compare``."""
 
 from __future__ import annotations
 
@@ -81,13 +81,9 @@ def fit(
             raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
         if len(problem) != 1 or table is not None:
             terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
-        from switchfit.io.problem_file import load_problem
-
-        loaded = load_problem(problem[0])
-        terminal.make_folder(out)
-        options = loaded.options | overrides
-        estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
-        write_estimate(estimate, loaded, options, output)
+        loaded = _override(terminal.load(problem[0], out), overrides)
+        estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
+        write_estimate(estimate, loaded, output)
         from switchfit.io.command_line import summarize_estimate
         from switchfit.report.formats import add_dates
 
@@ -99,7 +95,11 @@ def fit(
             terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
 
-def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
+def _override(loaded: ProblemFile, options: dict[str, Any]) -> ProblemFile:
+    return replace(loaded, options=loaded.options | options)
+
+
+def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
     import switchfit as sf
 
@@ -110,7 +110,7 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     with terminal.stop_on_interrupt(
         lambda r: f"iteration {r.iteration}: J = {r.cost:.6g}, optimality {r.optimality:.1e}"
     ) as report:
-        estimate = sf.estimate(loaded.problem, callback=report, **options)
+        estimate = sf.estimate(loaded.problem, callback=report, **loaded.options)
     if prepare_figures:
         importing.join()  # two threads that import modules of one package in different orders find some half made
     if terminal.is_verbose():
@@ -141,14 +141,7 @@ class Output:
     full: bool
 
 
-def write_estimate(
-    estimate: Any,
-    loaded: ProblemFile,
-    options: dict[str, Any],
-    output: Output,
-    *,
-    show: bool = True,
-) -> None:
+def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.io.result_tables import TABLES
     from switchfit.report.formats import add_dates
@@ -166,7 +159,7 @@ def write_estimate(
     terminal.write_file(folder / "report.txt", report + "\n")
     for name, path in tables.items():
         terminal.write_file(path, TABLES[name](estimate))
-    provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
+    provenance = estimate.describe_provenance(replace(loaded.provenance, options=loaded.options))
     _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:
         terminal.write_figure(estimate, folder / f"fit.{output.figures}")
@@ -178,6 +171,8 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
     from switchfit.io.command_line import summarize_estimate
     from switchfit.io.result_tables import ResultTable, check_table, list_logs
+    from switchfit.io.user_files import describe_error
+    from switchfit.runtime.errors import InputError
 
     logs = list_logs(paths)
     if table is not None:
@@ -185,16 +180,21 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         terminal.make_folder(table.parent)
     results, fitted = ResultTable(), []
     for name, path in logs:
-        loaded, estimate, error = _fit_log(model, path, overrides, output)
+        folder = None if output.folder is None else output.folder / name
+        estimate, error = None, ""
+        try:
+            loaded = _override(terminal.load(model, log=path), overrides)
+            estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
+        except Exception as raised:
+            error = str(raised) if isinstance(raised, InputError) else describe_error(raised)
         results.add(str(path), estimate, error)
         terminal.print_text(results.describe_last())
-        folder = None if output.folder is None else output.folder / name
         refused = {"verdict": "refused", "message": error}
         shown = refused if estimate is None else summarize_estimate(estimate) | {"out": folder}
         fitted.append({"log": str(path)} | shown)
-        if loaded is not None and folder is not None:
+        if estimate is not None and folder is not None:
             terminal.make_folder(folder)
-            write_estimate(estimate, loaded, loaded.options | overrides, replace(output, folder=folder), show=False)
+            write_estimate(estimate, loaded, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
             terminal.write_file(table, results.write(table))
         if estimate is not None and estimate.status.name == "INTERRUPTED":
@@ -204,19 +204,6 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     if results.refused:
         return terminal.BAD_INPUT
     return terminal.NOT_CONVERGED if results.failed or len(results) < len(logs) else terminal.CONVERGED
-
-
-def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:
-    """Return the problem of a log and its estimate, or None for both, and what is wrong."""
-    from switchfit.io.problem_file import load_problem
-    from switchfit.io.user_files import describe_error
-    from switchfit.runtime.errors import InputError
-
-    try:
-        loaded = load_problem(model, log)
-        return loaded, estimate_problem(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
-    except Exception as error:
-        return None, None, str(error) if isinstance(error, InputError) else describe_error(error)
 
 
 def _import_figures() -> None:
@@ -247,3 +234,186 @@ def _write_page(estimate: Any, provenance: Any, path: Path) -> None:
         terminal.print_note(f"no {path.name}: {missing}")
     else:
         terminal.write_file(path, page)
+
+
+USABLE = {"FOUND", "UNIDENTIFIED", "AMBIGUOUS", "AT_LIMIT"}
+"""Statuses of a search whose best sequence explains the data."""
+
+
+ModesFolder = Annotated[
+    Path | None, output_folder("modes.txt, modes.json, modes.png and best.toml, which switchfit fit reads")
+]
+MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most switches of a run. Default: 8.")]
+Criterion = Annotated[
+    Literal["bic", "mbic", "aicc", "cost"],
+    option(help="Price of a switch. bic, the default: log n; mbic: twice as much; cost: --switch-cost."),
+]
+SwitchCost = Annotated[
+    float | None, option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost.")
+]
+Method = Annotated[
+    Literal["auto", "beam", "insertion"],
+    option(help="What proposes sequences. Default: auto, the beam for data if the model has machine code."),
+]
+Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
+
+
+def modes(
+    problem: terminal.ProblemPath,
+    out: ModesFolder = None,
+    max_switches: MaxSwitches = 8,
+    criterion: Criterion = "bic",
+    switch_cost: SwitchCost = None,
+    method: Method = "auto",
+    width: Width = 40,
+    figures: terminal.FigureFormat = "png",
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    verbose: terminal.Verbose = False,
+    debug: terminal.Debug = False,
+) -> None:
+    """Find which modes were active, in which order, and when.
+
+    Fits mode sequences of the model to the data, and prints the best with a table by number of switches. The [library]
+    of the problem file says which sequences there may be. Ctrl-C ends the search after the current fit and keeps the
+    best so far.
+
+    Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
+    fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
+    """
+    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
+        settings |= {"criterion": criterion, "switch_cost": switch_cost}
+        loaded = terminal.load(problem, out, searched=True)
+        from switchfit.io.command_line import summarize_modes
+
+        terminal.print_list("Logs", loaded.issues)
+        search = _search(loaded, loaded.library | settings)
+        terminal.print_text(search)
+        best = None if out is None else _write_modes(search, loaded, out, figures)
+        terminal.print_json(summarize_modes(search) | {"out": out, "problem_file": best})
+        terminal.fail_for_refused(loaded.issues)
+        if search.status.name == "NO_SUCCESSION":
+            terminal.fail(search.message)
+        if search.status.name not in USABLE:
+            terminal.end_unreliable(
+                "no mode sequence to rely on; the first line of the result says why, and what to do."
+            )
+
+
+def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
+    """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
+    import switchfit as sf
+
+    def describe(progress: Any) -> str:
+        best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
+        return f"{progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}"
+
+    with terminal.stop_on_interrupt(describe, "fit") as report:
+        return sf.find_modes(loaded.problem, callback=report, **settings)
+
+
+def _write_modes(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path | None:
+    """Write table, search, figure and the best as a problem file; return the path of that, None without it."""
+    from switchfit.io.problem_file.fitted import write_fitted_problem
+    from switchfit.runtime.errors import InputError
+
+    terminal.write_result(search, folder / "modes", figures if search.chosen else "", saved=True)
+    best = None
+    if search.best is not None:
+        try:
+            text = write_fitted_problem(loaded, search.best, folder)
+        except InputError as error:
+            terminal.print_note(f"no best.toml: {error}")
+        else:
+            best = folder / "best.toml"
+            terminal.write_file(best, text)
+    return best
+
+
+OtherRun = Annotated[Path, argument("LOG|PROBLEM.toml", "A log like the one that was fitted, or a problem file.")]
+ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
+SavedPaths = Annotated[
+    list[Path],
+    argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", exists=True, dir_okay=False),
+]
+ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
+
+
+def validate(
+    saved: terminal.SavedPath,
+    other: OtherRun,
+    out: ValidationFolder = None,
+    folder: terminal.Folder = None,
+    figures: terminal.FigureFormat = "png",
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    debug: terminal.Debug = False,
+) -> None:
+    """Check whether the parameters of a fit hold for another run.
+
+    The parameters are those of the saved estimate. Only what is the other run's own is estimated from it: transition
+    times, unknown initial states. A log is read as the one that was fitted: the same columns, modes and first guesses.
+    If these differ, name a problem file for the other run; its parameters get the values of the fit.
+
+    Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
+    """
+    with terminal.report_errors(debug, json=json, quiet=quiet):
+        from switchfit.estimation.estimator import Estimate
+        from switchfit.io.command_line import summarize_validation
+        from switchfit.io.saved_problem import list_changed_models, load_other_run
+
+        estimate = Estimate.load(saved)
+        given = estimate.provenance
+        loaded = load_other_run(saved, given, other, folder)
+        terminal.make_folder(out)
+        changes = [] if given is None else list_changed_models(given, loaded)
+        terminal.print_list("Changed since", changes)
+        terminal.print_list("Logs", loaded.issues)
+        found = estimate.validate(loaded.problem)
+        summary = summarize_validation(found) | {"changes": changes}
+        terminal.show(found, summary, None if out is None else out / "validation", figures)
+        terminal.fail_for_refused(loaded.issues)
+        if found.verdict.level == "bad":
+            terminal.end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
+
+
+def compare(
+    saved: SavedPaths,
+    out: ComparisonFolder = None,
+    folder: terminal.Folder = None,
+    figures: terminal.FigureFormat = "png",
+    json: terminal.Json = False,
+    quiet: terminal.Quiet = False,
+    debug: terminal.Debug = False,
+) -> None:
+    """Compare models that were fitted to the same data.
+
+    Prints a row for each saved estimate, the best one first: unknowns, likelihood, AICc, BIC. Each is named by its
+    file, or by its folder if the files are named alike.
+
+    Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
+    fits to different data.
+    """
+    with terminal.report_errors(debug, json=json, quiet=quiet):
+        import switchfit as sf
+        from switchfit.io.command_line import summarize_comparison
+        from switchfit.io.logs import name_files
+        from switchfit.io.saved_problem import load_with_problem
+
+        terminal.make_folder(out)
+        names = name_files(saved)
+        estimates, changes = [], []
+        for name, path in zip(names, saved, strict=True):
+            estimate, changed = load_with_problem(path, folder)
+            estimates.append(estimate)
+            changes += [f"{name}: {change}" for change in changed]
+        terminal.print_list("Changed since", changes)
+        found = sf.compare(estimates, names=names)
+        summary = summarize_comparison(found) | {"changes": changes}
+        terminal.show(found, summary, None if out is None else out / "comparison", figures)
+        failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
+        if failed:
+            terminal.end_unreliable(
+                f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small."
+            )

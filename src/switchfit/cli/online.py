@@ -87,9 +87,7 @@ def online(
     with terminal.report_errors(debug, json=not quiet, quiet=quiet, verbose=verbose):
         if stdin and replay is not None:
             terminal.fail("--replay and --stdin contradict each other; give one of them.")
-        from switchfit.io.problem_file import load_problem
-
-        loaded = load_problem(problem, replay, searched=True, streamed=stdin)
+        loaded = terminal.load(problem, out, log=replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
         from switchfit.modes.library import build_library
@@ -98,7 +96,6 @@ def online(
         from switchfit.problem.structure import select_kind
         from switchfit.runtime.presentation import format_count
 
-        terminal.make_folder(out)
         for file in filter(None, (state, journal)):
             file.parent.mkdir(parents=True, exist_ok=True)
         sensors = select_kind(loaded.problem.experiments[0].data, Measurements)

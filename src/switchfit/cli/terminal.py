@@ -17,7 +17,6 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -25,6 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import typer
 
 if TYPE_CHECKING:
+    from switchfit.io.problem_file.building import ProblemFile
     from switchfit.runtime.errors import Issue
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
@@ -32,30 +32,18 @@ CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 1
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Voice:
-    """What a command prints: of its result the text, the JSON or nothing, and notes about what it does."""
-
-    text: bool = True
-    json: bool = False
-    notes: bool = True
-    log: bool = False
-
-
-_TEXT = Voice()
-
-_voice: ContextVar[Voice] = ContextVar("what is printed", default=_TEXT)
+_asked: ContextVar[frozenset[str]] = ContextVar("of json, quiet and verbose those that hold", default=frozenset())
 
 
 @contextlib.contextmanager
-def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
-    """Return a context in which the options --json, --quiet and --verbose hold."""
-    if quiet and verbose:
+def _ask(asked: frozenset[str]) -> Iterator[None]:
+    """Return a context in which some of the options --json, --quiet and --verbose hold."""
+    if asked >= {"quiet", "verbose"}:
         fail("--quiet and --verbose contradict each other; give one of them.")
-    token = _voice.set(Voice(text=not (json or quiet), json=json, notes=not quiet, log=verbose))
+    token = _asked.set(asked)
     logger, handler = logging.getLogger("switchfit"), logging.StreamHandler()
     level = logger.level
-    if verbose:
+    if is_verbose():
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
     try:
@@ -63,23 +51,23 @@ def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = Fal
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)
-        _voice.reset(token)
+        _asked.reset(token)
 
 
 def is_verbose() -> bool:
     """Return whether --verbose was given."""
-    return _voice.get().log
+    return "verbose" in _asked.get()
 
 
 def print_text(text: object) -> None:
     """Print a part of the result as text."""
-    if _voice.get().text:
+    if not _asked.get() & {"json", "quiet"}:
         _print(text)
 
 
 def print_json(value: Any) -> None:
     """Print the result as JSON, if it is asked for."""
-    if _voice.get().json:
+    if "json" in _asked.get():
         _print(format_json(value))
 
 
@@ -92,7 +80,7 @@ def format_json(value: Any) -> str:
 
 def print_note(text: object) -> None:
     """Print what the command does, to stderr."""
-    if _voice.get().notes:
+    if "quiet" not in _asked.get():
         _print(text, err=True)
 
 
@@ -123,13 +111,13 @@ def interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 @contextlib.contextmanager
-def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+def report_errors(debug: bool, **options: bool) -> Iterator[None]:
     """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file.
 
-    The other options hold as in `choose_voice`.
+    In this context the options --json, --quiet and --verbose hold, too.
     """
     try:
-        with choose_voice(json=json, quiet=quiet, verbose=verbose), handle_interrupt(interrupt):
+        with _ask(frozenset(name for name, given in options.items() if given)), handle_interrupt(interrupt):
             yield
     except BaseException as error:
         from switchfit.io.user_files import find_user_place
@@ -188,7 +176,7 @@ def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
 
 def end_unreliable(reason: str) -> NoReturn:
     """Print why the result is not to be relied on, except with --quiet, and exit with the code that says so."""
-    if _voice.get().notes:
+    if "quiet" not in _asked.get():
         print_error(reason)
     raise typer.Exit(NOT_CONVERGED)
 
@@ -227,6 +215,15 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
+
+
+def load(problem: Path, out: Path | None = None, **how: Any) -> ProblemFile:
+    """Load a problem file as `load_problem` does, and create the folder for the results."""
+    from switchfit.io.problem_file import load_problem
+
+    loaded = load_problem(problem, **how)
+    make_folder(out)
+    return loaded
 
 
 def make_folder(folder: Path | None) -> None:
@@ -300,6 +297,14 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
     if figures:
         write_figure(result, stem.with_suffix(f".{figures}"))
     print_note(f"written to {stem.parent}")
+
+
+def show(result: Any, summary: dict[str, Any], stem: Path | None, figures: str, *, saved: bool = False) -> None:
+    """Print a result, and write it as `write_result` does, if there is a folder for it."""
+    print_text(result)
+    if stem is not None:
+        write_result(result, stem, figures, saved=saved)
+    print_json(summary | {"out": None if stem is None else stem.parent})
 
 
 def write_figure(result: Any, path: Path) -> None:

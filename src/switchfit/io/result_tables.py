@@ -16,6 +16,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Trajectory
 from switchfit.io.logs import find_logs, import_library, name_files
 from switchfit.report.formats import add_dates, format_rounded, label_quantity
 from switchfit.report.frames import ERROR
@@ -86,6 +87,38 @@ def write_runs(estimate: Estimate) -> str:
             row["origin"] = "" if trajectory.origin is None else trajectory.origin.date
         rows.append(row)
     return write_rows(rows)
+
+
+def write_trajectories(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
+    """Return trajectories as CSV: a row for each node or time, with the run, the mode and the states.
+
+    Parameters
+    ----------
+    names : sequence of str
+    runs : sequence of Trajectory
+
+    Raises
+    ------
+    ValueError
+        If they have times in different units.
+    """
+    units = {run.time_unit for run in runs}
+    if len(units) > 1:
+        raise ValueError(
+            f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
+            "CSV file would mix them: give each its own problem file."
+        )
+    (unit,) = units
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\r\n")
+    dated = any(run.origin is not None for run in runs)
+    columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
+    table.writerow(["experiment", *columns, "mode", *runs[0].state_names])
+    for name, run in zip(names, runs, strict=True):
+        dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
+        for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
+            table.writerow([name, t, *([date] if dated else []), mode, *x])
+    return text.getvalue()
 
 
 def _list_flags(fit: Fit, run: str, channels: Sequence[ChannelQuality], tested: int) -> Iterator[str]:
