@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, fields
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -24,18 +24,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.validation import shorten
-from switchfit.report.formats import (
-    add_dates,
-    describe_origin,
-    format_iso,
-    format_span,
-    format_table,
-    format_time,
-    label_quantity,
-    list_dated,
-    list_jumps,
-    suffix_time,
-)
+from switchfit.report import formats
 from switchfit.report.sentences import write_reason, write_step
 from switchfit.runtime.errors import InputError
 from switchfit.strategy.comparison import ModelComparison
@@ -59,19 +48,16 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["sa
     InputError
         If it is neither, or the step makes no or too many times.
     """
-    if not given:
-        return None
-    if given == "samples":
-        return "samples"
-    try:
-        step = float(given)
-    except ValueError:
-        raise InputError(f"--times must be a step, such as 0.1, or 'samples'; got {given!r}.") from None
+    if given in ("", "samples"):
+        return "samples" if given else None
     t0, tf = experiment.ends_of_modes(experiment.initial_times)[[0, -1]].tolist()
+    step = np.nan
+    with contextlib.suppress(ValueError):
+        step = float(given)
     if not (0 < step < np.inf and (tf - t0) / step < MOST_TIMES):
         raise InputError(
-            f"--times must be a positive step that makes at most {MOST_TIMES:,} times from t0 = {t0:g} to tf = {tf:g}; "
-            f"got {given}."
+            f"--times must be 'samples', or a positive step, such as 0.1, that makes at most {MOST_TIMES:,} times from "
+            f"t0 = {t0:g} to tf = {tf:g}; got {given!r}."
         )
     count = int(np.floor((tf - t0) / step * (1 + 1e-12)))
     return np.minimum(t0 + step * np.arange(count + 1), tf)
@@ -129,21 +115,20 @@ def describe(problem: Problem, *, full: bool = False) -> str:
     full : bool
         All of them, not one screen.
     """
-    lines = [describe_experiments(problem.experiments, full=full)]
-    unknowns = problem.unknowns
-    rows = []
+    unknowns, rows = problem.unknowns, []
     numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
     columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
-    dated = list_dated(problem)
+    dated = formats.list_dated(problem)
     for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
-        ends = [format_time(end, run) for end in (lower, upper)]
-        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{ends[0]}, {ends[1]}]"
+        first, least, most = (formats.format_time(number, run) for number in (value, lower, upper))
+        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{least}, {most}]"
         known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
-        rows.append((name, f"{format_time(value, run)}{'' if run else unit_suffix(unit)}", bounds, known, scale))
+        rows.append((name, f"{first}{'' if run else unit_suffix(unit)}", bounds, known, scale))
     if not full and len(rows) > MOST_UNKNOWNS:
-        kept = MOST_UNKNOWNS - 2
-        rows = [*rows[:kept], (f"and {len(rows) - kept} more", "", "", "", "")]
-    return "\n".join([*lines, "Unknowns, first guess and bounds", *format_table(rows, "<<<<<")])
+        left = len(rows) - MOST_UNKNOWNS + 2
+        rows[-left:] = [(f"and {left} more", "", "", "", "")]
+    experiments = describe_experiments(problem.experiments, full=full)
+    return "\n".join([experiments, "Unknowns, first guess and bounds", *formats.format_table(rows, "<<<<<")])
 
 
 def describe_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
@@ -155,13 +140,13 @@ def describe_experiments(experiments: Sequence[Experiment], *, full: bool = Fals
     full : bool
         All of them, not one screen.
     """
+    shown = experiments if full else experiments[:MOST_EXPERIMENTS]
     lines = []
-    for k, experiment in enumerate(experiments, start=1):
+    for k, experiment in enumerate(shown, start=1):
         lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
         lines += [f"  {line}" for line in _describe_experiment(experiment)]
-        if not full and k == MOST_EXPERIMENTS < len(experiments):
-            lines.append(f"and {len(experiments) - k} more experiments: --full lists them")
-            break
+    if left := len(experiments) - len(shown):
+        lines.append(f"and {left} more experiments: --full lists them")
     return "\n".join(lines)
 
 
@@ -181,10 +166,9 @@ def describe_steps(problem: Problem, *, full: bool = False) -> str:
     """
     evaluator = evaluator_of(problem)
     rows = []
-    given = zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True)
-    for name, structure, mesh in given:
+    for name, structure, mesh in zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True):
         run = "" if len(problem.experiments) == 1 else f"{name}: "
-        rows.append(f"  {run}{mesh.cells:,} {_describe_method(structure)}{''.join(f'; {s}' for s in mesh.stiffness)}")
+        rows.append("; ".join([f"  {run}{mesh.cells:,} {_describe_method(structure)}", *mesh.stiffness]))
     if not full and len(rows) > MOST_EXPERIMENTS:
         total = sum(mesh.cells for mesh in evaluator.meshes)
         rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
@@ -202,56 +186,50 @@ def _describe_method(structure: Structure) -> str:
 
 
 def _describe_experiment(experiment: Experiment) -> list[str]:
-    step_unit, unit = unit_suffix(experiment.time_unit), suffix_time(experiment)
+    unit = formats.suffix_time(experiment)
     ends = experiment.ends_of_modes(experiment.initial_times)
-    show = partial(format_time, run=experiment)
-    times = ", ".join(map(show, ends[1:-1]))
-    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{show(ends[0])}, {show(ends[-1])}]{unit}"
+    start, *times, end = (formats.format_time(time, experiment) for time in ends)
+    sequence = f"{' -> '.join(experiment.mode_sequence)} on [{start}, {end}]{unit}"
     if experiment.has_free_tf:
-        horizon += " (tf is estimated)"
+        sequence += " (tf is estimated)"
     if experiment.taken_from_data:
-        horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
-    lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
-    jumps = list_jumps(experiment.jump_times, experiment)
-    lines += [jumps] if jumps else []
-    lines += [f"times in {text}"] if (text := describe_origin(experiment)) else []
-    for item in experiment.data:
-        if isinstance(item, Measurements):
-            step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
-            missing = item.values.size - item.count
-            lines.append(
-                f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}, "
-                f"{format_span(item.times[0], item.times[-1], experiment)}, typically {step:.4g}{step_unit} apart, "
-                f"{missing} values missing{_describe_sensor(item, step_unit)}"
-            )
-        elif isinstance(item, ReferenceSignal):
-            knots = item.signal.knots
-            names = _join_channel_names(item.names, item.units, item.signal.channels)
-            lines.append(
-                f"reference signal of {names}, {format_span(knots[0], knots[-1], experiment)}, {len(knots)} knots"
-            )
-        else:
-            lines.append(type(item).__name__)
-    return lines
+        sequence += f" ({' and '.join(experiment.taken_from_data)} from the data)"
+    lines = [f"{sequence}, at {', '.join(times)}{unit}" if times else sequence]
+    lines.append(formats.list_jumps(experiment.jump_times, experiment))
+    lines += [f"times in {text}"] if (text := formats.describe_origin(experiment)) else []
+    lines += [_describe_data(item, experiment) for item in experiment.data]
+    return [line for line in lines if line]
 
 
-def _describe_sensor(item: Measurements, unit: str) -> str:
-    """Return a description of delay, noise and loss, empty for a sensor without these."""
+def _describe_data(item: Any, experiment: Experiment) -> str:
+    """Return the channels of data, their span and number, and what is known of the sensor."""
+    if isinstance(item, ReferenceSignal):
+        knots, names = item.signal.knots, _join_channel_names(item.names, item.units, item.signal.channels)
+        span = formats.format_span(knots[0], knots[-1], experiment)
+        return f"reference signal of {names}, {span}, {len(knots)} knots"
+    if not isinstance(item, Measurements):
+        return type(item).__name__
+    unit = unit_suffix(experiment.time_unit)
+    step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
     named = sorted({name for name in item.sigma_names if name})
     said = [
+        f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}",
+        formats.format_span(item.times[0], item.times[-1], experiment),
+        f"typically {step:.4g}{unit} apart",
+        f"{item.values.size - item.count} values missing",
         f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",
         "noise unknown" if item.sigma is None else "",
         f"sigma: {', '.join(named)}" if named else "",
         f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
     ]
-    return "".join(f", {text}" for text in said if text)
+    return ", ".join(filter(None, said))
 
 
 def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
     """Return names with their units, or the number of channels where they have no names."""
     if names is None:
         return f"{channels} channels"
-    return ", ".join(map(label_quantity, names, units or ("",) * channels))
+    return ", ".join(map(formats.label_quantity, names, units or ("",) * channels))
 
 
 KEYS = {
@@ -277,7 +255,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
         "converged": estimate.status.successful,
-        "message": add_dates(estimate.message, estimate),
+        "message": formats.add_dates(estimate.message, estimate),
         **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
@@ -331,13 +309,21 @@ def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
             for mode, begin, end in trajectory.mode_spans
         ],
         "jumps": trajectory.jump_times,
-        **({} if run is None else {"jump_dates": [format_iso(time, run) for time in trajectory.jump_times.tolist()]}),
+        **(
+            {}
+            if run is None
+            else {"jump_dates": [formats.format_iso(time, run) for time in trajectory.jump_times.tolist()]}
+        ),
     }
 
 
 def _list_dates(times: dict[str, float], run: Trajectory | None) -> dict[str, str | None]:
     """Return times as dates under the key "date" with a suffix each; {} where they are no dates."""
-    return {} if run is None else {f"date{suffix}": format_iso(time, run) or None for suffix, time in times.items()}
+    return (
+        {}
+        if run is None
+        else {f"date{suffix}": formats.format_iso(time, run) or None for suffix, time in times.items()}
+    )
 
 
 def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
@@ -448,7 +434,11 @@ def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
     now : Now
     run : Experiment
     """
-    dates = {} if run.origin is None else {"date": format_iso(now.time, run), "since_date": format_iso(now.since, run)}
+    dates = (
+        {}
+        if run.origin is None
+        else {"date": formats.format_iso(now.time, run), "since_date": formats.format_iso(now.since, run)}
+    )
     return {
         "t": now.time,
         **_pick(now, "mode", "since", "mode_sequence", "transition_times", "mode_probability"),

@@ -17,10 +17,11 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
-from switchfit.io.logs import find_logs, import_library, name_files
+from switchfit.io.logs import find_logs, name_files
 from switchfit.report.formats import add_dates, format_rounded, label_quantity
 from switchfit.report.frames import ERROR
 from switchfit.report.sentences import write_reason
+from switchfit.runtime.errors import import_library
 from switchfit.runtime.frames import describe_frame
 from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.answers import UNLIKELY
@@ -199,7 +200,9 @@ def check_table(path: Path) -> None:
         If it is to be Parquet, and pyarrow is not installed.
     """
     if path.suffix.lower() in PARQUET:
-        import_library("pyarrow.parquet", "parquet", str(path), "or give the table a name that ends in .csv")
+        import_library(
+            "pyarrow.parquet", str(path), "'switchfit[parquet]'", ", or give the table a name that ends in .csv"
+        )
 
 
 @dataclass

@@ -1,19 +1,15 @@
 """Logs: files of robots and test rigs, read into times and channels with units; each format has a module of its own.
 
 Which logs a pattern or a folder stands for, and what to call them.
-
-Libraries that read or write a format, which are installed with an extra of switchfit.
 """
 
 from __future__ import annotations
 
 import contextlib
 import glob
-import importlib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -81,35 +77,6 @@ def name_files(paths: Sequence[str | Path]) -> list[str]:
     levels = enumerate(zip(*parts, strict=False))
     shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
     return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
-
-
-def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any:
-    """Import a library.
-
-    Parameters
-    ----------
-    name : str
-        Such as ``"pyarrow.parquet"``.
-    extra : str
-        The extra of switchfit that it comes with.
-    what : str
-        What it is needed for, with the name of the file, as the begin of a sentence.
-    otherwise : str, optional
-        What else to do, as the end of a sentence.
-
-    Raises
-    ------
-    InputError
-        If it is not installed, with the command that installs it.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        library = name.partition(".")[0]
-        raise InputError(
-            f"{what} needs {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'"
-            f"{', ' if otherwise else ''}{otherwise}."
-        ) from error
 
 
 @contextlib.contextmanager

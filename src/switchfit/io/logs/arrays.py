@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs import explain_damage, import_library
+from switchfit.io.logs import explain_damage
 from switchfit.io.logs.log import Log, Options, build_log, find_time_name
 from switchfit.problem.validation import join_names, shorten
-from switchfit.runtime.errors import InputError
+from switchfit.runtime.errors import InputError, import_library
 from switchfit.runtime.files import explain_read_errors
 
 
@@ -25,7 +25,7 @@ def read_parquet(path: Path, options: Options) -> Log:
     InputError
         If the file cannot be read.
     """
-    parquet = import_library("pyarrow.parquet", "parquet", f"{path}: Parquet")
+    parquet = import_library("pyarrow.parquet", f"{path}: Parquet", "'switchfit[parquet]'")
     with explain_damage(path, "a Parquet file"):
         table = parquet.read_table(path)
         columns = {name: table.column(name).to_numpy() for name in table.column_names}
@@ -103,7 +103,7 @@ def _load(path: Path) -> dict[str, Any]:
         head = file.read(520)
     with explain_damage(path, "a .mat file"), warnings.catch_warnings():
         if HDF5 in (head[:8], head[512:520]):
-            h5py = import_library("h5py", "matlab", f"{path}: a .mat file of version 7.3")
+            h5py = import_library("h5py", f"{path}: a .mat file of version 7.3", "'switchfit[matlab]'")
             with h5py.File(path, "r") as file:
                 return {name: _read_hdf(h5py, item) for name, item in file.items() if not name.startswith("#")}
         from scipy.io import loadmat  # here, since importing it takes long

@@ -12,10 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from switchfit.io.logs import import_library
 from switchfit.io.logs.log import FloatArray, Log
 from switchfit.problem.validation import as_array, shorten
-from switchfit.runtime.errors import InputError
+from switchfit.runtime.errors import InputError, import_library
 
 LOCAL = ("east", "north", "up")
 """Names of the channels of the local frame, in metres."""
@@ -90,7 +89,7 @@ def add_local_frame(log: Log, origin: tuple[float, float, float] | None, range_e
         origin = (float(latitude[first]), float(longitude[first]), float(height))
     local = np.full((3, len(log)), np.nan)
     heights = np.where(np.isfinite(altitude[known]), altitude[known], origin[2])
-    pymap3d = import_library("pymap3d", "gps", f"{log.source}: a position")
+    pymap3d = import_library("pymap3d", f"{log.source}: a position", "'switchfit[gps]'")
     local[:, known] = pymap3d.geodetic2enu(latitude[known], longitude[known], heights, *origin)
     local[2, ~np.isfinite(altitude)] = np.nan
     values = {**log.values, **dict(zip(LOCAL, local, strict=True))}

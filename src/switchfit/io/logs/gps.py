@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs import import_library
 from switchfit.io.logs.log import Event, FloatArray, Log, Options, build_log
 from switchfit.io.logs.text import decode
-from switchfit.runtime.errors import InputError, Issue
+from switchfit.runtime.errors import InputError, Issue, import_library
 
 UNITS = {
     "latitude": "deg", "longitude": "deg", "altitude": "m", "speed": "m/s", "course": "deg", "hdop": "", "quality": "",
@@ -36,7 +35,7 @@ def read_gpx(path: Path, options: Options) -> Log:
         If the file cannot be read, or has no points with a time.
     """
     text = decode(path)
-    gpxpy = import_library("gpxpy", "gps", f"{path}: GPX")
+    gpxpy = import_library("gpxpy", f"{path}: GPX", "'switchfit[gps]'")
     try:
         gpx = gpxpy.parse(text)
     except Exception as error:  # of the parser of XML, of numbers, of dates
@@ -67,7 +66,7 @@ def read_nmea(path: Path, options: Options) -> Log:
     InputError
         If there is no fix.
     """
-    pynmea2 = import_library("pynmea2", "gps", f"{path}: NMEA 0183")
+    pynmea2 = import_library("pynmea2", f"{path}: NMEA 0183", "'switchfit[gps]'")
     fixes: list[dict[str, Any]] = []
     damaged: list[int] = []
     day: date | None = None

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs import explain_damage, import_library
+from switchfit.io.logs import explain_damage
 from switchfit.io.logs.geodesy import LOCAL, SIGMA
 from switchfit.io.logs.log import Event, Log, Options, build_log
 from switchfit.problem.validation import shorten
-from switchfit.runtime.errors import InputError, Issue
+from switchfit.runtime.errors import InputError, Issue, import_library
 
 SECOND = 10**9
 """Nanoseconds."""
@@ -41,8 +41,8 @@ def read_bag(path: Path, options: Options) -> Log:
         If the bag cannot be read, or the topic is missing or has no numbers.
     """
     what = f"{path}: a ROS bag"
-    highlevel = import_library("rosbags.highlevel", "ros", what)
-    typesys = import_library("rosbags.typesys", "ros", what)
+    highlevel = import_library("rosbags.highlevel", what, "'switchfit[ros]'")
+    typesys = import_library("rosbags.typesys", what, "'switchfit[ros]'")
     with explain_damage(path, "a ROS bag"):
         store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:

@@ -18,18 +18,9 @@ import numpy as np
 from switchfit.estimation.saved import FileDigest, Provenance, describe_platform, find_versions, make_relative
 from switchfit.io.logs import find_logs
 from switchfit.io.logs.log import Log
+from switchfit.io.problem_file import tables
 from switchfit.io.problem_file.logs import Opened, cut_log, list_columns
-from switchfit.io.problem_file.tables import (
-    OPTIONS,
-    Contents,
-    DataTable,
-    ExperimentTable,
-    InputTable,
-    JumpTable,
-    LibraryTable,
-    ModelTable,
-    ParameterTable,
-)
+from switchfit.io.problem_file.tables import OPTIONS, Contents, DataTable, ExperimentTable, InputTable, ModelTable
 from switchfit.io.user_files import build_at, call, find_object, load_object, replace_files
 from switchfit.models import BUILT_IN
 from switchfit.modes.library import build_library
@@ -260,7 +251,7 @@ def build_experiments(
 
 
 def _add_first_sequence(
-    path: Path, table: ExperimentTable, library: LibraryTable | None, system: HybridSystem | None
+    path: Path, table: ExperimentTable, library: tables.LibraryTable | None, system: HybridSystem | None
 ) -> ExperimentTable:
     """Return an experiment without a mode sequence with one of a single mode, from which a search begins.
 
@@ -327,7 +318,7 @@ class _Run:
         find_object(reference, self.folder, f"{self.where}.{place}")
         return lambda t, x, p: x
 
-    def _build_jump(self, place: str, table: JumpTable) -> Jump:
+    def _build_jump(self, place: str, table: tables.JumpTable) -> Jump:
         found = self._load_function(f"{place}.map", table.map.name)
         if table.map.arguments and self.system is not None:
             found = call(found, f"{self.where}.{place}.map {table.map.name!r}", **table.map.arguments)
@@ -377,7 +368,7 @@ class _Run:
         return Input(given, values[:, 0] if len(item.columns) == 1 else values, kind=item.kind, units=units)
 
 
-def build_parameter(table: ParameterTable) -> Parameter:
+def build_parameter(table: tables.ParameterTable) -> Parameter:
     """Return the unknown that a table describes.
 
     Parameters
@@ -401,8 +392,8 @@ def build_parameters(path: Path, contents: Contents) -> dict[str, Parameter]:
     path : Path
     contents : Contents
     """
-    tables = contents.parameters
-    return {name: build_at(f"{path}: parameters.{name}", build_parameter, tables[name]) for name in tables}
+    given = contents.parameters.items()
+    return {name: build_at(f"{path}: parameters.{name}", build_parameter, table) for name, table in given}
 
 
 @functools.cache
