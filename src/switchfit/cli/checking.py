@@ -263,7 +263,7 @@ def design(
         settings = {} if table is None else table.model_dump(exclude_none=True)
         settings |= terminal.select_given(criterion=criterion, samples=samples)
         plan = sf.design(loaded.problem, **settings)
-        terminal.show(plan, summarize_design(plan), None if out is None else out / "design", figures, saved=True)
+        terminal.show(plan, summarize_design(plan), out, "design", figures, saved=True)
         if out is not None:
             _write_plan(plan, out)
         terminal.fail_for_refused(loaded.issues)

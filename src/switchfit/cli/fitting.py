@@ -126,8 +126,10 @@ def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:
     """Return the CSV files for what a screen of the report has no room for."""
     from switchfit.report.text import SCREEN
 
-    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
-    is_long = {"runs": counts["runs"] > SCREEN["experiments"], "unknowns": counts["unknowns"] > SCREEN["unknowns"]}
+    is_long = {
+        "runs": len(estimate.run_names) > SCREEN["experiments"],
+        "unknowns": len(estimate.theta) > SCREEN["unknowns"],
+    }
     return {} if folder is None else {name: folder / f"{name}.csv" for name in is_long if is_long[name]}
 
 
@@ -170,15 +172,17 @@ def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
     from switchfit.io.command_line import summarize_estimate
-    from switchfit.io.result_tables import ResultTable, check_table, list_logs
+    from switchfit.io.result_tables import check_table, describe_fit, describe_row, list_logs, write_logs
     from switchfit.io.user_files import describe_error
     from switchfit.runtime.errors import InputError
+    from switchfit.runtime.presentation import format_count
 
     logs = list_logs(paths)
     if table is not None:
         check_table(table)
         terminal.make_folder(table.parent)
-    results, fitted = ResultTable(), []
+    rows: list[dict[str, Any]] = []
+    fitted = []
     for name, path in logs:
         folder = None if output.folder is None else output.folder / name
         estimate, error = None, ""
@@ -187,23 +191,25 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
             estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
         except Exception as raised:
             error = str(raised) if isinstance(raised, InputError) else describe_error(raised)
-        results.add(str(path), estimate, error)
-        terminal.print_text(results.describe_last())
-        refused = {"verdict": "refused", "message": error}
-        shown = refused if estimate is None else summarize_estimate(estimate) | {"out": folder}
+        rows.append(describe_fit(str(path), estimate, error))
+        terminal.print_text(describe_row(rows[-1]))
+        shown = rows[-1] if estimate is None else summarize_estimate(estimate) | {"out": folder}
         fitted.append({"log": str(path)} | shown)
         if estimate is not None and folder is not None:
             terminal.make_folder(folder)
             write_estimate(estimate, loaded, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
-            terminal.write_file(table, results.write(table))
+            terminal.write_file(table, write_logs(rows, table))
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
-    terminal.print_note(results.summarize(len(logs)))
+    refused = sum(row["verdict"] == "refused" for row in rows)
+    failed, left = sum(bool(row["message"]) for row in rows) - refused, len(logs) - len(rows)
+    counts = f"{len(rows) - refused - failed} fitted, {failed} not, {refused} refused"
+    terminal.print_note(f"{format_count(len(logs), 'log')}: {counts}{f'; {left} were not begun' if left else ''}")
     terminal.print_json({"logs": fitted})
-    if results.refused:
+    if refused:
         return terminal.BAD_INPUT
-    return terminal.NOT_CONVERGED if results.failed or len(results) < len(logs) else terminal.CONVERGED
+    return terminal.NOT_CONVERGED if failed or left else terminal.CONVERGED
 
 
 def _import_figures() -> None:
@@ -289,9 +295,9 @@ def modes(
 
         terminal.print_list("Logs", loaded.issues)
         search = _search(loaded, loaded.library | settings)
-        terminal.print_text(search)
-        best = None if out is None else _write_modes(search, loaded, out, figures)
-        terminal.print_json(summarize_modes(search) | {"out": out, "problem_file": best})
+        best = None if out is None else _write_best(search, loaded, out)
+        summary, drawn = summarize_modes(search) | {"problem_file": best}, figures if search.chosen else ""
+        terminal.show(search, summary, out, "modes", drawn, saved=True)
         terminal.fail_for_refused(loaded.issues)
         if search.status.name == "NO_SUCCESSION":
             terminal.fail(search.message)
@@ -313,22 +319,20 @@ def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
         return sf.find_modes(loaded.problem, callback=report, **settings)
 
 
-def _write_modes(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path | None:
-    """Write table, search, figure and the best as a problem file; return the path of that, None without it."""
+def _write_best(search: Any, loaded: ProblemFile, folder: Path) -> Path | None:
+    """Write the best mode sequence as a problem file; return its path, None if there is none."""
     from switchfit.io.problem_file.fitted import write_fitted_problem
     from switchfit.runtime.errors import InputError
 
-    terminal.write_result(search, folder / "modes", figures if search.chosen else "", saved=True)
-    best = None
-    if search.best is not None:
-        try:
-            text = write_fitted_problem(loaded, search.best, folder)
-        except InputError as error:
-            terminal.print_note(f"no best.toml: {error}")
-        else:
-            best = folder / "best.toml"
-            terminal.write_file(best, text)
-    return best
+    if search.best is None:
+        return None
+    try:
+        text = write_fitted_problem(loaded, search.best, folder)
+    except InputError as error:
+        terminal.print_note(f"no best.toml: {error}")
+        return None
+    terminal.write_file(folder / "best.toml", text)
+    return folder / "best.toml"
 
 
 OtherRun = Annotated[Path, argument("LOG|PROBLEM.toml", "A log like the one that was fitted, or a problem file.")]
@@ -371,8 +375,7 @@ def validate(
         terminal.print_list("Changed since", changes)
         terminal.print_list("Logs", loaded.issues)
         found = estimate.validate(loaded.problem)
-        summary = summarize_validation(found) | {"changes": changes}
-        terminal.show(found, summary, None if out is None else out / "validation", figures)
+        terminal.show(found, summarize_validation(found) | {"changes": changes}, out, "validation", figures)
         terminal.fail_for_refused(loaded.issues)
         if found.verdict.level == "bad":
             terminal.end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
@@ -410,8 +413,7 @@ def compare(
             changes += [f"{name}: {change}" for change in changed]
         terminal.print_list("Changed since", changes)
         found = sf.compare(estimates, names=names)
-        summary = summarize_comparison(found) | {"changes": changes}
-        terminal.show(found, summary, None if out is None else out / "comparison", figures)
+        terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", figures)
         failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
         if failed:
             terminal.end_unreliable(

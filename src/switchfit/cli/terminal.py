@@ -299,12 +299,14 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
     print_note(f"written to {stem.parent}")
 
 
-def show(result: Any, summary: dict[str, Any], stem: Path | None, figures: str, *, saved: bool = False) -> None:
+def show(
+    result: Any, summary: dict[str, Any], out: Path | None, name: str, figures: str, *, saved: bool = False
+) -> None:
     """Print a result, and write it as `write_result` does, if there is a folder for it."""
     print_text(result)
-    if stem is not None:
-        write_result(result, stem, figures, saved=saved)
-    print_json(summary | {"out": None if stem is None else stem.parent})
+    if out is not None:
+        write_result(result, out / name, figures, saved=saved)
+    print_json(summary | {"out": out})
 
 
 def write_figure(result: Any, path: Path) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from switchfit.report.frames import ERROR
 from switchfit.report.sentences import write_reason
 from switchfit.runtime.errors import import_library
 from switchfit.runtime.frames import describe_frame
-from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.answers import UNLIKELY
 from switchfit.uncertainty.residuals import ChannelQuality, measure_quality
 
@@ -205,110 +203,80 @@ def check_table(path: Path) -> None:
         )
 
 
-@dataclass
-class ResultTable:
-    """Results of fits to logs, in the order in which they were fitted.
+def describe_fit(log: str, estimate: Estimate | None, error: str) -> dict[str, Any]:
+    """Return the row of a log: its estimate, or the error that kept it from being fitted.
 
-    Attributes
+    A column that does not apply to it is left out. The message is empty for a fit that is good or doubtful.
+
+    Parameters
     ----------
-    rows : list of dict
-        Of each log its columns; a column that does not apply to it is left out.
-    unknowns : dict of str to str
-        Names of the columns of the unknowns of all logs, with the unit in parentheses, and their units.
-    refused, failed : int
+    log : str
+    estimate : Estimate or None
+    error : str
     """
+    if estimate is None:
+        return {"log": log, "verdict": "refused", "message": error}
+    message = "" if estimate.status.successful else add_dates(estimate.message, estimate)
+    if not message and not estimate.success:
+        message = write_reason(estimate.verdict.reasons[0])
+    quality, trajectory = measure_quality(estimate), estimate.trajectories[0]
+    row: dict[str, Any] = {
+        "log": log,
+        "verdict": estimate.verdict.level,
+        "status": estimate.status.name,
+        "cost": float(estimate.cost),
+        "values": estimate.samples,
+        "chi2": float(quality.chi_square),
+        "degrees of freedom": estimate.freedom,
+        "explained": float(quality.explained),
+        "t0": float(trajectory.times[0]),
+        "tf": float(trajectory.times[-1]),
+        "time unit": trajectory.time_unit,
+        "iterations": estimate.iterations,
+        "seconds": float(estimate.seconds),
+    }
+    unknowns = list_unknowns(estimate)
+    for unknown in unknowns:
+        shown = label_quantity(unknown["unknown"], unknown["unit"])
+        row |= {shown: unknown["value"], ERROR.format(shown): unknown["std_error"]}
+    row |= {f"{unknown['unknown']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
+    return {**row, "message": message}
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    unknowns: dict[str, str] = field(default_factory=dict)
-    refused: int = 0
-    failed: int = 0
 
-    def __len__(self) -> int:
-        return len(self.rows)
+def describe_row(row: Mapping[str, Any]) -> str:
+    """Return the row of a log as one line of text: verdict and numbers, or the error.
 
-    def add(self, log: str, estimate: Estimate | None, error: str) -> None:
-        """Add a row for a log: its estimate, or the error that kept it from being fitted.
+    Parameters
+    ----------
+    row : mapping
+    """
+    numbers = []
+    for name in (name for name in row if ERROR.format(name) in row):
+        value, error, _ = format_rounded(row[name], row[ERROR.format(name)])
+        numbers.append(f"{name} = {value} {error}".rstrip())
+    return ". ".join(filter(None, [f"{row['log']}: {row['verdict']}", ", ".join(numbers), row["message"]]))
 
-        Parameters
-        ----------
-        log : str
-        estimate : Estimate or None
-        error : str
-        """
-        if estimate is None:
-            self.refused += 1
-            self.rows.append({"log": log, "verdict": "refused", "message": error})
-            return
-        self.failed += not estimate.success
-        message = "" if estimate.status.successful else add_dates(estimate.message, estimate)
-        if not message and not estimate.success:
-            message = write_reason(estimate.verdict.reasons[0])
-        quality = measure_quality(estimate)
-        trajectory = estimate.trajectories[0]
-        row: dict[str, Any] = {
-            "log": log,
-            "verdict": estimate.verdict.level,
-            "status": estimate.status.name,
-            "cost": float(estimate.cost),
-            "values": estimate.samples,
-            "chi2": float(quality.chi_square),
-            "degrees of freedom": estimate.freedom,
-            "explained": float(quality.explained),
-            "t0": float(trajectory.times[0]),
-            "tf": float(trajectory.times[-1]),
-            "time unit": trajectory.time_unit,
-            "iterations": estimate.iterations,
-            "seconds": float(estimate.seconds),
-        }
-        unknowns = list_unknowns(estimate)
-        for unknown in unknowns:
-            shown = label_quantity(unknown["unknown"], unknown["unit"])
-            self.unknowns[shown] = unknown["unit"]
-            row |= {shown: unknown["value"], ERROR.format(shown): unknown["std_error"]}
-        row |= {f"{unknown['unknown']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
-        self.rows.append({**row, "message": message})
 
-    def describe_last(self) -> str:
-        """Return the last row as one line of text: verdict and numbers, or the error."""
-        row = self.rows[-1]
-        if row["verdict"] == "refused":
-            return f"{row['log']}: refused. {row['message']}"
-        numbers = []
-        for name in (name for name in self.unknowns if name in row):
-            value, error, _ = format_rounded(row[name], row[ERROR.format(name)])
-            numbers.append(f"{name} = {value} {error}".rstrip())
-        message = f". {row['message']}" if row["message"] else ""
-        return f"{row['log']}: {row['verdict']}. {', '.join(numbers)}{message}"
+def write_logs(rows: Sequence[Mapping[str, Any]], path: Path) -> str | bytes:
+    """Return the content of the table of logs, with the columns that any of them has.
 
-    def summarize(self, total: int) -> str:
-        """Return how many logs were fitted, in a line.
+    Parameters
+    ----------
+    rows : sequence of mapping
+    path : Path
+        Its ending says whether it is Parquet or CSV.
+    """
+    columns = sorted(list_columns(rows), key=lambda name: name == "message")  # which comes last
+    if path.suffix.lower() not in PARQUET:
+        return write_rows(rows, columns)
+    import pyarrow.parquet
 
-        Parameters
-        ----------
-        total : int
-            Logs that were to be fitted.
-        """
-        left = f"; {total - len(self)} were not begun" if total > len(self) else ""
-        fitted = len(self) - self.refused - self.failed
-        return f"{format_count(total, 'log')}: {fitted} fitted, {self.failed} not, {self.refused} refused{left}"
+    def find_unit(column: str) -> str:  # of an unknown, which has it in parentheses
+        name = column.removesuffix(ERROR.format(""))
+        return name[:-1].rpartition(" (")[2] if ERROR.format(name) in columns and name.endswith(")") else ""
 
-    def write(self, path: Path) -> str | bytes:
-        """Return the content of the table's file, with the columns that any of the logs has.
-
-        Parameters
-        ----------
-        path : Path
-            Its ending says whether it is Parquet or CSV.
-        """
-        columns = sorted(list_columns(self.rows), key=lambda name: name == "message")  # which comes last
-        return self._write_parquet(columns) if path.suffix.lower() in PARQUET else write_rows(self.rows, columns)
-
-    def _write_parquet(self, columns: Sequence[str]) -> bytes:
-        """Return Parquet; an empty cell is null, and the fields of unknowns have their units as metadata."""
-        import pyarrow.parquet
-
-        table, file = pyarrow.table({name: [row.get(name) for row in self.rows] for name in columns}), io.BytesIO()
-        units = [self.unknowns.get(name.removesuffix(ERROR.format("")), "") for name in columns]
-        fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
-        pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
-        return file.getvalue()
+    table, file = pyarrow.table({name: [row.get(name) for row in rows] for name in columns}), io.BytesIO()
+    units = map(find_unit, columns)
+    fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
+    pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
+    return file.getvalue()
