@@ -12,7 +12,7 @@ from test_cli import run
 
 import switchfit as sf
 from switchfit.io.problem_file import load_problem
-from switchfit.io.problem_file.fitted import write_fitted_problem
+from switchfit.io.problem_file.writing import write_fitted_problem
 
 MODEL = """
 import jax.numpy as jnp

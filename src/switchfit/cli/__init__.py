@@ -82,3 +82,10 @@ def main() -> None:
         build_app(asked or COMMANDS)(prog_name="switchfit")
     finally:
         gc.freeze()  # else Python searches all that is imported for garbage when it exits: 20 to 80 ms
+
+
+def __getattr__(name: str) -> object:
+    """Return the whole command line as ``app``, built when it is first used (PEP 562)."""
+    if name != "app":
+        raise AttributeError(f"module 'switchfit.cli' has no attribute {name!r}", name=name)
+    return globals().setdefault(name, build_app())

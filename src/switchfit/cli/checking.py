@@ -36,7 +36,7 @@ def init(
     """
     with terminal.report_errors(debug, quiet=quiet):
         from switchfit.io.command_line import describe_experiments
-        from switchfit.io.first_problem import write_first_problem
+        from switchfit.io.problem_file.writing import write_first_problem
 
         folder = Path(name)
         written = write_first_problem(folder, log)

@@ -321,7 +321,7 @@ def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
 
 def _write_best(search: Any, loaded: ProblemFile, folder: Path) -> Path | None:
     """Write the best mode sequence as a problem file; return its path, None if there is none."""
-    from switchfit.io.problem_file.fitted import write_fitted_problem
+    from switchfit.io.problem_file.writing import write_fitted_problem
     from switchfit.runtime.errors import InputError
 
     if search.best is None:

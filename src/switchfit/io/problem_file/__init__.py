@@ -165,7 +165,7 @@ def load_problem(
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> import switchfit as sf
-    >>> from switchfit.io.first_problem import write_first_problem
+    >>> from switchfit.io.problem_file.writing import write_first_problem
     >>> from switchfit.io.problem_file import load_problem
 
     >>> with TemporaryDirectory() as folder:
