@@ -8,8 +8,9 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -77,6 +78,22 @@ def name_files(paths: Sequence[str | Path]) -> list[str]:
     levels = enumerate(zip(*parts, strict=False))
     shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
     return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
+
+
+def refuse_without_times(source: str, names: Iterable[str]) -> NoReturn:
+    """Raise InputError for a table in which no column is found that has the times.
+
+    Parameters
+    ----------
+    source : str
+    names : iterable of str
+    """
+    from switchfit.problem.validation import join_names  # here, since it imports NumPy
+
+    raise InputError(
+        f"{source}: no column is called time; its columns are {join_names(names)}. Name the one with the times: "
+        "time = ..."
+    )
 
 
 @contextlib.contextmanager

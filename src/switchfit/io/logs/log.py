@@ -6,11 +6,12 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from typing import Any, NamedTuple, NoReturn, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.io.logs import refuse_without_times
 from switchfit.problem.dates import SECONDS, TIME_UNITS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
@@ -349,14 +350,6 @@ def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str 
             if kind.fullmatch(name.strip().lower()) and name.strip() != TEMPERATURE:
                 return name
     return next((name for name in given if name.strip() == TEMPERATURE and name not in channels), None)
-
-
-def refuse_without_times(source: str, names: Iterable[str]) -> NoReturn:
-    """Raise InputError for a table in which no column is found that has the times."""
-    raise InputError(
-        f"{source}: no column is called time; its columns are {join_names(names)}. Name the one with the times: "
-        "time = ..."
-    )
 
 
 def _find_spelled_unit(name: str) -> str:

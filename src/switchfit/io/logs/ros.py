@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from switchfit.io.logs import explain_damage
-from switchfit.io.logs.geodesy import LOCAL, SIGMA
 from switchfit.io.logs.log import Event, Log, Options, build_log
+from switchfit.io.logs.reader import LOCAL, SIGMA
 from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError, Issue, import_library
 

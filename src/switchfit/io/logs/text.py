@@ -16,21 +16,10 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs import explain_damage
-from switchfit.io.logs.geodesy import FRAME, find_position
-from switchfit.io.logs.log import (
-    Event,
-    FloatArray,
-    Log,
-    Options,
-    build_log,
-    find_time_name,
-    is_unit,
-    refuse_without_times,
-    split_unit,
-    strip_brackets,
-)
-from switchfit.problem.dates import read_date_text
+from switchfit.io.logs import explain_damage, refuse_without_times
+from switchfit.io.logs.log import Event, Log, Options, build_log, find_time_name, is_unit, split_unit, strip_brackets
+from switchfit.io.logs.reader import FRAME, find_position
+from switchfit.problem.dates import FloatArray, read_date_text
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
 from switchfit.runtime.files import explain_read_errors
