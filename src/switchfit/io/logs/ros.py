@@ -18,7 +18,8 @@ from switchfit.runtime.errors import InputError, Issue, import_library
 SECOND = 10**9
 """Nanoseconds."""
 FAR = 86_400 * SECOND
-"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are of another clock."""
+"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are those of another clock, as of
+a simulation, and stay as they are."""
 LONGEST_ARRAY = 36
 """Entries of an array in a message that become channels; longer ones are pictures and scans."""
 
@@ -51,37 +52,31 @@ def read_bag(path: Path, options: Options) -> Log:
 
 def _read_topic(path: Path, reader: Any, options: Options) -> Log:
     connections = _choose_connections(path, reader.connections, options.topic)
-    kind = connections[0].msgtype
+    kind, topic = connections[0].msgtype, connections[0].topic
     read = _READERS.get(kind, _flatten)
+    given = [
+        (received, reader.deserialize(data, connection.msgtype))
+        for connection, received, data in reader.messages(connections=connections)
+    ]
+    if not given:
+        raise InputError(f"{path}: topic {topic} has no messages; there is nothing to read.")
     start = reader.start_time
-    records: list[Record] = []
-    events: list[Event] = []
-    stamps: list[int] = []
-    received: list[int] = []
-    for connection, time, data in reader.messages(connections=connections):
-        message = reader.deserialize(data, connection.msgtype)
-        received.append(time)
-        stamps.append(_read_stamp(message))
-        records.append(read(message))
-        if isinstance(getattr(message, "data", None), str):
-            events.append(Event((time - start) / SECOND, connection.topic, message.data))
-    if not records:
-        raise InputError(f"{path}: topic {connections[0].topic} has no messages; there is nothing to read.")
+    texts = [(time, getattr(message, "data", None)) for time, message in given]
+    events = [Event((time - start) / SECOND, topic, text) for time, text in texts if isinstance(text, str)]
+    records = [read(message) for _, message in given]
+    stamps = [_read_stamp(message) for _, message in given]
     has_stamps = any(stamps)
-    clock, offset = _choose_clock(stamps if has_stamps else received, start)
+    moments = np.array(stamps if has_stamps else [time for time, _ in given])
+    zero = start if abs(int(moments[0]) - start) < FAR else 0  # all topics of a bag count from its begin
     names = dict.fromkeys(name for record in records for name in record)
     values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
     units = {name: _UNITS.get(_strip(name), "") if kind in _READERS else "" for name in values}
-    issues = () if has_stamps else (Issue("log: no stamps", (str(path), connections[0].topic)),)
+    issues = () if has_stamps else (Issue("log: no stamps", (str(path), topic)),)
     name = "stamp" if has_stamps else "received"
-    log = build_log(
-        f"{path} ({connections[0].topic})",
-        {**values, name: clock},
-        units | {name: "s"},
-        options._replace(time=name, keep_epoch=True),
-    )
+    columns = {**values, name: (moments - zero) / SECOND}
+    log = build_log(f"{path} ({topic})", columns, units | {name: "s"}, options._replace(time=name, keep_epoch=True))
     return replace(
-        log, offset=offset, issues=issues, events=tuple(events), place="message", has_positions=read is _read_fix
+        log, offset=zero / SECOND, issues=issues, events=tuple(events), place="message", has_positions=read is _read_fix
     )
 
 
@@ -106,16 +101,6 @@ def _read_stamp(message: Any) -> int:
     return 0 if stamp is None else int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
-def _choose_clock(stamps: Sequence[int], start: int) -> tuple[Any, float]:
-    """Return seconds since the bag began, which all topics of a bag share, and when that was.
-
-    Stamps of another clock, as those of a simulation, are left as they are.
-    """
-    near = abs(stamps[0] - start) < FAR
-    zero = start if near else 0
-    return np.array([stamp - zero for stamp in stamps], dtype=np.int64) / SECOND, zero / SECOND
-
-
 def _strip(name: str) -> str:
     """Return the quantity that a channel is of: "x" for "sigma_x", "velocity" for "left.velocity"."""
     return name.rpartition(".")[2].removeprefix("sigma_")
@@ -125,9 +110,10 @@ def _strip(name: str) -> str:
 
 
 def _read_fix(message: Any) -> Record:
+    position = ("latitude", "longitude", "altitude")
     if message.status.status < 0:  # no fix
-        return {"latitude": np.nan, "longitude": np.nan, "altitude": np.nan}
-    found = {"latitude": message.latitude, "longitude": message.longitude, "altitude": message.altitude}
+        return dict.fromkeys(position, np.nan)
+    found = {name: getattr(message, name) for name in position}
     variances = np.asarray(message.position_covariance)[[0, 4, 8]]
     if message.position_covariance_type > 0 and np.all(variances > 0):
         found |= dict(zip(SIGMA, np.sqrt(variances).tolist(), strict=True))

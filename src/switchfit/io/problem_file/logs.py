@@ -51,11 +51,11 @@ def cut_log(
             )
     times = times[inside]
     _check_order(log, times, log.rows[inside], what)
-    offset = times[0] if table.time_offset is None else table.time_offset
     values = np.stack([log[name][inside] for name in columns], axis=1)
     units = tuple(log.units[log.find_channel(name)] for name in columns)
     if log.dates is not None and _keep_dates(table, log, run):
         return log.dates[inside], values, units
+    offset = times[0] if table.time_offset is None else table.time_offset
     return (times - offset) * _find_time_scale(log, table, run.time_unit), values, units
 
 
@@ -107,8 +107,6 @@ def _keep_dates(item: LogTable, log: Log, run: ExperimentTable) -> bool:
     Those that are written as dates are, unless time_offset or time_scale makes numbers of them; the stamps of a
     recorder, and numbers since 1970, only if the file says that they are dates, or gives a date to compare them with.
     """
-    if not log.offset:
-        return False
     stated = item.epoch is not None or run.origin is not None or run.time_zone is not None or _has_dates(run)
     if item.time_offset == 0.0 and item.time_scale is None:
         return log.has_dates or stated
@@ -148,27 +146,22 @@ def open_experiments(
     """
     opened = []
     for k, tables in enumerate(expanded, start=1):
-        runs = [(table, _open_logs(path, f"experiments[{k}]", contents, table, streamed)) for table in tables]
+        runs: Opened = []
+        for table in tables:
+            where = f"{path}: experiments[{k}]"
+            try:
+                logs = [
+                    build_at(f"{where}.{place}", _open_log, path.parent, item, contents, table, streamed)
+                    for place, item in table.list_logs().items()
+                ]
+                runs.append((table, align_starts(logs)))
+            except ValueError as error:
+                runs.append((table, error))
         errors = [logs for _, logs in runs if isinstance(logs, ValueError)]
         if len(errors) == len(runs):
             raise errors[0]
         opened.append(runs)
     return opened
-
-
-def _open_logs(
-    path: Path, where: str, contents: Contents, table: ExperimentTable, streamed: bool
-) -> list[Log] | ValueError:
-    """Return the logs of data and inputs, in this order, whose dates begin together; or what is wrong with them."""
-    try:
-        return align_starts(
-            [
-                build_at(f"{path}: {where}.{place}", _open_log, path.parent, item, contents, table, streamed)
-                for place, item in table.list_logs().items()
-            ]
-        )
-    except ValueError as error:
-        return error
 
 
 def _open_log(
