@@ -18,8 +18,8 @@ from switchfit.runtime.errors import InputError, Issue, import_library
 SECOND = 10**9
 """Nanoseconds."""
 FAR = 86_400 * SECOND
-"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are those of another clock, as of
-a simulation, and stay as they are."""
+"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are of another clock, as that of a
+simulation, and stay as they are."""
 LONGEST_ARRAY = 36
 """Entries of an array in a message that become channels; longer ones are pictures and scans."""
 
@@ -54,19 +54,20 @@ def _read_topic(path: Path, reader: Any, options: Options) -> Log:
     connections = _choose_connections(path, reader.connections, options.topic)
     kind, topic = connections[0].msgtype, connections[0].topic
     read = _READERS.get(kind, _flatten)
-    given = [
-        (received, reader.deserialize(data, connection.msgtype))
-        for connection, received, data in reader.messages(connections=connections)
-    ]
-    if not given:
-        raise InputError(f"{path}: topic {topic} has no messages; there is nothing to read.")
     start = reader.start_time
-    texts = [(time, getattr(message, "data", None)) for time, message in given]
-    events = [Event((time - start) / SECOND, topic, text) for time, text in texts if isinstance(text, str)]
-    records = [read(message) for _, message in given]
-    stamps = [_read_stamp(message) for _, message in given]
+
+    def unpack(connection: Any, time: int, data: bytes) -> tuple[int, int, Record, Event | None]:
+        message = reader.deserialize(data, connection.msgtype)
+        text = getattr(message, "data", None)
+        event = Event((time - start) / SECOND, topic, text) if isinstance(text, str) else None
+        return time, _read_stamp(message), read(message), event
+
+    found = [unpack(*given) for given in reader.messages(connections=connections)]
+    if not found:
+        raise InputError(f"{path}: topic {topic} has no messages; there is nothing to read.")
+    received, stamps, records, events = zip(*found, strict=True)
     has_stamps = any(stamps)
-    moments = np.array(stamps if has_stamps else [time for time, _ in given])
+    moments = np.array(stamps if has_stamps else received)
     zero = start if abs(int(moments[0]) - start) < FAR else 0  # all topics of a bag count from its begin
     names = dict.fromkeys(name for record in records for name in record)
     values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
@@ -75,8 +76,9 @@ def _read_topic(path: Path, reader: Any, options: Options) -> Log:
     name = "stamp" if has_stamps else "received"
     columns = {**values, name: (moments - zero) / SECOND}
     log = build_log(f"{path} ({topic})", columns, units | {name: "s"}, options._replace(time=name, keep_epoch=True))
+    said = tuple(filter(None, events))
     return replace(
-        log, offset=zero / SECOND, issues=issues, events=tuple(events), place="message", has_positions=read is _read_fix
+        log, offset=zero / SECOND, issues=issues, events=said, place="message", has_positions=read is _read_fix
     )
 
 
