@@ -12,9 +12,11 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+import switchfit as sf
 from switchfit.cli import terminal
 from switchfit.cli.terminal import argument, option, output_folder
 from switchfit.io import find_examples
+from switchfit.runtime.files import write_atomically
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
 FirstLog = Annotated[
@@ -22,11 +24,10 @@ FirstLog = Annotated[
 ]
 
 
+@terminal.command("quiet")
 def init(
     name: NewFolder,
     log: FirstLog = None,
-    quiet: terminal.Quiet = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Create a problem to begin with, ready to fit.
 
@@ -34,19 +35,18 @@ def init(
     the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
     estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
     """
-    with terminal.report_errors(debug, quiet=quiet):
-        from switchfit.io.command_line import describe_experiments
-        from switchfit.io.problem_file.writing import write_first_problem
+    from switchfit.io.command_line import describe_experiments
+    from switchfit.io.problem_file.writing import write_first_problem
 
-        folder = Path(name)
-        written = write_first_problem(folder, log)
-        loaded = terminal.load(folder / "problem.toml")
-        terminal.print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
-        terminal.print_text(describe_experiments(loaded.problem.experiments))
-        terminal.print_text(
-            f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
-            f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
-        )
+    folder = Path(name)
+    written = write_first_problem(folder, log)
+    loaded = terminal.load(folder / "problem.toml")
+    terminal.print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
+    terminal.print_text(describe_experiments(loaded.problem.experiments))
+    terminal.print_text(
+        f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
+        f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
+    )
 
 
 def _complete_examples(incomplete: str) -> list[str]:
@@ -65,37 +65,36 @@ ExampleName = Annotated[
 ExampleFolder = Annotated[Path | None, argument("FOLDER", "Folder to create. Default: one of the name.")]
 
 
+@terminal.command()
 def examples(
     name: ExampleName = None,
     folder: ExampleFolder = None,
-    debug: terminal.Debug = False,
 ) -> None:
     """List the examples, or copy one.
 
     It is copied into a new folder. Nothing is overwritten.
     """
-    with terminal.report_errors(debug):
-        found = _list_examples()
-        if name is None:
-            width = max(map(len, found), default=0)
-            terminal.print_text("\n".join(f"{each:<{width}}  {_describe(path)}" for each, path in found.items()))
-            terminal.print_note("\nCopy one with: switchfit examples NAME")
-            return
-        if name not in found:
-            terminal.fail(f"there is no example {name!r}; there are {', '.join(found)}.")
-        target = Path(name) if folder is None else folder
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            terminal.fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.")
-        source = found[name]
-        if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
-        else:
-            target.mkdir(parents=True, exist_ok=True)
-            shutil.copy(source, target)
-        problems, scripts = sorted(target.glob("*.toml")), sorted(target.glob("*.py"))
-        commands = [f"switchfit {_choose_command(path)} {path}" for path in problems]
-        commands = commands or [f"python {path}" for path in scripts]
-        terminal.print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
+    found = _list_examples()
+    if name is None:
+        width = max(map(len, found), default=0)
+        terminal.print_text("\n".join(f"{each:<{width}}  {_describe(path)}" for each, path in found.items()))
+        terminal.print_note("\nCopy one with: switchfit examples NAME")
+        return
+    if name not in found:
+        terminal.fail(f"there is no example {name!r}; there are {', '.join(found)}.")
+    target = Path(name) if folder is None else folder
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        terminal.fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.")
+    source = found[name]
+    if source.is_dir():
+        shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
+    else:
+        target.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source, target)
+    problems, scripts = sorted(target.glob("*.toml")), sorted(target.glob("*.py"))
+    commands = [f"switchfit {_choose_command(path)} {path}" for path in problems]
+    commands = commands or [f"python {path}" for path in scripts]
+    terminal.print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
 
 
 def _choose_command(path: Path) -> str:
@@ -117,6 +116,7 @@ def _describe(path: Path) -> str:
     return text.partition("\n")[0]
 
 
+@terminal.command("json", "quiet", "verbose")
 def check(
     problem: terminal.ProblemPath,
     no_run: Annotated[
@@ -126,10 +126,6 @@ def check(
         bool,
         typer.Option("--full", help="List all runs and unknowns, and compare with the paper's equations too: seconds."),
     ] = False,
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Check a problem without fitting it.
 
@@ -138,33 +134,31 @@ def check(
 
     Exit code 0: the derivatives are right. 1: they are not. 2: the input is wrong.
     """
-    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        if no_run:
-            _check_files(problem, full)
-            return
-        loaded = terminal.load(problem)
-        import switchfit as sf
-        from switchfit.fit.evaluator import evaluator_of
-        from switchfit.io.command_line import describe, describe_steps, summarize_check
-        from switchfit.report.uncertainty import write_orders
+    if no_run:
+        _check_files(problem, full)
+        return
+    loaded = terminal.load(problem)
+    from switchfit.fit.evaluator import evaluator_of
+    from switchfit.io.command_line import describe, describe_steps, summarize_check
+    from switchfit.report.uncertainty import write_orders
 
-        terminal.print_text(f"{describe(loaded.problem, full=full)}\n")
-        terminal.print_list("Logs", loaded.issues)
-        terminal.print_text(f"{describe_steps(loaded.problem, full=full)}\n")
-        evaluator = evaluator_of(loaded.problem)
-        if terminal.is_verbose():
-            terminal.print_note(evaluator.engine)
-        derivatives = sf.check_derivatives(loaded.problem, paper=full)
-        short = f"Derivatives of J along a random direction\n  {write_orders(derivatives)}"
-        terminal.print_text(f"{derivatives if full else short}\n")
-        found = sf.identifiability(loaded.problem)
-        terminal.print_text(found)
-        terminal.print_json(
-            summarize_check(evaluator, derivatives, found) | {"issues": [str(issue) for issue in loaded.issues]}
-        )
-        terminal.fail_for_refused(loaded.issues)
-        if not derivatives.passed:
-            raise typer.Exit(terminal.NOT_CONVERGED)
+    terminal.print_text(f"{describe(loaded.problem, full=full)}\n")
+    terminal.print_list("Logs", loaded.issues)
+    terminal.print_text(f"{describe_steps(loaded.problem, full=full)}\n")
+    evaluator = evaluator_of(loaded.problem)
+    if terminal.is_asked("verbose"):
+        terminal.print_note(evaluator.engine)
+    derivatives = sf.check_derivatives(loaded.problem, paper=full)
+    short = f"Derivatives of J along a random direction\n  {write_orders(derivatives)}"
+    terminal.print_text(f"{derivatives if full else short}\n")
+    found = sf.identifiability(loaded.problem)
+    terminal.print_text(found)
+    terminal.print_json(
+        summarize_check(evaluator, derivatives, found) | {"issues": [str(issue) for issue in loaded.issues]}
+    )
+    terminal.fail_for_refused(loaded.issues)
+    if not derivatives.passed:
+        raise typer.Exit(terminal.NOT_CONVERGED)
 
 
 def _check_files(problem: Path, full: bool) -> None:
@@ -190,13 +184,11 @@ Times = Annotated[
 ]
 
 
+@terminal.command("json", "quiet")
 def simulate(
     problem: terminal.ProblemPath,
     out: OutputFile = None,
     times: Times = "",
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Integrate the model at the first guess.
 
@@ -204,24 +196,22 @@ def simulate(
     experiments' time_unit is "min" instead of "s". Where times are dates, a column "date" has them, in the time zone of
     the experiment.
     """
-    if out is None and not json:
+    if out is None and not terminal.is_asked("json"):
         terminal.fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
-    with terminal.report_errors(debug, json=json, quiet=quiet):
-        loaded = terminal.load(problem)
-        import switchfit as sf
-        from switchfit.io.command_line import choose_times, tabulate_trajectory
+    loaded = terminal.load(problem)
+    from switchfit.io.command_line import choose_times, tabulate_trajectory
 
-        given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
-        runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
-        names = loaded.problem.run_names
-        terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
-        if out is None:
-            return
-        from switchfit.io.result_tables import write_trajectories
+    given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
+    runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
+    names = loaded.problem.run_names
+    terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
+    if out is None:
+        return
+    from switchfit.io.result_tables import write_trajectories
 
-        table = write_trajectories(names, runs)
-        terminal.make_folder(out.parent)
-        terminal.write_file(out, table)
+    table = write_trajectories(names, runs)
+    terminal.make_folder(out.parent)
+    write_atomically(table, out)
 
 
 DesignFolder = Annotated[
@@ -234,16 +224,13 @@ Criterion = Annotated[
 Samples = Annotated[int | None, option(metavar="COUNT", help="Most samples of each sensor. Default: all of the file.")]
 
 
+@terminal.command("json", "quiet", "verbose")
 def design(
     problem: terminal.ProblemPath,
     out: DesignFolder = None,
     criterion: Criterion = None,
     samples: Samples = None,
     figures: terminal.FigureFormat = "png",
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Find the experiment that will determine unknowns best.
 
@@ -253,22 +240,20 @@ def design(
 
     Exit code 0: all unknowns that count can be estimated with the design. 1: some cannot. 2: the input is wrong.
     """
-    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        loaded = terminal.load(problem, out)
-        import switchfit as sf
-        from switchfit.io.command_line import summarize_design
+    loaded = terminal.load(problem, out)
+    from switchfit.io.command_line import summarize_design
 
-        terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
-        table = loaded.contents.design
-        settings = {} if table is None else table.model_dump(exclude_none=True)
-        settings |= terminal.select_given(criterion=criterion, samples=samples)
-        plan = sf.design(loaded.problem, **settings)
-        terminal.show(plan, summarize_design(plan), out, "design", figures, saved=True)
-        if out is not None:
-            _write_plan(plan, out)
-        terminal.fail_for_refused(loaded.issues)
-        if lost := [name for name in plan.names if name in plan.undetermined]:
-            terminal.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
+    terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
+    table = loaded.contents.design
+    settings = {} if table is None else table.model_dump(exclude_none=True)
+    settings |= terminal.select_given(criterion=criterion, samples=samples)
+    plan = sf.design(loaded.problem, **settings)
+    terminal.show(plan, summarize_design(plan), out, "design", figures, saved=True)
+    if out is not None:
+        _write_plan(plan, out)
+    terminal.fail_for_refused(loaded.issues)
+    if lost := [name for name in plan.names if name in plan.undetermined]:
+        terminal.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
 
 
 def _write_plan(plan: Any, folder: Path) -> None:
@@ -277,9 +262,9 @@ def _write_plan(plan: Any, folder: Path) -> None:
 
     knots = plan.problem.experiments[plan.experiment].inputs
     if knots is not None:
-        terminal.write_file(folder / "input.csv", write_rows(zip_rows({"t": knots.times, **plan.inputs})))
+        write_atomically(write_rows(zip_rows({"t": knots.times, **plan.inputs})), folder / "input.csv")
     samples = [{"sensor": name, "t": time} for name, times in plan.sample_times.items() for time in times]
-    terminal.write_file(folder / "samples.csv", write_rows(samples, ("sensor", "t")))
+    write_atomically(write_rows(samples, ("sensor", "t")), folder / "samples.csv")
 
 
 PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]
@@ -289,11 +274,11 @@ Part = Annotated[
 ]
 
 
+@terminal.command()
 def paper(
     out: PaperFolder = Path("paper"),
     quick: Quick = False,
     only: Part = None,
-    debug: terminal.Debug = False,
 ) -> None:
     """Reproduce the paper's experiments and figures.
 
@@ -301,13 +286,12 @@ def paper(
     the same command is run again.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
-    with terminal.report_errors(debug):
-        from switchfit.paper import TABLE, run
+    from switchfit.paper import TABLE, run
 
-        terminal.make_folder(out)
-        try:
-            run(out, quick=quick, only=only, say=terminal.print_note)
-        except KeyboardInterrupt:
-            terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
-        terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
-        terminal.print_note(f"written to {out}")
+    terminal.make_folder(out)
+    try:
+        run(out, quick=quick, only=only, say=terminal.print_note)
+    except KeyboardInterrupt:
+        terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
+    terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
+    terminal.print_note(f"written to {out}")

@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+import switchfit as sf
 from switchfit.cli import terminal
 from switchfit.cli.terminal import argument, option, output_folder
+from switchfit.io.user_files import describe_error
+from switchfit.runtime.errors import InputError, MissingExtraError
+from switchfit.runtime.files import write_atomically
+from switchfit.runtime.presentation import format_count, format_page, format_text
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
@@ -44,6 +49,7 @@ WithCertificate = Annotated[bool, typer.Option("--certificate", help="Print the 
 Full = Annotated[bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")]
 
 
+@terminal.command("json", "quiet", "verbose")
 def fit(
     problem: Problems,
     out: OutputFolder = None,
@@ -56,10 +62,6 @@ def fit(
     no_figures: NoFigures = False,
     certificate: WithCertificate = False,
     full: Full = False,
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Estimate transition times and parameters, and report.
 
@@ -76,23 +78,22 @@ def fit(
     overrides = terminal.select_given(strategy=strategy, hessian=hessian, max_iterations=max_iterations)
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
-    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        if model is not None:
-            raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
-        if len(problem) != 1 or table is not None:
-            terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
-        loaded = _override(terminal.load(problem[0], out), overrides)
-        estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
-        write_estimate(estimate, loaded, output)
-        from switchfit.io.command_line import summarize_estimate
-        from switchfit.report.formats import add_dates
+    if model is not None:
+        raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
+    if len(problem) != 1 or table is not None:
+        terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
+    loaded = _override(terminal.load(problem[0], out), overrides)
+    estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
+    write_estimate(estimate, loaded, output)
+    from switchfit.io.command_line import summarize_estimate
+    from switchfit.report.formats import add_dates
 
-        terminal.print_json(summarize_estimate(estimate) | {"out": out})
-        terminal.fail_for_refused(loaded.issues)
-        if not estimate.status.successful:
-            terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
-        if not estimate.success:
-            terminal.end_unreliable("the fit is bad; the first line of the report says why.")
+    terminal.print_json(summarize_estimate(estimate) | {"out": out})
+    terminal.fail_for_refused(loaded.issues)
+    if not estimate.status.successful:
+        terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
+    if not estimate.success:
+        terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
 
 def _override(loaded: ProblemFile, options: dict[str, Any]) -> ProblemFile:
@@ -101,7 +102,6 @@ def _override(loaded: ProblemFile, options: dict[str, Any]) -> ProblemFile:
 
 def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
-    import switchfit as sf
 
     importing = threading.Thread(target=_import_figures, daemon=True)
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
@@ -113,7 +113,7 @@ def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
         estimate = sf.estimate(loaded.problem, callback=report, **loaded.options)
     if prepare_figures:
         importing.join()  # two threads that import modules of one package in different orders find some half made
-    if terminal.is_verbose():
+    if terminal.is_asked("verbose"):
         terminal.print_note(estimate.engine)
         for step in estimate.steps:
             terminal.print_note(f"{step.strategy}: lowest J = {step.cost:.6g} after {step.seconds:.2g} s")
@@ -147,7 +147,6 @@ def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: 
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.io.result_tables import TABLES
     from switchfit.report.formats import add_dates
-    from switchfit.runtime.presentation import format_text
 
     checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
     folder, tables = output.folder, _choose_tables(estimate, output.folder)
@@ -158,9 +157,9 @@ def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: 
         terminal.print_text(report)
     if folder is None:
         return
-    terminal.write_file(folder / "report.txt", report + "\n")
+    write_atomically(report + "\n", folder / "report.txt")
     for name, path in tables.items():
-        terminal.write_file(path, TABLES[name](estimate))
+        write_atomically(TABLES[name](estimate), path)
     provenance = estimate.describe_provenance(replace(loaded.provenance, options=loaded.options))
     _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:
@@ -173,9 +172,6 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
     from switchfit.io.command_line import summarize_estimate
     from switchfit.io.result_tables import check_table, describe_fit, describe_row, list_logs, write_logs
-    from switchfit.io.user_files import describe_error
-    from switchfit.runtime.errors import InputError
-    from switchfit.runtime.presentation import format_count
 
     logs = list_logs(paths)
     if table is not None:
@@ -199,7 +195,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
             terminal.make_folder(folder)
             write_estimate(estimate, loaded, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
-            terminal.write_file(table, write_logs(rows, table))
+            write_atomically(write_logs(rows, table), table)
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
     refused = sum(row["verdict"] == "refused" for row in rows)
@@ -231,15 +227,13 @@ def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None
 
 def _write_page(estimate: Any, provenance: Any, path: Path) -> None:
     """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
-    from switchfit.runtime.errors import MissingExtraError
-    from switchfit.runtime.presentation import format_page
 
     try:
         page = format_page(estimate, provenance=provenance)
     except MissingExtraError as missing:
         terminal.print_note(f"no {path.name}: {missing}")
     else:
-        terminal.write_file(path, page)
+        write_atomically(page, path)
 
 
 USABLE = {"FOUND", "UNIDENTIFIED", "AMBIGUOUS", "AT_LIMIT"}
@@ -264,6 +258,7 @@ Method = Annotated[
 Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
 
 
+@terminal.command("json", "quiet", "verbose")
 def modes(
     problem: terminal.ProblemPath,
     out: ModesFolder = None,
@@ -273,10 +268,6 @@ def modes(
     method: Method = "auto",
     width: Width = 40,
     figures: terminal.FigureFormat = "png",
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Find which modes were active, in which order, and when.
 
@@ -287,29 +278,25 @@ def modes(
     Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
     fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
     """
-    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
-        settings |= {"criterion": criterion, "switch_cost": switch_cost}
-        loaded = terminal.load(problem, out, searched=True)
-        from switchfit.io.command_line import summarize_modes
+    settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
+    settings |= {"criterion": criterion, "switch_cost": switch_cost}
+    loaded = terminal.load(problem, out, searched=True)
+    from switchfit.io.command_line import summarize_modes
 
-        terminal.print_list("Logs", loaded.issues)
-        search = _search(loaded, loaded.library | settings)
-        best = None if out is None else _write_best(search, loaded, out)
-        summary, drawn = summarize_modes(search) | {"problem_file": best}, figures if search.chosen else ""
-        terminal.show(search, summary, out, "modes", drawn, saved=True)
-        terminal.fail_for_refused(loaded.issues)
-        if search.status.name == "NO_SUCCESSION":
-            terminal.fail(search.message)
-        if search.status.name not in USABLE:
-            terminal.end_unreliable(
-                "no mode sequence to rely on; the first line of the result says why, and what to do."
-            )
+    terminal.print_list("Logs", loaded.issues)
+    search = _search(loaded, loaded.library | settings)
+    best = None if out is None else _write_best(search, loaded, out)
+    summary, drawn = summarize_modes(search) | {"problem_file": best}, figures if search.chosen else ""
+    terminal.show(search, summary, out, "modes", drawn, saved=True)
+    terminal.fail_for_refused(loaded.issues)
+    if search.status.name == "NO_SUCCESSION":
+        terminal.fail(search.message)
+    if search.status.name not in USABLE:
+        terminal.end_unreliable("no mode sequence to rely on; the first line of the result says why, and what to do.")
 
 
 def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
     """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
-    import switchfit as sf
 
     def describe(progress: Any) -> str:
         best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
@@ -322,7 +309,6 @@ def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
 def _write_best(search: Any, loaded: ProblemFile, folder: Path) -> Path | None:
     """Write the best mode sequence as a problem file; return its path, None if there is none."""
     from switchfit.io.problem_file.writing import write_fitted_problem
-    from switchfit.runtime.errors import InputError
 
     if search.best is None:
         return None
@@ -331,7 +317,7 @@ def _write_best(search: Any, loaded: ProblemFile, folder: Path) -> Path | None:
     except InputError as error:
         terminal.print_note(f"no best.toml: {error}")
         return None
-    terminal.write_file(folder / "best.toml", text)
+    write_atomically(text, folder / "best.toml")
     return folder / "best.toml"
 
 
@@ -344,15 +330,13 @@ SavedPaths = Annotated[
 ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
 
 
+@terminal.command("json", "quiet")
 def validate(
     saved: terminal.SavedPath,
     other: OtherRun,
     out: ValidationFolder = None,
     folder: terminal.Folder = None,
     figures: terminal.FigureFormat = "png",
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Check whether the parameters of a fit hold for another run.
 
@@ -362,33 +346,30 @@ def validate(
 
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
-    with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.estimation.estimator import Estimate
-        from switchfit.io.command_line import summarize_validation
-        from switchfit.io.saved_problem import list_changed_models, load_other_run
+    from switchfit.estimation.estimator import Estimate
+    from switchfit.io.command_line import summarize_validation
+    from switchfit.io.saved_problem import list_changed_models, load_other_run
 
-        estimate = Estimate.load(saved)
-        given = estimate.provenance
-        loaded = load_other_run(saved, given, other, folder)
-        terminal.make_folder(out)
-        changes = [] if given is None else list_changed_models(given, loaded)
-        terminal.print_list("Changed since", changes)
-        terminal.print_list("Logs", loaded.issues)
-        found = estimate.validate(loaded.problem)
-        terminal.show(found, summarize_validation(found) | {"changes": changes}, out, "validation", figures)
-        terminal.fail_for_refused(loaded.issues)
-        if found.verdict.level == "bad":
-            terminal.end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
+    estimate = Estimate.load(saved)
+    given = estimate.provenance
+    loaded = load_other_run(saved, given, other, folder)
+    terminal.make_folder(out)
+    changes = [] if given is None else list_changed_models(given, loaded)
+    terminal.print_list("Changed since", changes)
+    terminal.print_list("Logs", loaded.issues)
+    found = estimate.validate(loaded.problem)
+    terminal.show(found, summarize_validation(found) | {"changes": changes}, out, "validation", figures)
+    terminal.fail_for_refused(loaded.issues)
+    if found.verdict.level == "bad":
+        terminal.end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
 
 
+@terminal.command("json", "quiet")
 def compare(
     saved: SavedPaths,
     out: ComparisonFolder = None,
     folder: terminal.Folder = None,
     figures: terminal.FigureFormat = "png",
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Compare models that were fitted to the same data.
 
@@ -398,24 +379,22 @@ def compare(
     Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
     fits to different data.
     """
-    with terminal.report_errors(debug, json=json, quiet=quiet):
-        import switchfit as sf
-        from switchfit.io.command_line import summarize_comparison
-        from switchfit.io.logs import name_files
-        from switchfit.io.saved_problem import load_with_problem
+    from switchfit.io.command_line import summarize_comparison
+    from switchfit.io.logs import name_files
+    from switchfit.io.saved_problem import load_with_problem
 
-        terminal.make_folder(out)
-        names = name_files(saved)
-        estimates, changes = [], []
-        for name, path in zip(names, saved, strict=True):
-            estimate, changed = load_with_problem(path, folder)
-            estimates.append(estimate)
-            changes += [f"{name}: {change}" for change in changed]
-        terminal.print_list("Changed since", changes)
-        found = sf.compare(estimates, names=names)
-        terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", figures)
-        failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
-        if failed:
-            terminal.end_unreliable(
-                f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small."
-            )
+    terminal.make_folder(out)
+    names = name_files(saved)
+    estimates, changes = [], []
+    for name, path in zip(names, saved, strict=True):
+        estimate, changed = load_with_problem(path, folder)
+        estimates.append(estimate)
+        changes += [f"{name}: {change}" for change in changed]
+    terminal.print_list("Changed since", changes)
+    found = sf.compare(estimates, names=names)
+    terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", figures)
+    failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
+    if failed:
+        terminal.end_unreliable(
+            f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small."
+        )

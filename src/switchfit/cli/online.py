@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import switchfit as sf
 from switchfit.cli import terminal
 from switchfit.cli.terminal import option, output_folder
+from switchfit.runtime.presentation import format_count
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
@@ -57,6 +59,7 @@ Live = Annotated[
 ]
 
 
+@terminal.command("quiet", "verbose")
 def online(
     problem: terminal.ProblemPath,
     replay: Replayed = None,
@@ -71,9 +74,6 @@ def online(
     live: Live = None,
     out: Annotated[Path | None, output_folder("online.txt and online.png")] = None,
     figures: terminal.FigureFormat = "png",
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Estimate while the samples come in: which mode is it now, since when, with which parameters?
 
@@ -84,51 +84,48 @@ def online(
     Exit code 0: the model follows the samples. 1: at the end it does not. 2: the input is wrong, or was in some lines
     of stdin, which are reported and left out.
     """
-    with terminal.report_errors(debug, json=not quiet, quiet=quiet, verbose=verbose):
-        if stdin and replay is not None:
-            terminal.fail("--replay and --stdin contradict each other; give one of them.")
-        loaded = terminal.load(problem, out, log=replay, searched=True, streamed=stdin)
-        for issue in loaded.issues:
-            terminal.print_note(issue)
-        from switchfit.modes.library import build_library
-        from switchfit.online.log import build_log
-        from switchfit.problem.data import Measurements
-        from switchfit.problem.structure import select_kind
-        from switchfit.runtime.presentation import format_count
+    if stdin and replay is not None:
+        terminal.fail("--replay and --stdin contradict each other; give one of them.")
+    loaded = terminal.load(problem, out, log=replay, searched=True, streamed=stdin)
+    for issue in loaded.issues:
+        terminal.print_note(issue)
+    from switchfit.modes.library import build_library
+    from switchfit.online.log import build_log
+    from switchfit.problem.data import Measurements
+    from switchfit.problem.structure import select_kind
 
-        for file in filter(None, (state, journal)):
-            file.parent.mkdir(parents=True, exist_ok=True)
-        sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
-        room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
-        settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
-        settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
-        library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
-        settings |= {"successions": library.successions, "min_duration": library.durations}
-        estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
-        with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
-            recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
-            if estimator.now is None:
-                terminal.fail("there were no samples.")
-            if state is not None:
-                estimator.save(state)
-            if out is not None and recorded:
-                terminal.write_result(build_log(loaded.problem, recorded), out / "online", figures)
-            if page is not None and not interrupted:
-                with contextlib.suppress(terminal.CtrlC):
-                    terminal.print_note("the samples have ended; Ctrl-C ends the page")
-                    page.wait()
-        terminal.fail_for_refused(loaded.issues)
-        if refused:
-            terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
-        if estimator.now.status.name == "LOST":
-            terminal.end_unreliable(f"{estimator.now.status.value}.")
+    for file in filter(None, (state, journal)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
+    room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
+    settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
+    settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
+    library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
+    settings |= {"successions": library.successions, "min_duration": library.durations}
+    estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
+    with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
+        recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
+        if estimator.now is None:
+            terminal.fail("there were no samples.")
+        if state is not None:
+            estimator.save(state)
+        if out is not None and recorded:
+            terminal.write_result(build_log(loaded.problem, recorded), out / "online", figures)
+        if page is not None and not interrupted:
+            with contextlib.suppress(terminal.CtrlC):
+                terminal.print_note("the samples have ended; Ctrl-C ends the page")
+                page.wait()
+    terminal.fail_for_refused(loaded.issues)
+    if refused:
+        terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
+    if estimator.now.status.name == "LOST":
+        terminal.end_unreliable(f"{estimator.now.status.value}.")
 
 
 def _start(
     loaded: ProblemFile, settings: dict[str, Any], alarms: dict[str, Any], state: Path | None, journal: Path | None
 ) -> OnlineEstimator:
     """Return the estimator: a new one, or that of a state and a journal."""
-    import switchfit as sf
     from switchfit.online.saved import read_journal
 
     written = journal if journal is not None and journal.exists() else None
@@ -167,7 +164,7 @@ def _run(
             line = summarize_now(now, run)
             if page is not None:
                 page.show(terminal.format_json(line))
-            terminal.print_json(line)
+            terminal.print_text(terminal.format_json(line))
             if records:
                 recorded.append(now)
             if stopped():

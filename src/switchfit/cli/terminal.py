@@ -8,6 +8,8 @@ The arguments that several commands take.
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import io
 import logging
 import os
@@ -23,9 +25,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
+from switchfit.io.user_files import describe_error, find_user_place
+from switchfit.runtime.errors import InputError, Issue
+from switchfit.runtime.files import write_atomically
+
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
-    from switchfit.runtime.errors import Issue
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -43,7 +48,7 @@ def _ask(asked: frozenset[str]) -> Iterator[None]:
     token = _asked.set(asked)
     logger, handler = logging.getLogger("switchfit"), logging.StreamHandler()
     level = logger.level
-    if is_verbose():
+    if is_asked("verbose"):
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
     try:
@@ -54,20 +59,20 @@ def _ask(asked: frozenset[str]) -> Iterator[None]:
         _asked.reset(token)
 
 
-def is_verbose() -> bool:
-    """Return whether --verbose was given."""
-    return "verbose" in _asked.get()
+def is_asked(name: str) -> bool:
+    """Return whether --json, --quiet or --verbose was given."""
+    return name in _asked.get()
 
 
 def print_text(text: object) -> None:
     """Print a part of the result as text."""
-    if not _asked.get() & {"json", "quiet"}:
+    if not (is_asked("json") or is_asked("quiet")):
         _print(text)
 
 
 def print_json(value: Any) -> None:
     """Print the result as JSON, if it is asked for."""
-    if "json" in _asked.get():
+    if is_asked("json"):
         _print(format_json(value))
 
 
@@ -80,7 +85,7 @@ def format_json(value: Any) -> str:
 
 def print_note(text: object) -> None:
     """Print what the command does, to stderr."""
-    if "quiet" not in _asked.get():
+    if not is_asked("quiet"):
         _print(text, err=True)
 
 
@@ -120,8 +125,6 @@ def report_errors(debug: bool, **options: bool) -> Iterator[None]:
         with _ask(frozenset(name for name, given in options.items() if given)), handle_interrupt(interrupt):
             yield
     except BaseException as error:
-        from switchfit.io.user_files import find_user_place
-
         users = find_user_place(error) is not None
         if isinstance(error, typer.Exit) and not users:
             raise
@@ -136,9 +139,6 @@ def report_errors(debug: bool, **options: bool) -> Iterator[None]:
 
 def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
     """Print the error and exit; `users` is whether it was raised in a file of the user."""
-    from switchfit.io.user_files import describe_error
-    from switchfit.runtime.errors import InputError
-
     if users and not isinstance(error, InputError):
         fail(f"{describe_error(error)}. (--debug shows the full traceback.)")
     if isinstance(error, OSError) and error.filename is not None:
@@ -176,7 +176,7 @@ def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
 
 def end_unreliable(reason: str) -> NoReturn:
     """Print why the result is not to be relied on, except with --quiet, and exit with the code that says so."""
-    if "quiet" not in _asked.get():
+    if not is_asked("quiet"):
         print_error(reason)
     raise typer.Exit(NOT_CONVERGED)
 
@@ -206,7 +206,7 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
         print_note(f"stopping after this {part}; Ctrl-C again to stop at once")
 
     def report(progress: Any) -> bool:
-        if is_verbose() and progress is not None:
+        if is_asked("verbose") and progress is not None:
             print_note(f"  {describe(progress)}")
         return requested.is_set()
 
@@ -230,13 +230,6 @@ def make_folder(folder: Path | None) -> None:
     """Create a folder, with those above it, unless it exists or none is asked for."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-
-
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file atomically."""
-    from switchfit.runtime.files import write_atomically
-
-    write_atomically(content, path)
 
 
 DOTS = 150
@@ -269,10 +262,6 @@ Folder = Annotated[
 FigureFormat = Annotated[
     Literal["png", "pdf", "svg"], option("--figures", help="Format of the figure in --out. Default: png.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
 
 
 def select_given(**options: Any) -> dict[str, Any]:
@@ -291,7 +280,7 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
 
     The files differ in their endings. Say where they are.
     """
-    write_file(stem.with_suffix(".txt"), f"{result}\n")
+    write_atomically(f"{result}\n", stem.with_suffix(".txt"))
     if saved:
         result.save(stem.with_suffix(".json"))
     if figures:
@@ -314,7 +303,7 @@ def write_figure(result: Any, path: Path) -> None:
     os.environ.setdefault("MPLBACKEND", "Agg")
     content = io.BytesIO()
     result.plot().savefig(content, format=path.suffix[1:], dpi=DOTS)
-    write_file(path, content.getvalue())
+    write_atomically(content.getvalue(), path)
 
 
 def fail_for_refused(issues: Sequence[Issue]) -> None:
@@ -324,3 +313,34 @@ def fail_for_refused(issues: Sequence[Issue]) -> None:
         print_error(issue)
     if refused:
         raise typer.Exit(BAD_INPUT)
+
+
+COMMON = {
+    "json": Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")],
+    "quiet": Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")
+    ],
+    "verbose": Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")],
+    "debug": Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")],
+}
+"""Options of which a command has some, and --debug in any case."""
+
+
+def command(*options: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that gives a command some of the common options, and runs it in `report_errors`."""
+    names = (*options, "debug")
+
+    def decorate(run: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(run)
+        def run_command(**given: Any) -> None:
+            common = {name: given.pop(name) for name in names}
+            with report_errors(**common):
+                run(**given)
+
+        kind = inspect.Parameter.KEYWORD_ONLY
+        added = [inspect.Parameter(name, kind, default=False, annotation=COMMON[name]) for name in names]
+        own = inspect.signature(run, eval_str=True)
+        run_command.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
+        return run_command
+
+    return decorate

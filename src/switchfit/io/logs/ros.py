@@ -18,8 +18,8 @@ from switchfit.runtime.errors import InputError, Issue, import_library
 SECOND = 10**9
 """Nanoseconds."""
 FAR = 86_400 * SECOND
-"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are of another clock, as that of a
-simulation, and stay as they are."""
+"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are of another clock, as that
+of a simulation, and stay as they are."""
 LONGEST_ARRAY = 36
 """Entries of an array in a message that become channels; longer ones are pictures and scans."""
 
