@@ -7,6 +7,7 @@ from __future__ import annotations
 import ast
 import os
 import shutil
+import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +16,7 @@ import typer
 import switchfit as sf
 from switchfit.cli import terminal
 from switchfit.cli.terminal import argument, option, output_folder
-from switchfit.io import find_examples
+from switchfit.io import find_examples, refuse_existing
 from switchfit.runtime.files import write_atomically
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
@@ -25,10 +26,7 @@ FirstLog = Annotated[
 
 
 @terminal.command("quiet")
-def init(
-    name: NewFolder,
-    log: FirstLog = None,
-) -> None:
+def init(name: NewFolder, log: FirstLog = None) -> None:
     """Create a problem to begin with, ready to fit.
 
     Writes a folder with a problem file, its model and data. With --from the time column and up to three channels of
@@ -66,10 +64,7 @@ ExampleFolder = Annotated[Path | None, argument("FOLDER", "Folder to create. Def
 
 
 @terminal.command()
-def examples(
-    name: ExampleName = None,
-    folder: ExampleFolder = None,
-) -> None:
+def examples(name: ExampleName = None, folder: ExampleFolder = None) -> None:
     """List the examples, or copy one.
 
     It is copied into a new folder. Nothing is overwritten.
@@ -83,24 +78,20 @@ def examples(
     if name not in found:
         terminal.fail(f"there is no example {name!r}; there are {', '.join(found)}.")
     target = Path(name) if folder is None else folder
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        terminal.fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.")
+    refuse_existing(target, "FOLDER")
     source = found[name]
     if source.is_dir():
         shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
     else:
         target.mkdir(parents=True, exist_ok=True)
         shutil.copy(source, target)
-    problems, scripts = sorted(target.glob("*.toml")), sorted(target.glob("*.py"))
-    commands = [f"switchfit {_choose_command(path)} {path}" for path in problems]
-    commands = commands or [f"python {path}" for path in scripts]
+    commands = [f"switchfit {_choose_command(path)} {path}" for path in sorted(target.glob("*.toml"))]
+    commands = commands or [f"python {path}" for path in sorted(target.glob("*.py"))]
     terminal.print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
 
 
 def _choose_command(path: Path) -> str:
     """Return the command for a problem file: a search where the mode sequence is what is looked for."""
-    import tomllib
-
     contents = tomllib.loads(path.read_text(encoding="utf-8"))
     is_search = "library" in contents and not any("mode_sequence" in run for run in contents.get("experiments", []))
     return "modes" if is_search else "fit"
@@ -275,11 +266,7 @@ Part = Annotated[
 
 
 @terminal.command()
-def paper(
-    out: PaperFolder = Path("paper"),
-    quick: Quick = False,
-    only: Part = None,
-) -> None:
+def paper(out: PaperFolder = Path("paper"), quick: Quick = False, only: Part = None) -> None:
     """Reproduce the paper's experiments and figures.
 
     Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when

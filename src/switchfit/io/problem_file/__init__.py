@@ -212,10 +212,9 @@ def _open(
     path: Path, contents: Contents, log: str | Path | None, *, streamed: bool = False
 ) -> tuple[Contents, list[Opened]]:
     """Return the tables of a file, with another log in them if one is given, and its open logs."""
-    if contents.problem is not None:
-        find_object(contents.problem, path.parent, f"{path}: problem")
-    elif contents.model is not None and ".py" in contents.model.name:
-        find_object(contents.model.name, path.parent, f"{path}: model")
+    for key, table in (("problem", contents.problem), ("model", contents.model)):
+        if table is not None and (key == "problem" or ".py" in table.name):
+            find_object(table.name, path.parent, f"{path}: {key}")
     if log is not None:
         contents = _replace_log(path, contents, os.path.abspath(log))
     expanded = [

@@ -102,9 +102,8 @@ def build_problem(
     """
     runs = build_experiments(path, contents, opened, searched=searched)
     problem = _build_problem(path, contents, runs, searched)
-    library = {} if contents.library is None else contents.library.model_dump(exclude_none=True)
-    given = {"library": library.pop("modes")} | library if "modes" in library else library
-    build_at(f"{path}: library", build_library, problem, **given, max_switches=1)
+    library = {} if contents.library is None else contents.library.model_dump(exclude_none=True, by_alias=True)
+    build_at(f"{path}: library", build_library, problem, **library, max_switches=1)
     options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
     folder = path.absolute().parent
     provenance = Provenance(
@@ -119,26 +118,25 @@ def build_problem(
         platform=describe_platform(),
     )
     used = contents.model_copy(update={"experiments": list(runs.tables)})
-    return ProblemFile(path, problem, options, provenance, runs.issues, given, used)
+    return ProblemFile(path, problem, options, provenance, runs.issues, library, used)
 
 
 def _build_problem(path: Path, contents: Contents, runs: Runs, searched: bool) -> Problem:
     options = contents.options.model_dump(exclude=OPTIONS, exclude_none=True)
-    if contents.problem is not None:
-        if options:
-            raise InputError(
-                f"{path}: with 'problem', {', '.join(options)} is set where the sf.Problem is built, not here."
+    built: Problem
+    if contents.problem is None:
+        if searched:  # with room for transitions, a problem may have nothing else to estimate
+            options["max_transitions"] = max(
+                1, *(len(run.transition_times + run.jump_times) for run in runs.experiments)
             )
-        what = f"{path}: problem"
-        found: Problem = _make(
-            load_object(contents.problem, path.parent, what), ModelTable(name=contents.problem), what, Problem
+        parameters = build_parameters(path, contents)
+        built = build_at(str(path), Problem, runs.system, runs.experiments, parameters, **options)
+    elif options:
+        raise InputError(
+            f"{path}: with 'problem', {', '.join(options)} is set where the sf.Problem is built, not here."
         )
-        return found
-    if searched:  # with room for transitions, a problem may have nothing else to estimate
-        options["max_transitions"] = max(1, *(len(e.transition_times) + len(e.jump_times) for e in runs.experiments))
-    built: Problem = build_at(
-        str(path), Problem, runs.system, runs.experiments, build_parameters(path, contents), **options
-    )
+    else:
+        built = _load(path, "problem", contents.problem, Problem)
     return built
 
 
@@ -179,24 +177,10 @@ def digest_file(folder: Path, path: Path) -> FileDigest:
         return FileDigest(name, 0, "")
 
 
-def _build_system(path: Path, table: ModelTable, run: bool) -> HybridSystem | None:
-    """Return the system of a model that is built in, or in a Python file; None if that is not to be run."""
-    what = f"{path}: model"
-    if ".py" not in table.name and table.name not in BUILT_IN:
-        raise InputError(
-            f"{what} {table.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of your "
-            "own as 'file.py:object'."
-        )
-    if not run:
-        return None
-    found = BUILT_IN.get(table.name) or load_object(table.name, path.parent, what)
-    system: HybridSystem = _make(found, table, what, HybridSystem)
-    return system
-
-
-def _make(found: Any, table: ModelTable, what: str, kind: type) -> Any:
-    """Return an object of some kind that a Python file has, or that a function in it returns with the arguments."""
-    what = f"{what} {table.name!r}"
+def _load(path: Path, key: str, table: ModelTable, kind: type) -> Any:
+    """Return what a key of a problem file names: something built in, or in a Python file, or made by a function there."""
+    what = f"{path}: {key} {table.name!r}"
+    found = BUILT_IN.get(table.name) or load_object(table.name, path.parent, f"{path}: {key}")
     if callable(found):
         found = call(found, what, **table.arguments)
     elif table.arguments:
@@ -225,7 +209,13 @@ def build_experiments(
     run : bool
         Whether to run the Python file of the model; without, there is no system.
     """
-    system = None if contents.model is None else _build_system(path, contents.model, run)
+    model = contents.model
+    if model is not None and ".py" not in model.name and model.name not in BUILT_IN:
+        raise InputError(
+            f"{path}: model {model.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of "
+            "your own as 'file.py:object'."
+        )
+    system = _load(path, "model", model, HybridSystem) if run and model is not None else None
     experiments: list[Experiment] = []
     used: list[ExperimentTable] = []
     issues: dict[str, Issue] = {}
@@ -257,15 +247,11 @@ def _add_first_sequence(
 
     Raises ValueError without a system: there is no search, which alone needs no sequence.
     """
-    if library is None:
+    if library is None or system is None:
+        add = "add [library] to the file: " if library is None else ""
         raise ValueError(
             "the key 'mode_sequence' is missing: name the modes in the order of their activity. If that is what you "
-            f"want to know, add [library] to the file: switchfit modes {path} then finds the sequence."
-        )
-    if system is None:
-        raise ValueError(
-            f"the key 'mode_sequence' is missing, and [library] leaves it to be found: switchfit modes {path} "
-            "--out DIR finds it, and writes DIR/best.toml, a problem file with the sequence."
+            f"want to know, {add}switchfit modes {path} --out DIR finds it, and writes a problem file, DIR/best.toml."
         )
     if table.transition_times is not None:
         raise ValueError("transition_times belong to a mode_sequence, which is missing: leave out both, or none.")
@@ -274,8 +260,8 @@ def _add_first_sequence(
     return table.model_copy(update={"mode_sequence": [first], "transition_times": []})
 
 
-FOREIGN = {"measurements": ("lowpass_hz", "weights"), "reference": ("sigma", "loss", "delay")}
-"""Of each kind of data, the keys of the other one."""
+OWN = {"measurements": ("sigma", "loss", "delay"), "reference": ("lowpass_hz", "weights")}
+"""Of each kind of data, the keys that the other one does not have."""
 
 
 @dataclass(frozen=True)
@@ -339,12 +325,11 @@ class _Run:
 
     def _build_data(self, place: str, item: DataTable, log: Log) -> Measurements | ReferenceSignal:
         observe = self._build_observe(place, item)
-        for key in FOREIGN[item.kind]:
-            if key in item.model_fields_set:
-                raise ValueError(
-                    f"{key} does not belong to kind = {item.kind!r}: measurements have sigma, loss and delay, a "
-                    "reference has lowpass_hz and weights."
-                )
+        if foreign := item.model_fields_set & {key for kind in OWN if kind != item.kind for key in OWN[kind]}:
+            raise ValueError(
+                f"{min(foreign)} does not belong to kind = {item.kind!r}: measurements have sigma, loss and delay, a "
+                "reference has lowpass_hz and weights."
+            )
         kind = Measurements if item.kind == "measurements" else ReferenceSignal
         columns, q = list_columns(item, self.contents, self.table), len(item.columns)
         times, values, units = cut_log(log, item, columns, self.table, kind.__name__)

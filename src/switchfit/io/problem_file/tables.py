@@ -298,7 +298,7 @@ class ExperimentTable(Table):
 class LibraryTable(Table):
     """The mode sequences among which ``switchfit modes`` searches."""
 
-    modes: Names | None = None
+    modes: Names | None = Field(default=None, serialization_alias="library")
     """names of the modes that may occur; left out, all of the model"""
     first: NameOrNames | None = None
     """mode or modes with which a sequence may begin; left out, any"""
@@ -370,7 +370,7 @@ class Contents(Table):
 
     model: Annotated[ModelTable, BeforeValidator(_wrap_name)] | None = None
     """a built-in model, or 'file.py:object', or a table with name and arguments"""
-    problem: str | None = None
+    problem: Annotated[ModelTable, BeforeValidator(_wrap_name)] | None = None
     """'file.py:object' with an sf.Problem or a function making one, instead of all the rest"""
     parameters: dict[str, Annotated[ParameterTable, BeforeValidator(_wrap_value)]] = {}
     """the model's parameters"""

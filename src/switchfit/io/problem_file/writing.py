@@ -16,7 +16,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import make_relative
-from switchfit.io import find_examples
+from switchfit.io import find_examples, refuse_existing
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
 from switchfit.io.problem_file.building import ProblemFile
@@ -119,8 +119,7 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     InputError
         If the folder has something in it, or the log cannot be used.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} exists already, and nothing is overwritten: give another NAME.")
+    refuse_existing(folder, "NAME")
     texts: dict[str, str] = {}
     if log is None:
         copied = [find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")]
@@ -303,7 +302,7 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     contents, problem = loaded.contents, estimate.evaluator_at_solution().problem
     if contents.problem is not None:
         raise InputError(
-            f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
+            f"{loaded.path} names a problem that {contents.problem.name!r} builds in Python: write the sequence there."
         )
     tables = contents.model_dump(exclude_unset=True, exclude_none=True)
     for e, (table, run) in enumerate(zip(tables["experiments"], problem.experiments, strict=True)):
