@@ -126,9 +126,8 @@ def _build_problem(path: Path, contents: Contents, runs: Runs, searched: bool) -
     built: Problem
     if contents.problem is None:
         if searched:  # with room for transitions, a problem may have nothing else to estimate
-            options["max_transitions"] = max(
-                1, *(len(run.transition_times + run.jump_times) for run in runs.experiments)
-            )
+            counts = (len(run.transition_times) + len(run.jump_times) for run in runs.experiments)
+            options["max_transitions"] = max(1, *counts)
         parameters = build_parameters(path, contents)
         built = build_at(str(path), Problem, runs.system, runs.experiments, parameters, **options)
     elif options:
@@ -178,7 +177,7 @@ def digest_file(folder: Path, path: Path) -> FileDigest:
 
 
 def _load(path: Path, key: str, table: ModelTable, kind: type) -> Any:
-    """Return what a key of a problem file names: something built in, or in a Python file, or made by a function there."""
+    """Return what a key names: something built in, or in a Python file, or what a function there returns."""
     what = f"{path}: {key} {table.name!r}"
     found = BUILT_IN.get(table.name) or load_object(table.name, path.parent, f"{path}: {key}")
     if callable(found):
@@ -212,8 +211,8 @@ def build_experiments(
     model = contents.model
     if model is not None and ".py" not in model.name and model.name not in BUILT_IN:
         raise InputError(
-            f"{path}: model {model.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model of "
-            "your own as 'file.py:object'."
+            f"{path}: model {model.name!r} is not known; the built-in models are {', '.join(BUILT_IN)}. Give a model "
+            "of your own as 'file.py:object'."
         )
     system = _load(path, "model", model, HybridSystem) if run and model is not None else None
     experiments: list[Experiment] = []
