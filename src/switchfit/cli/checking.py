@@ -198,7 +198,7 @@ def simulate(
     terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
     if out is None:
         return
-    from switchfit.io.result_tables import write_trajectories
+    from switchfit.io.command_line import write_trajectories
 
     table = write_trajectories(names, runs)
     terminal.make_folder(out.parent)
@@ -249,7 +249,7 @@ def design(
 
 def _write_plan(plan: Any, folder: Path) -> None:
     """Write the input and the samples of a design as CSV."""
-    from switchfit.io.result_tables import write_rows, zip_rows
+    from switchfit.io.command_line import write_rows, zip_rows
 
     knots = plan.problem.experiments[plan.experiment].inputs
     if knots is not None:

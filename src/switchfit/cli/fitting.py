@@ -145,7 +145,7 @@ class Output:
 
 def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
-    from switchfit.io.result_tables import TABLES
+    from switchfit.io.command_line import TABLES
     from switchfit.report.formats import add_dates
 
     checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
@@ -170,8 +170,14 @@ def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: 
 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
-    from switchfit.io.command_line import summarize_estimate
-    from switchfit.io.result_tables import check_table, describe_fit, describe_row, list_logs, write_logs
+    from switchfit.io.command_line import (
+        check_table,
+        describe_fit,
+        describe_row,
+        list_logs,
+        summarize_estimate,
+        write_logs,
+    )
 
     logs = list_logs(paths)
     if table is not None:
