@@ -357,10 +357,9 @@ def validate(
     from switchfit.io.saved_problem import list_changed_models, load_other_run
 
     estimate = Estimate.load(saved)
-    given = estimate.provenance
-    loaded = load_other_run(saved, given, other, folder)
+    loaded = load_other_run(saved, estimate.provenance, other, folder)
     terminal.make_folder(out)
-    changes = [] if given is None else list_changed_models(given, loaded)
+    changes = list_changed_models(estimate.provenance, loaded)
     terminal.print_list("Changed since", changes)
     terminal.print_list("Logs", loaded.issues)
     found = estimate.validate(loaded.problem)

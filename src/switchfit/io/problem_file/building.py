@@ -278,22 +278,20 @@ class _Run:
         for (place, item), log in zip(table.list_logs().items(), logs, strict=True):
             build = self._build_input if isinstance(item, InputTable) else self._build_data
             built[place] = build_at(f"{self.where}.{place}", build, place, item, log)
-        inputs, times, state = built.pop("inputs", None), table.transition_times, table.initial_state
+        times, state = table.transition_times, table.initial_state
         jumps = {f"jumps[{k}]": jump for k, jump in enumerate(table.jumps, start=1)}
+        given: dict[str, Any] = table.model_dump(
+            include={"t0", "parameter_map", "name", "time_unit", "origin", "time_zone"}
+        )
         return Experiment(
-            data=list(built.values()),
+            **given,
             mode_sequence=tuple(table.mode_sequence or ()),
+            inputs=built.pop("inputs", None),
+            data=list(built.values()),
             transition_times=None if times is None else tuple(map(build_parameter, times)),
-            t0=table.t0,
             tf=None if table.tf is None else build_parameter(table.tf),  # type: ignore[arg-type]
-            inputs=inputs,
             initial_state=None if state is None else [e.value if e.fixed else build_parameter(e) for e in state],
-            parameter_map=table.parameter_map,
-            name=table.name,
-            time_unit=table.time_unit,
             jumps=[build_at(f"{self.where}.{at}", self._build_jump, at, jump) for at, jump in jumps.items()],
-            origin=table.origin,
-            time_zone=table.time_zone,
         )
 
     def _load_function(self, place: str, reference: str) -> Any:
