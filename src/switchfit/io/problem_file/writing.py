@@ -173,34 +173,27 @@ def choose_channels(log: Log) -> tuple[list[str], list[str]]:
 def _is_varying(values: FloatArray) -> bool:
     """Return whether a channel has enough samples, is not constant, and does not just count the rows."""
     known = values[np.isfinite(values)]
-    if len(known) < FEWEST_SAMPLES or np.ptp(known) == 0:
-        return False
-    return bool(np.ptp(np.diff(known)) > 1e-9 * np.ptp(known))
+    return len(known) >= FEWEST_SAMPLES and bool(np.ptp(np.diff(known)) > 1e-9 * np.ptp(known))
 
 
 def _fill_gaps(values: FloatArray) -> FloatArray:
     """Return values with missing samples interpolated."""
     places, known = np.arange(len(values)), np.isfinite(values)
-    return np.interp(places, places[known], values[known]) if known.any() else np.zeros(len(values))
-
-
-def _find_change(values: FloatArray) -> int:
-    """Return the row at which a step from one mean to another explains most of the values (K, q), scaled alike."""
-    scaled = (values - values.mean(0)) / np.where(values.std(0) > 0, values.std(0), 1.0)
-    sums, count = np.cumsum(scaled, axis=0), len(values)
-    k = np.arange(1, count)
-    explained = (sums[:-1] ** 2).sum(1) * (1 / k + 1 / (count - k))
-    inside = slice(max(count // 20, 1), -max(count // 20, 1))
-    return int(k[inside][explained[inside].argmax()])
+    return np.interp(places, places[known], values[known])
 
 
 def _guess_levels(values: FloatArray) -> tuple[int, FloatArray, FloatArray, FloatArray]:
     """Return the row of the transition, the levels before and after it, (q,), and how far values (K, q) are off them.
 
-    The second level is that of the second half of the rows after it.
+    A step from one mean to another at that row explains most of the values, scaled alike. The second level is that of
+    the second half of the rows after it.
     """
-    k = _find_change(values)
-    half = k + (len(values) - k) // 2
+    sums, count = np.cumsum((values - values.mean(0)) / values.std(0), axis=0), len(values)
+    rows = np.arange(1, count)
+    explained = (sums[:-1] ** 2).sum(1) * (1 / rows + 1 / (count - rows))
+    inside = slice(max(count // 20, 1), -max(count // 20, 1))
+    k = int(rows[inside][explained[inside].argmax()])
+    half = k + (count - k) // 2
     before, after = values[:k].mean(0), values[half:].mean(0)
     off = np.concatenate([values[:k] - before, values[half:] - after]).std(0)
     return k, before, after, np.where(off > 0, off, np.abs(after - before) * 1e-3 + 1e-12)
@@ -260,11 +253,9 @@ def _describe_data(
     if others:
         yield f"# further channels: {', '.join(others)}"
     yield from (f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues)
-    flaws = {
-        "sort": np.any(np.diff(log.times) < 0),
-        "drop-duplicates": len(np.unique(log.times)) < len(log),
-    }
-    if repairs := [repair for repair, is_needed in flaws.items() if is_needed]:
+    repairs = ["sort"] if np.any(np.diff(log.times) < 0) else []
+    repairs += ["drop-duplicates"] if len(np.unique(log.times)) < len(log) else []
+    if repairs:
         yield f"repair = {write_value(repairs)}   # what may be changed of that"
     sigma = f"sigma = {write_value(sigmas)}   # <- standard deviations of the noise; numbers, if they are known"
     yield sigma if sigmas else "# sigma = 0.1   # <- standard deviation of the noise, if it is known"
