@@ -253,7 +253,7 @@ def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):
     result = run("modes", folder / "python.toml", "--max-switches", 0, "--out", tmp_path)
     assert result.exit_code in (0, 1)
     assert "no best.toml: " in result.stderr
-    assert "'model.py:build', which is built in Python: write the sequence there." in result.stderr
+    assert "'model.py:build' builds in Python: write the sequence there." in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["modes.json", "modes.png", "modes.txt"]
 
 
