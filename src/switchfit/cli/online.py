@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
     from switchfit.online.estimator import OnlineEstimator
     from switchfit.online.state import Now
-    from switchfit.problem.experiment import Experiment
     from switchfit.report.html.live import LivePage
 
 LEAST_ROOM = 4096
@@ -148,57 +147,41 @@ def _start(
 def _run(
     loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, page: LivePage | None, records: bool
 ) -> tuple[list[Now], int, bool]:
-    """Feed all samples, until Ctrl-C, and print what the estimator says.
+    """Feed all samples, until Ctrl-C, and print what the estimator says; of a log, those that it has not had yet.
 
-    Return what it said, if that is recorded, how many lines it refused, and whether it was interrupted.
+    Return what it said, if that is recorded, how many lines of stdin it refused, and whether it was interrupted.
     """
-    from switchfit.io.command_line import summarize_now
+    from switchfit.io.command_line import read_sample, summarize_now
+    from switchfit.online.state import list_updates
 
-    recorded: list[Now] = []
-    refused: list[int] = []
+    recorded, refused = [], 0
     (run,) = loaded.problem.experiments
+    last = -math.inf if estimator.now is None else estimator.now.time
     with terminal.stop_on_interrupt(repr, "sample") as report:
         stopped = partial(report, None)
-        said = _replay_lines(run, estimator, stopped, refused) if stdin else _replay_log(run, estimator)
-        for now in said:
-            line = summarize_now(now, run)
+        logged = list_updates([(item.times, item.values) for item in run.data])
+        samples: Iterable[Any] = _read_lines(stopped) if stdin else ((t, y, None) for t, y in logged if t > last)
+        for number, sample in enumerate(samples, start=1):
+            if stdin and not sample.strip():
+                continue
+            try:
+                t, y, u = read_sample(sample, run) if stdin else sample
+                now = estimator.update(t, y, u=u)
+            except REFUSED as error:
+                if not stdin:
+                    raise
+                terminal.print_error(f"line {number}: {error}")
+                refused += 1
+                continue
+            line = terminal.format_json(summarize_now(now, run))
             if page is not None:
-                page.show(terminal.format_json(line))
-            terminal.print_text(terminal.format_json(line))
+                page.show(line)
+            terminal.print_text(line)
             if records:
                 recorded.append(now)
             if stopped():
                 break
-    return recorded, len(refused), stopped()
-
-
-def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
-    """Feed the samples of the log after those that the estimator has had; yield what it says after each."""
-    from switchfit.online.state import list_updates
-
-    last = -math.inf if estimator.now is None else estimator.now.time
-    for t, y in list_updates([(item.times, item.values) for item in run.data]):
-        if t > last:
-            yield estimator.update(t, y)
-
-
-def _replay_lines(
-    run: Experiment, estimator: OnlineEstimator, stopped: Callable[[], bool], refused: list[int]
-) -> Iterator[Now]:
-    """Feed the lines of stdin; yield what the estimator says after each, and report those that it refuses."""
-    from switchfit.io.command_line import read_sample
-
-    for number, line in enumerate(_read_lines(stopped), start=1):
-        if not line.strip():
-            continue
-        try:
-            t, y, u = read_sample(line, run)
-            now = estimator.update(t, y, u=u)
-        except REFUSED as error:
-            terminal.print_error(f"line {number}: {error}")
-            refused.append(number)
-        else:
-            yield now
+    return recorded, refused, stopped()
 
 
 def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:
