@@ -122,17 +122,6 @@ def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
     return estimate
 
 
-def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:
-    """Return the CSV files for what a screen of the report has no room for."""
-    from switchfit.report.text import SCREEN
-
-    is_long = {
-        "runs": len(estimate.run_names) > SCREEN["experiments"],
-        "unknowns": len(estimate.theta) > SCREEN["unknowns"],
-    }
-    return {} if folder is None else {name: folder / f"{name}.csv" for name in is_long if is_long[name]}
-
-
 @dataclass(frozen=True)
 class Output:
     """What is printed of a fit, and written; the format of the figure, empty for none."""
@@ -145,21 +134,23 @@ class Output:
 
 def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
-    from switchfit.io.command_line import TABLES
+    from switchfit.io.command_line import list_tables
     from switchfit.report.formats import add_dates
 
     checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
-    folder, tables = output.folder, _choose_tables(estimate, output.folder)
+    folder, files = output.folder, {}
+    if folder is not None:
+        files = {name: (folder / f"{name}.csv", table) for name, table in list_tables(estimate).items()}
+    paths = {name: str(path) for name, (path, _) in files.items()}
     # The report after the certificate, which is part of the verdict.
-    files = {name: str(path) for name, path in tables.items()}
-    report = f"{format_text(estimate, full=output.full, files=files)}{checked}"
+    report = f"{format_text(estimate, full=output.full, files=paths)}{checked}"
     if show:
         terminal.print_text(report)
     if folder is None:
         return
     write_atomically(report + "\n", folder / "report.txt")
-    for name, path in tables.items():
-        write_atomically(TABLES[name](estimate), path)
+    for path, table in files.values():
+        write_atomically(table, path)
     provenance = estimate.describe_provenance(replace(loaded.provenance, options=loaded.options))
     _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:

@@ -31,6 +31,7 @@ from switchfit.problem.validation import shorten
 from switchfit.report import formats
 from switchfit.report.frames import ERROR
 from switchfit.report.sentences import write_reason, write_step
+from switchfit.report.text import SCREEN
 from switchfit.runtime.errors import InputError, import_library
 from switchfit.runtime.frames import describe_frame
 from switchfit.strategy.comparison import ModelComparison
@@ -620,8 +621,15 @@ def list_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
-TABLES = {"runs": write_runs, "unknowns": write_unknowns}
-"""Tables of a fit by the names of their files."""
+def list_tables(estimate: Estimate) -> dict[str, str]:
+    """Return the tables that a screen of the report has no room for, as CSV, by the names of their files.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    runs = {"runs": write_runs(estimate)} if len(estimate.run_names) > SCREEN["experiments"] else {}
+    return runs | ({"unknowns": write_unknowns(estimate)} if len(estimate.theta) > SCREEN["unknowns"] else {})
 
 
 def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:

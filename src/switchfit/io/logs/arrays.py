@@ -149,12 +149,7 @@ def _find_times(arrays: Mapping[str, Any], time: str | None) -> dict[str, str]:
 
 
 def _is_vector(value: Any) -> bool:
-    return (
-        isinstance(value, np.ndarray)
-        and value.dtype.kind in "biuf"
-        and value.size > 1
-        and value.size == max(value.shape)
-    )
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and 1 < value.size == max(value.shape)
 
 
 def _split_channels(name: str, value: Any, samples: int) -> dict[str, Any]:

@@ -55,7 +55,7 @@ def cut_log(
     units = tuple(log.units[log.find_channel(name)] for name in columns)
     if log.dates is not None and _keep_dates(table, log, run):
         return log.dates[inside], values, units
-    offset = times[0] if table.time_offset is None else table.time_offset
+    offset = times[0] if table.time_offset == "first" else table.time_offset
     return (times - offset) * _find_time_scale(log, table, run.time_unit), values, units
 
 
