@@ -8,19 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from test_cli import run
 
 import switchfit as sf
-from switchfit import cli, io
+from switchfit import io
 from switchfit.io import find_examples
 from switchfit.io.problem_file import load_problem, writing
 from switchfit.io.problem_file.writing import choose_channels, write_first_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 def write_log(path, header="t,level,idle,count", rows=list):

@@ -95,7 +95,7 @@ def has_text(cells: Sequence[str]) -> bool:
 
 
 def read_header(rows: Sequence[list[str]], comment: list[str]) -> tuple[list[str], list[str], dict[str, int], int]:
-    """Return the names of the columns, their units, other names with the column of each, and the first row of data.
+    """Return the names of the columns, their units, the column of each name in the header, and the first row of data.
 
     Parameters
     ----------
@@ -152,11 +152,11 @@ def _assign_lines(lines: list[list[str]]) -> tuple[list[str], list[str], dict[st
     if unit_lines:
         units = [strip_brackets(cell) or unit for cell, unit in zip(unit_lines[0], units, strict=True)]
     names = [name or f"column {k}" for k, name in enumerate(names, start=1)]
-    labels: dict[str, int] = {}
+    places = {name: names.index(name) for name in names}
     for line in [chosen, *name_lines]:
         once = {cell for cell, count in Counter(line).items() if cell and count == 1}
-        labels |= {cell: k for k, cell in enumerate(line) if cell in once and cell not in names and cell not in labels}
-    return names, units, labels
+        places |= {cell: k for k, cell in enumerate(line) if cell in once and cell not in places}
+    return names, units, places
 
 
 def _is_unit_line(cells: list[str]) -> bool:
@@ -200,8 +200,8 @@ class _Table:
     ----------
     source : str
     names, units : list of str
-    labels : dict of str to int
-        Other names, and the column of each.
+    places : dict of str to int
+        The column of each name, and of other names that the header has for it.
     lines : (K,) array of int
         Number of the line of each row.
     columns : list of sequence of str, or of (K,) array
@@ -215,7 +215,7 @@ class _Table:
     source: str
     names: list[str]
     units: list[str]
-    labels: dict[str, int]
+    places: dict[str, int]
     lines: NDArray[np.intp]
     columns: list[Any]
     comma: bool = False
@@ -285,7 +285,7 @@ def read_text(path: Path, options: Options) -> Log:
             figures = {"line": float(table.lines[first]), "count": float(bad.sum())}
             issues.append(Issue("log: text", (table.source, "line", names[k], table.columns[k][first]), figures))
     units = {name: table.units[names.index(name)] for name in values}
-    labels = {label: names[k] for label, k in table.labels.items() if names[k] in values}
+    labels = {label: names[k] for label, k in table.places.items() if names[k] in values and label not in names}
     events.sort(key=lambda event: event.time)
     return replace(
         log, values=values, units=units, issues=tuple(issues), events=tuple(events), labels=labels, rows=table.lines,
@@ -415,31 +415,28 @@ def _use_decimal_commas(path: Path, rows: list[Row]) -> bool:
 
 
 def _find_column(table: _Table, name: str) -> int:
-    names = table.names
-    if names.count(name) > 1:
-        raise InputError(f"{table.source} has {names.count(name)} columns {shorten(name)}; rename all but one.")
-    if name in names:
-        return names.index(name)
-    if name in table.labels:
-        return table.labels[name]
-    raise InputError(f"{table.source} has no column {shorten(name)}; its columns are {join_names(names)}.")
+    count = table.names.count(name)
+    if count > 1:
+        raise InputError(f"{table.source} has {count} columns {shorten(name)}; rename all but one.")
+    if name not in table.places:
+        raise InputError(f"{table.source} has no column {shorten(name)}; its columns are {join_names(table.names)}.")
+    return table.places[name]
 
 
 def _find_columns(table: _Table, columns: Sequence[str]) -> list[int]:
     """Return the columns of some names; for east, north and up, those of the position on the globe."""
-    names = table.names
-    own = [name for name in columns if name not in FRAME or name in names or name in table.labels]
+    own = [name for name in columns if name not in FRAME or name in table.places]
     if len(own) < len(columns):
-        hdop = [name for name in names if name.lower() == "hdop"]
-        own += [name for name in [*(find_position(names) or []), *hdop] if name not in own]
+        hdop = [name for name in table.names if name.lower() == "hdop"]
+        own += [name for name in [*(find_position(table.names) or []), *hdop] if name not in own]
     return [_find_column(table, name) for name in own]
 
 
 def _find_time(table: _Table, channels: Sequence[int]) -> int:
     """Return the column with the times: the first one that is called so, or the first one if it never falls."""
-    found = find_time_name([*table.names, *table.labels], [table.names[k] for k in channels])
+    found = find_time_name(table.places, [table.names[k] for k in channels])
     if found is not None:
-        return table.names.index(found) if found in table.names else table.labels[found]
+        return table.places[found]
     numbers, bad = table.parse_column(0)
     if len(table.names) > 1 and not bad.any() and np.all(np.diff(numbers) >= 0) and numbers[-1] > numbers[0]:
         return 0
