@@ -308,31 +308,14 @@ def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
     name : str
     trajectory : Trajectory
     """
-    run = trajectory if trajectory.origin is not None else None
-    return {
-        "name": name,
-        "time_unit": trajectory.time_unit,
-        **({} if run is None or run.origin is None else {"origin": run.origin.date}),
-        "modes": [
-            {"mode": mode, "begin": begin, "end": end, **_list_dates({"_begin": begin, "_end": end}, run)}
-            for mode, begin, end in trajectory.mode_spans
-        ],
-        "jumps": trajectory.jump_times,
-        **(
-            {}
-            if run is None
-            else {"jump_dates": [formats.format_iso(time, run) for time in trajectory.jump_times.tolist()]}
-        ),
-    }
-
-
-def _list_dates(times: dict[str, float], run: Trajectory | None) -> dict[str, str | None]:
-    """Return times as dates under the key "date" with a suffix each; {} where they are no dates."""
-    return (
-        {}
-        if run is None
-        else {f"date{suffix}": formats.format_iso(time, run) or None for suffix, time in times.items()}
-    )
+    modes = [{"mode": mode, "begin": begin, "end": end} for mode, begin, end in trajectory.mode_spans]
+    found = {"name": name, "time_unit": trajectory.time_unit, "modes": modes, "jumps": trajectory.jump_times}
+    if trajectory.origin is None:
+        return found
+    for span in modes:
+        span |= {f"date_{end}": formats.format_iso(span[end], trajectory) or None for end in ("begin", "end")}
+    dates = [formats.format_iso(time, trajectory) for time in trajectory.jump_times.tolist()]
+    return found | {"origin": trajectory.origin.date, "jump_dates": dates}
 
 
 def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
@@ -443,12 +426,7 @@ def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
     now : Now
     run : Experiment
     """
-    dates = (
-        {}
-        if run.origin is None
-        else {"date": formats.format_iso(now.time, run), "since_date": formats.format_iso(now.since, run)}
-    )
-    return {
+    found = {
         "t": now.time,
         **_pick(now, "mode", "since", "mode_sequence", "transition_times", "mode_probability"),
         **_pick(now, "parameters", "standard_errors", "statistic", "threshold"),
@@ -456,8 +434,10 @@ def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
         "alarm": None if now.alarm is None else now.alarm._asdict(),
         "retracted": None if now.retracted is None else now.retracted._asdict(),
         "seconds": now.seconds,
-        **dates,
     }
+    if run.origin is not None:
+        found |= {"date": formats.format_iso(now.time, run), "since_date": formats.format_iso(now.since, run)}
+    return found
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:
