@@ -508,7 +508,6 @@ def write_runs(estimate: Estimate) -> str:
     estimate : Estimate
     """
     quality = measure_quality(estimate)
-    any_dated = any(trajectory.origin is not None for trajectory in estimate.trajectories)
     rows = []
     for e, (name, trajectory) in enumerate(zip(estimate.run_names, estimate.trajectories, strict=True)):
         here = [channel for channel in quality.channels if channel.experiment == e]
@@ -523,8 +522,8 @@ def write_runs(estimate: Estimate) -> str:
             "explained": min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan),
             "flags": "; ".join(_list_flags(estimate, name, here, len(quality.channels))),
         }
-        if any_dated:
-            row["origin"] = "" if trajectory.origin is None else trajectory.origin.date
+        if trajectory.origin is not None:
+            row["origin"] = trajectory.origin.date
         rows.append(row)
     return write_rows(rows)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import inspect
 import os
@@ -37,7 +38,7 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
         If the file or the object is missing, or running the file raises.
     """
     path, name = find_object(reference, folder, what)
-    module = _run(path)
+    module = _run(path, path.stat().st_mtime_ns)
     if not hasattr(module, name):
         public = [key for key in vars(module) if not key.startswith("_")]
         raise InputError(f"{what} {reference!r}: {path} defines no {name!r}; it has {', '.join(public) or 'nothing'}.")
@@ -171,16 +172,11 @@ def find_user_place(error: BaseException | None) -> str | None:
 #: Files that were run: absolute path -> path as the user wrote it.
 _files: dict[str | None, Path] = {}
 
-#: Modules of the files that ran without error, with the time of their last change (ns).
-_modules: dict[str, tuple[int, Any]] = {}
 
-
-def _run(path: Path) -> Any:
-    """Return the module of a file; a file that several keys name runs once unless it changes."""
+@functools.cache
+def _run(path: Path, changed: int) -> Any:
+    """Return the module of a file; one that several keys name runs once, until the time of its last change differs."""
     key = str(path.resolve())
-    stamp = path.stat().st_mtime_ns
-    if key in _modules and _modules[key][0] == stamp:
-        return _modules[key][1]
     specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", key)
     if specification is None or specification.loader is None:
         raise InputError(f"{path} cannot be loaded as a Python file.")
@@ -193,5 +189,4 @@ def _run(path: Path) -> Any:
             specification.loader.exec_module(module)
     finally:
         sys.path.remove(str(path.parent))
-    _modules[key] = (stamp, module)
     return module
