@@ -38,7 +38,9 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
         If the file or the object is missing, or running the file raises.
     """
     path, name = find_object(reference, folder, what)
-    module = _run(path, path.stat().st_mtime_ns)
+    key = str(path.resolve())
+    _files[key] = path
+    module = _run(key, path.stat().st_mtime_ns)
     if not hasattr(module, name):
         public = [key for key in vars(module) if not key.startswith("_")]
         raise InputError(f"{what} {reference!r}: {path} defines no {name!r}; it has {', '.join(public) or 'nothing'}.")
@@ -174,14 +176,13 @@ _files: dict[str | None, Path] = {}
 
 
 @functools.cache
-def _run(path: Path, changed: int) -> Any:
+def _run(key: str, changed: int) -> Any:
     """Return the module of a file; one that several keys name runs once, until the time of its last change differs."""
-    key = str(path.resolve())
+    path = _files[key]
     specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", key)
     if specification is None or specification.loader is None:
         raise InputError(f"{path} cannot be loaded as a Python file.")
     module = importlib.util.module_from_spec(specification)
-    _files[key] = path
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:
