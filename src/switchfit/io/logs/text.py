@@ -340,7 +340,7 @@ def _read_table(path: Path, drop_broken: bool) -> _Table:
         width, body = len(header[0]), kept[first:]
         numbers = None if drop_broken else _parse_block([line for _, line in body], delimiter, width)
         if numbers is not None:
-            return _Table(str(path), *header, np.array([k for k, _ in body]), list(numbers.T))
+            return _Table(str(path), *header, np.array([k for k, _ in body]), list(numbers.T.copy()))
         rows, broken = _check_widths(split_lines(kept, delimiter)[first:], width, drop_broken)
     except ValueError as error:
         raise InputError(f"{path}, {error}") from error
