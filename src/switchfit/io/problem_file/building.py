@@ -19,7 +19,7 @@ from switchfit.estimation.saved import FileDigest, Provenance, describe_platform
 from switchfit.io.logs import find_logs
 from switchfit.io.logs.log import Log
 from switchfit.io.problem_file import tables
-from switchfit.io.problem_file.logs import Opened, cut_log, list_columns
+from switchfit.io.problem_file.logs import Opened, cut_log
 from switchfit.io.problem_file.tables import OPTIONS, Contents, DataTable, ExperimentTable, InputTable, ModelTable
 from switchfit.io.user_files import build_at, call, find_object, load_object, replace_files
 from switchfit.models import BUILT_IN
@@ -328,18 +328,18 @@ class _Run:
                 "reference has lowpass_hz and weights."
             )
         kind = Measurements if item.kind == "measurements" else ReferenceSignal
-        columns, q = list_columns(item, self.contents, self.table), len(item.columns)
-        times, values, units = cut_log(log, item, columns, self.table, kind.__name__)
+        times, values, units = cut_log(log, item, self.contents, self.table, kind.__name__)
+        q = len(item.columns)
         names = tuple(item.observe if isinstance(item.observe, list) else item.columns)
         more: dict[str, Any] = {"observe": observe, "names": names, "units": units[:q]}
         if kind is ReferenceSignal:
             return ReferenceSignal.from_samples(times, values, lowpass_hz=item.lowpass_hz, weights=item.weights, **more)
-        sigma = values[:, q:] if len(columns) > q else item.sigma
+        sigma = values[:, q:] if values.shape[1] > q else item.sigma
         given = item.model_dump(include={"loss", "loss_scale", "delay"})
         return Measurements(times, values[:, :q], sigma=sigma, **given, **more)
 
     def _build_input(self, place: str, item: InputTable, log: Log) -> Input:
-        times, values, units = cut_log(log, item, list_columns(item, self.contents, self.table), self.table, "Input")
+        times, values, units = cut_log(log, item, self.contents, self.table, "Input")
         given: Any = times
         if not len(log):  # of a stream, whose inputs hold until others come
             given, values = [self.table.t0 or 0.0], np.zeros((1, len(units)))

@@ -22,21 +22,21 @@ from switchfit.runtime.errors import InputError
 
 
 def cut_log(
-    log: Log, table: LogTable, columns: Sequence[str], run: ExperimentTable, what: str
+    log: Log, table: DataTable | InputTable, contents: Contents, run: ExperimentTable, what: str
 ) -> tuple[FloatArray | Dates, FloatArray, tuple[str, ...]]:
-    """Return times (K,), which may be dates, and the values of some columns (K, q) in the rows inside the window, and
+    """Return times (K,), which may be dates, and the values of the columns (K, q) in the rows inside the window, and
     their units.
 
     Parameters
     ----------
     log : Log
-    table : LogTable
-    columns : sequence of str
+    table : DataTable or InputTable
+    contents : Contents
     run : ExperimentTable
     what : str
         What is made from them, for messages.
     """
-    times, inside = log.times, np.ones(len(log), dtype=bool)
+    columns, times, inside = _list_columns(table, contents, run), log.times, np.ones(len(log), dtype=bool)
     if not len(log):  # of a stream
         return times, np.zeros((0, len(columns))), ("",) * len(columns)
     if table.window is not None:
@@ -167,7 +167,7 @@ def open_experiments(
 def _open_log(
     folder: Path, table: DataTable | InputTable, contents: Contents, run: ExperimentTable, streamed: bool
 ) -> Log:
-    columns = list(dict.fromkeys(list_columns(table, contents, run)))
+    columns = list(dict.fromkeys(_list_columns(table, contents, run)))
     if table.file is None and streamed:
         return Log(np.zeros(0), dict.fromkeys(columns, np.zeros(0)), dict.fromkeys(columns, ""), "", "the stream")
     if table.file is None:
@@ -177,15 +177,8 @@ def _open_log(
     return log if table.epoch is None else _count_from_1970(log, table.epoch)
 
 
-def list_columns(table: DataTable | InputTable, contents: Contents, run: ExperimentTable) -> list[str]:
-    """Return the columns of a log with values, and after them those that hold sigma, unless it is that of parameters.
-
-    Parameters
-    ----------
-    table : DataTable or InputTable
-    contents : Contents
-    run : ExperimentTable
-    """
+def _list_columns(table: DataTable | InputTable, contents: Contents, run: ExperimentTable) -> list[str]:
+    """Return the columns of a log with values, and after them those that hold sigma, unless parameters do."""
     parameters = {*contents.parameters, *run.parameter_map}
     columns = list(table.columns.values() if isinstance(table.columns, dict) else table.columns)
     given = table.sigma if isinstance(table, DataTable) and isinstance(table.sigma, list) else []
