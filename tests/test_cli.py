@@ -388,7 +388,7 @@ def test_a_fit_waits_for_the_modules_that_draw(folder, monkeypatch):
         done.append(True)
 
     monkeypatch.setattr(fitting, "_import_figures", import_figures)
-    fitting.estimate_problem(load_problem(folder / "problem.toml"), {}, prepare_figures=True)
+    fitting.estimate_problem(load_problem(folder / "problem.toml"), prepare_figures=True)
     assert done
 
 

@@ -12,7 +12,7 @@ from test_cli import run
 
 import switchfit as sf
 from switchfit.io.problem_file import load_problem
-from switchfit.io.problem_file.fitted import write_fitted_problem
+from switchfit.io.problem_file.writing import write_fitted_problem
 
 MODEL = """
 import jax.numpy as jnp
@@ -212,12 +212,13 @@ def test_other_commands_say_what_to_do_without_a_sequence(folder, command):
     missing = run(*command, write_problem(folder, LIBRARY))
     assert missing.exit_code == 2
     assert "experiments[1]: the key 'mode_sequence' is missing: name the modes in the order" in missing.stderr
+    assert "add [library] to the file: switchfit modes" in missing.stderr
     result = run(*command, folder / "problem.toml")
     assert result.exit_code == 2
     assert result.stderr.startswith(
-        f"switchfit: {folder}/problem.toml: experiments[1]: the key 'mode_sequence' is missing, and [library] leaves "
-        f"it to be found: switchfit modes {folder}/problem.toml --out DIR finds it"
+        f"switchfit: {folder}/problem.toml: experiments[1]: the key 'mode_sequence' is missing: "
     )
+    assert f"want to know, switchfit modes {folder}/problem.toml --out DIR finds it" in result.stderr
 
 
 def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
@@ -252,7 +253,7 @@ def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):
     result = run("modes", folder / "python.toml", "--max-switches", 0, "--out", tmp_path)
     assert result.exit_code in (0, 1)
     assert "no best.toml: " in result.stderr
-    assert "'model.py:build', which is built in Python: write the sequence there." in result.stderr
+    assert "'model.py:build' builds in Python: write the sequence there." in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["modes.json", "modes.png", "modes.txt"]
 
 

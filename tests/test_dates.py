@@ -22,9 +22,8 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit.cli import app
-from switchfit.io.command_line import summarize_estimate
+from switchfit.io.command_line import summarize_estimate, write_runs, write_unknowns
 from switchfit.io.problem_file import load_problem
-from switchfit.io.result_tables import write_runs, write_unknowns
 from switchfit.problem.dates import SECONDS, Dates, Origin, from_epoch, make_origin, read_dates
 from switchfit.report.axes import DateLocator
 from switchfit.report.formats import add_dates, format_date, format_time

@@ -8,19 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from test_cli import run
 
 import switchfit as sf
-from switchfit import cli, io
-from switchfit.io import find_examples, first_problem
-from switchfit.io.first_problem import choose_channels, write_first_problem
-from switchfit.io.problem_file import load_problem
+from switchfit import io
+from switchfit.io import find_examples
+from switchfit.io.problem_file import load_problem, writing
+from switchfit.io.problem_file.writing import choose_channels, write_first_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 def write_log(path, header="t,level,idle,count", rows=list):
@@ -81,7 +77,7 @@ def test_a_log_that_is_out_of_order_is_repaired_as_the_file_says(tmp_path):
 
 def test_a_large_log_is_referred_to(tmp_path, monkeypatch):
     log = write_log(tmp_path / "log.csv")
-    monkeypatch.setattr(first_problem, "LARGEST_COPY", 100)
+    monkeypatch.setattr(writing, "LARGEST_COPY", 100)
     written = write_first_problem(tmp_path / "new", log)
     assert [path.name for path in written] == ["problem.toml", "model.py"]
     assert 'file = "../log.csv"' in (tmp_path / "new" / "problem.toml").read_text()

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import PROBLEM, ROOM
-from typer.testing import CliRunner
+from test_cli import PROBLEM, ROOM, run
 
 import switchfit as sf
-from switchfit import cli
 from switchfit.io.logs import find_logs, name_files
 from switchfit.io.problem_file import load_problem
 from switchfit.runtime.errors import InputError
@@ -38,10 +36,6 @@ def folder(tmp_path):
 
 def spoil(folder):
     (folder / "logs" / "sunday.csv").write_text("t;T\n0;1\n1;cold\n")
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

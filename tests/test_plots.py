@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from models import RAMP
 
 import switchfit as sf
-from switchfit.io.result_tables import write_unknowns
+from switchfit.io.command_line import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.html.curves import list_transitions
 from switchfit.report.plot import plot_timeline

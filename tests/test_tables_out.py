@@ -20,7 +20,7 @@ import switchfit as sf
 from switchfit.batch import fits as saved
 from switchfit.batch.chunks import compute_seal
 from switchfit.fit.result import Fit
-from switchfit.io.result_tables import write_runs, write_unknowns
+from switchfit.io.command_line import write_runs, write_unknowns
 from switchfit.models import heater_problem
 from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.runtime.errors import MissingExtraError

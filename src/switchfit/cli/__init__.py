@@ -20,20 +20,14 @@ YOUNG_OBJECTS = 200_000
 """New objects after which Python looks for garbage. With its own threshold of 700, a tenth of the processor time of a
 cold fit goes into searching imported modules and traces, none of which is garbage."""
 
-COMMANDS = {
-    "init": "starting",
-    "fit": "fitting",
-    "modes": "modes",
-    "online": "online",
-    "design": "checking",
-    "check": "checking",
-    "simulate": "checking",
-    "validate": "comparison",
-    "compare": "comparison",
-    "examples": "starting",
-    "paper": "comparison",
+MODULES = {
+    "fitting": ("fit", "modes", "validate", "compare"),
+    "online": ("online",),
+    "checking": ("init", "examples", "check", "simulate", "design", "paper"),
 }
-"""Commands, in the order of --help, and the modules that have them."""
+"""Modules and their commands, in the order of --help."""
+
+COMMANDS = {name: module for module, names in MODULES.items() for name in names}
 
 
 def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
@@ -84,9 +78,8 @@ def main() -> None:
     # pydantic would look for plugins in the metadata of every installed package, which takes 10 to 20 ms.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     asked = [name for name in sys.argv[1:2] if name in COMMANDS]
-    app = build_app(asked or COMMANDS)
     try:
-        app(prog_name="switchfit")
+        build_app(asked or COMMANDS)(prog_name="switchfit")
     finally:
         gc.freeze()  # else Python searches all that is imported for garbage when it exits: 20 to 80 ms
 

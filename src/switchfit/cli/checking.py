@@ -1,22 +1,113 @@
-"""``switchfit check``, ``simulate`` and ``design``: a problem without a fit."""
+"""``switchfit init`` and ``examples``, to begin with; ``check``, ``simulate`` and ``design``, a problem without a fit;
+``paper``, the paper's experiments.
+"""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+import ast
+import os
+import shutil
+import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+import switchfit as sf
 from switchfit.cli import terminal
-from switchfit.cli.terminal import option, output_folder
+from switchfit.cli.terminal import argument, option, output_folder
+from switchfit.io import find_examples, refuse_existing
+from switchfit.runtime.files import write_atomically
 
-if TYPE_CHECKING:
-    from switchfit.fit.trajectory import Trajectory
+NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
+FirstLog = Annotated[
+    Path | None, option("--from", metavar="LOG", help="Log to begin with, of any format. Default: an example.")
+]
 
 
+@terminal.command("quiet")
+def init(name: NewFolder, log: FirstLog = None) -> None:
+    """Create a problem to begin with, ready to fit.
+
+    Writes a folder with a problem file, its model and data. With --from the time column and up to three channels of
+    the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
+    estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
+    """
+    from switchfit.io.command_line import describe_experiments
+    from switchfit.io.problem_file.writing import write_first_problem
+
+    folder = Path(name)
+    written = write_first_problem(folder, log)
+    loaded = terminal.load(folder / "problem.toml")
+    terminal.print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
+    terminal.print_text(describe_experiments(loaded.problem.experiments))
+    terminal.print_text(
+        f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
+        f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
+    )
+
+
+def _complete_examples(incomplete: str) -> list[str]:
+    return [name for name in _list_examples() if name.startswith(incomplete)]
+
+
+def _list_examples() -> dict[str, Path]:
+    """Return the examples by name: folders and single files."""
+    found = sorted(find_examples().glob("[!_.]*"))
+    return {path.stem: path for path in found if path.is_dir() or path.suffix == ".py"}
+
+
+ExampleName = Annotated[
+    str | None, argument("NAME", "Example to copy. Left out, all are listed.", autocompletion=_complete_examples)
+]
+ExampleFolder = Annotated[Path | None, argument("FOLDER", "Folder to create. Default: one of the name.")]
+
+
+@terminal.command()
+def examples(name: ExampleName = None, folder: ExampleFolder = None) -> None:
+    """List the examples, or copy one.
+
+    It is copied into a new folder. Nothing is overwritten.
+    """
+    found = _list_examples()
+    if name is None:
+        width = max(map(len, found), default=0)
+        terminal.print_text("\n".join(f"{each:<{width}}  {_describe(path)}" for each, path in found.items()))
+        terminal.print_note("\nCopy one with: switchfit examples NAME")
+        return
+    if name not in found:
+        terminal.fail(f"there is no example {name!r}; there are {', '.join(found)}.")
+    target = Path(name) if folder is None else folder
+    refuse_existing(target, "FOLDER")
+    source = found[name]
+    if source.is_dir():
+        shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
+    else:
+        target.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source, target)
+    commands = [f"switchfit {_choose_command(path)} {path}" for path in sorted(target.glob("*.toml"))]
+    commands = commands or [f"python {path}" for path in sorted(target.glob("*.py"))]
+    terminal.print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
+
+
+def _choose_command(path: Path) -> str:
+    """Return the command for a problem file: a search where the mode sequence is what is looked for."""
+    contents = tomllib.loads(path.read_text(encoding="utf-8"))
+    is_search = "library" in contents and not any("mode_sequence" in run for run in contents.get("experiments", []))
+    return "modes" if is_search else "fit"
+
+
+def _describe(path: Path) -> str:
+    """Return what an example is about: the title of its README, or the first line of its problem file or script."""
+    readme = path / "README.md"
+    if readme.is_file():
+        return readme.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+    script = path if path.is_file() else next(iter(sorted(path.glob("*.py"))), None)
+    text = "" if script is None else ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) or ""
+    return text.partition("\n")[0]
+
+
+@terminal.command("json", "quiet", "verbose")
 def check(
     problem: terminal.ProblemPath,
     no_run: Annotated[
@@ -26,10 +117,6 @@ def check(
         bool,
         typer.Option("--full", help="List all runs and unknowns, and compare with the paper's equations too: seconds."),
     ] = False,
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Check a problem without fitting it.
 
@@ -38,35 +125,31 @@ def check(
 
     Exit code 0: the derivatives are right. 1: they are not. 2: the input is wrong.
     """
-    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        if no_run:
-            _check_files(problem, full)
-            return
-        from switchfit.io.problem_file import load_problem
+    if no_run:
+        _check_files(problem, full)
+        return
+    loaded = terminal.load(problem)
+    from switchfit.fit.evaluator import evaluator_of
+    from switchfit.io.command_line import describe, describe_steps, summarize_check
+    from switchfit.report.uncertainty import write_orders
 
-        loaded = load_problem(problem)
-        import switchfit as sf
-        from switchfit.fit.evaluator import evaluator_of
-        from switchfit.io.command_line import describe, describe_steps, summarize_check
-        from switchfit.report.uncertainty import write_orders
-
-        terminal.print_text(f"{describe(loaded.problem, full=full)}\n")
-        terminal.print_list("Logs", loaded.issues)
-        terminal.print_text(f"{describe_steps(loaded.problem, full=full)}\n")
-        evaluator = evaluator_of(loaded.problem)
-        if terminal.is_verbose():
-            terminal.print_note(evaluator.engine)
-        derivatives = sf.check_derivatives(loaded.problem, paper=full)
-        short = f"Derivatives of J along a random direction\n  {write_orders(derivatives)}"
-        terminal.print_text(f"{derivatives if full else short}\n")
-        found = sf.identifiability(loaded.problem)
-        terminal.print_text(found)
-        terminal.print_json(
-            summarize_check(evaluator, derivatives, found) | {"issues": [str(issue) for issue in loaded.issues]}
-        )
-        terminal.fail_for_refused(loaded.issues)
-        if not derivatives.passed:
-            raise typer.Exit(terminal.NOT_CONVERGED)
+    terminal.print_text(f"{describe(loaded.problem, full=full)}\n")
+    terminal.print_list("Logs", loaded.issues)
+    terminal.print_text(f"{describe_steps(loaded.problem, full=full)}\n")
+    evaluator = evaluator_of(loaded.problem)
+    if terminal.is_asked("verbose"):
+        terminal.print_note(evaluator.engine)
+    derivatives = sf.check_derivatives(loaded.problem, paper=full)
+    short = f"Derivatives of J along a random direction\n  {write_orders(derivatives)}"
+    terminal.print_text(f"{derivatives if full else short}\n")
+    found = sf.identifiability(loaded.problem)
+    terminal.print_text(found)
+    terminal.print_json(
+        summarize_check(evaluator, derivatives, found) | {"issues": [str(issue) for issue in loaded.issues]}
+    )
+    terminal.fail_for_refused(loaded.issues)
+    if not derivatives.passed:
+        raise typer.Exit(terminal.NOT_CONVERGED)
 
 
 def _check_files(problem: Path, full: bool) -> None:
@@ -92,13 +175,11 @@ Times = Annotated[
 ]
 
 
+@terminal.command("json", "quiet")
 def simulate(
     problem: terminal.ProblemPath,
     out: OutputFile = None,
     times: Times = "",
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Integrate the model at the first guess.
 
@@ -106,48 +187,25 @@ def simulate(
     experiments' time_unit is "min" instead of "s". Where times are dates, a column "date" has them, in the time zone of
     the experiment.
     """
-    if out is None and not json:
+    if out is None and not terminal.is_asked("json"):
         terminal.fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
-    with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.problem_file import load_problem
+    loaded = terminal.load(problem)
+    from switchfit.io.command_line import choose_times, tabulate_trajectory
 
-        loaded = load_problem(problem)
-        import switchfit as sf
-        from switchfit.io.command_line import choose_times, tabulate_trajectory
+    given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
+    runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
+    names = loaded.problem.run_names
+    terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
+    if out is None:
+        return
+    from switchfit.io.command_line import write_trajectories
 
-        given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
-        runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
-        names = loaded.problem.run_names
-        terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
-        if out is None:
-            return
-        table = _write_table(names, runs)
-        terminal.make_folder(out.parent)
-        terminal.write_file(out, table)
+    table = write_trajectories(names, runs)
+    terminal.make_folder(out.parent)
+    write_atomically(table, out)
 
 
-def _write_table(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
-    """Return trajectories as CSV: a row for each node or time, with the run, the mode and the states."""
-    units = {run.time_unit for run in runs}
-    if len(units) > 1:
-        raise ValueError(
-            f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
-            "CSV file would mix them: give each its own problem file."
-        )
-    (unit,) = units
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\r\n")
-    dated = any(run.origin is not None for run in runs)
-    columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
-    table.writerow(["experiment", *columns, "mode", *runs[0].state_names])
-    for name, run in zip(names, runs, strict=True):
-        dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
-        for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
-            table.writerow([name, t, *([date] if dated else []), mode, *x])
-    return text.getvalue()
-
-
-OutputFolder = Annotated[
+DesignFolder = Annotated[
     Path | None, output_folder("design.txt, design.json, design.png, and the designed input and sample times as CSV")
 ]
 Criterion = Annotated[
@@ -157,16 +215,13 @@ Criterion = Annotated[
 Samples = Annotated[int | None, option(metavar="COUNT", help="Most samples of each sensor. Default: all of the file.")]
 
 
+@terminal.command("json", "quiet", "verbose")
 def design(
     problem: terminal.ProblemPath,
-    out: OutputFolder = None,
+    out: DesignFolder = None,
     criterion: Criterion = None,
     samples: Samples = None,
     figures: terminal.FigureFormat = "png",
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Find the experiment that will determine unknowns best.
 
@@ -176,35 +231,54 @@ def design(
 
     Exit code 0: all unknowns that count can be estimated with the design. 1: some cannot. 2: the input is wrong.
     """
-    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        from switchfit.io.problem_file import load_problem
+    loaded = terminal.load(problem, out)
+    from switchfit.io.command_line import summarize_design
 
-        loaded = load_problem(problem)
-        import switchfit as sf
-        from switchfit.io.command_line import summarize_design
-
-        terminal.make_folder(out)
-        terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
-        table = loaded.contents.design
-        settings = {} if table is None else table.model_dump(exclude_none=True)
-        settings |= terminal.select_given(criterion=criterion, samples=samples)
-        plan = sf.design(loaded.problem, **settings)
-        terminal.print_text(plan)
-        terminal.print_json(summarize_design(plan) | {"out": out})
-        if out is not None:
-            _write(plan, out, figures)
-        terminal.fail_for_refused(loaded.issues)
-        if lost := [name for name in plan.names if name in plan.undetermined]:
-            terminal.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
+    terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
+    table = loaded.contents.design
+    settings = {} if table is None else table.model_dump(exclude_none=True)
+    settings |= terminal.select_given(criterion=criterion, samples=samples)
+    plan = sf.design(loaded.problem, **settings)
+    terminal.show(plan, summarize_design(plan), out, "design", figures, saved=True)
+    if out is not None:
+        _write_plan(plan, out)
+    terminal.fail_for_refused(loaded.issues)
+    if lost := [name for name in plan.names if name in plan.undetermined]:
+        terminal.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
 
 
-def _write(plan: Any, folder: Path, figures: str) -> None:
-    """Write table, design and figure, and the input and the samples as CSV."""
-    from switchfit.io.result_tables import write_rows, zip_rows
+def _write_plan(plan: Any, folder: Path) -> None:
+    """Write the input and the samples of a design as CSV."""
+    from switchfit.io.command_line import write_rows, zip_rows
 
-    terminal.write_result(plan, folder / "design", figures, saved=True)
     knots = plan.problem.experiments[plan.experiment].inputs
     if knots is not None:
-        terminal.write_file(folder / "input.csv", write_rows(zip_rows({"t": knots.times, **plan.inputs})))
+        write_atomically(write_rows(zip_rows({"t": knots.times, **plan.inputs})), folder / "input.csv")
     samples = [{"sensor": name, "t": time} for name, times in plan.sample_times.items() for time in times]
-    terminal.write_file(folder / "samples.csv", write_rows(samples, ("sensor", "t")))
+    write_atomically(write_rows(samples, ("sensor", "t")), folder / "samples.csv")
+
+
+PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")]
+Part = Annotated[
+    str | None, option(metavar="NAME", help="One part: lti, magic-formula, convergence, noise, trials or horizon.")
+]
+
+
+@terminal.command()
+def paper(out: PaperFolder = Path("paper"), quick: Quick = False, only: Part = None) -> None:
+    """Reproduce the paper's experiments and figures.
+
+    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run leaves the
+    parts that are done; --only runs another one.
+    """
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    from switchfit.paper import TABLE, run
+
+    terminal.make_folder(out)
+    try:
+        run(out, quick=quick, only=only, say=terminal.print_note)
+    except KeyboardInterrupt:
+        terminal.fail("interrupted; run the parts that are missing by --only.", terminal.INTERRUPTED)
+    terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
+    terminal.print_note(f"written to {out}")

@@ -1,4 +1,4 @@
-"""``switchfit fit``: one problem, or many logs with one problem file."""
+"""``switchfit fit``, of one problem or of many logs, and ``modes``, ``validate`` and ``compare``."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+import switchfit as sf
 from switchfit.cli import terminal
 from switchfit.cli.terminal import argument, option, output_folder
+from switchfit.io.user_files import describe_error
+from switchfit.runtime.errors import InputError, MissingExtraError
+from switchfit.runtime.files import write_atomically
+from switchfit.runtime.presentation import format_count, format_page, format_text
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
@@ -44,6 +49,7 @@ WithCertificate = Annotated[bool, typer.Option("--certificate", help="Print the 
 Full = Annotated[bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")]
 
 
+@terminal.command("json", "quiet", "verbose")
 def fit(
     problem: Problems,
     out: OutputFolder = None,
@@ -56,10 +62,6 @@ def fit(
     no_figures: NoFigures = False,
     certificate: WithCertificate = False,
     full: Full = False,
-    json: terminal.Json = False,
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Estimate transition times and parameters, and report.
 
@@ -76,32 +78,30 @@ def fit(
     overrides = terminal.select_given(strategy=strategy, hessian=hessian, max_iterations=max_iterations)
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
-    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
-        if model is not None:
-            raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
-        if len(problem) != 1 or table is not None:
-            terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
-        from switchfit.io.problem_file import load_problem
+    if model is not None:
+        raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
+    if len(problem) != 1 or table is not None:
+        terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
+    loaded = _override(terminal.load(problem[0], out), overrides)
+    estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
+    write_estimate(estimate, loaded, output)
+    from switchfit.io.command_line import summarize_estimate
+    from switchfit.report.formats import add_dates
 
-        loaded = load_problem(problem[0])
-        terminal.make_folder(out)
-        options = loaded.options | overrides
-        estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
-        write_estimate(estimate, loaded, options, output)
-        from switchfit.io.command_line import summarize_estimate
-        from switchfit.report.formats import add_dates
-
-        terminal.print_json(summarize_estimate(estimate) | {"out": out})
-        terminal.fail_for_refused(loaded.issues)
-        if not estimate.status.successful:
-            terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
-        if not estimate.success:
-            terminal.end_unreliable("the fit is bad; the first line of the report says why.")
+    terminal.print_json(summarize_estimate(estimate) | {"out": out})
+    terminal.fail_for_refused(loaded.issues)
+    if not estimate.status.successful:
+        terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
+    if not estimate.success:
+        terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
 
-def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
+def _override(loaded: ProblemFile, options: dict[str, Any]) -> ProblemFile:
+    return replace(loaded, options=loaded.options | options)
+
+
+def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
-    import switchfit as sf
 
     importing = threading.Thread(target=_import_figures, daemon=True)
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
@@ -110,25 +110,16 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     with terminal.stop_on_interrupt(
         lambda r: f"iteration {r.iteration}: J = {r.cost:.6g}, optimality {r.optimality:.1e}"
     ) as report:
-        estimate = sf.estimate(loaded.problem, callback=report, **options)
+        estimate = sf.estimate(loaded.problem, callback=report, **loaded.options)
     if prepare_figures:
         importing.join()  # two threads that import modules of one package in different orders find some half made
-    if terminal.is_verbose():
+    if terminal.is_asked("verbose"):
         terminal.print_note(estimate.engine)
         for step in estimate.steps:
             terminal.print_note(f"{step.strategy}: lowest J = {step.cost:.6g} after {step.seconds:.2g} s")
         counts = f"{estimate.iterations} iterations, {estimate.evaluations} evaluations"
         terminal.print_note(f"{counts}, {estimate.seconds:.2g} s")
     return estimate
-
-
-def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:
-    """Return the CSV files for what a screen of the report has no room for."""
-    from switchfit.report.text import SCREEN
-
-    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
-    is_long = {"runs": counts["runs"] > SCREEN["experiments"], "unknowns": counts["unknowns"] > SCREEN["unknowns"]}
-    return {} if folder is None else {name: folder / f"{name}.csv" for name in is_long if is_long[name]}
 
 
 @dataclass(frozen=True)
@@ -141,32 +132,26 @@ class Output:
     full: bool
 
 
-def write_estimate(
-    estimate: Any,
-    loaded: ProblemFile,
-    options: dict[str, Any],
-    output: Output,
-    *,
-    show: bool = True,
-) -> None:
+def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
-    from switchfit.io.result_tables import TABLES
+    from switchfit.io.command_line import list_tables
     from switchfit.report.formats import add_dates
-    from switchfit.runtime.presentation import format_text
 
     checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
-    folder, tables = output.folder, _choose_tables(estimate, output.folder)
+    folder, files = output.folder, {}
+    if folder is not None:
+        files = {name: (folder / f"{name}.csv", table) for name, table in list_tables(estimate).items()}
+    paths = {name: str(path) for name, (path, _) in files.items()}
     # The report after the certificate, which is part of the verdict.
-    files = {name: str(path) for name, path in tables.items()}
-    report = f"{format_text(estimate, full=output.full, files=files)}{checked}"
+    report = f"{format_text(estimate, full=output.full, files=paths)}{checked}"
     if show:
         terminal.print_text(report)
     if folder is None:
         return
-    terminal.write_file(folder / "report.txt", report + "\n")
-    for name, path in tables.items():
-        terminal.write_file(path, TABLES[name](estimate))
-    provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
+    write_atomically(report + "\n", folder / "report.txt")
+    for path, table in files.values():
+        write_atomically(table, path)
+    provenance = estimate.describe_provenance(replace(loaded.provenance, options=loaded.options))
     _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:
         terminal.write_figure(estimate, folder / f"fit.{output.figures}")
@@ -176,47 +161,48 @@ def write_estimate(
 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
-    from switchfit.io.command_line import summarize_estimate
-    from switchfit.io.result_tables import ResultTable, check_table, list_logs
+    from switchfit.io.command_line import (
+        check_table,
+        describe_fit,
+        describe_row,
+        list_logs,
+        summarize_estimate,
+        write_logs,
+    )
 
     logs = list_logs(paths)
     if table is not None:
         check_table(table)
         terminal.make_folder(table.parent)
-    results, fitted = ResultTable(), []
+    rows: list[dict[str, Any]] = []
+    fitted = []
     for name, path in logs:
-        loaded, estimate, error = _fit_log(model, path, overrides, output)
-        results.add(str(path), estimate, error)
-        terminal.print_text(results.describe_last())
         folder = None if output.folder is None else output.folder / name
-        refused = {"verdict": "refused", "message": error}
-        shown = refused if estimate is None else summarize_estimate(estimate) | {"out": folder}
+        estimate, error = None, ""
+        try:
+            loaded = _override(terminal.load(model, log=path), overrides)
+            estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
+        except Exception as raised:
+            error = str(raised) if isinstance(raised, InputError) else describe_error(raised)
+        rows.append(describe_fit(str(path), estimate, error))
+        terminal.print_text(describe_row(rows[-1]))
+        shown = rows[-1] if estimate is None else summarize_estimate(estimate) | {"out": folder}
         fitted.append({"log": str(path)} | shown)
-        if loaded is not None and folder is not None:
+        if estimate is not None and folder is not None:
             terminal.make_folder(folder)
-            write_estimate(estimate, loaded, loaded.options | overrides, replace(output, folder=folder), show=False)
+            write_estimate(estimate, loaded, replace(output, folder=folder), show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
-            terminal.write_file(table, results.write(table))
+            write_atomically(write_logs(rows, table), table)
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
-    terminal.print_note(results.summarize(len(logs)))
+    refused = sum(row["verdict"] == "refused" for row in rows)
+    failed, left = sum(bool(row["message"]) for row in rows) - refused, len(logs) - len(rows)
+    counts = f"{len(rows) - refused - failed} fitted, {failed} not, {refused} refused"
+    terminal.print_note(f"{format_count(len(logs), 'log')}: {counts}{f'; {left} were not begun' if left else ''}")
     terminal.print_json({"logs": fitted})
-    if results.refused:
+    if refused:
         return terminal.BAD_INPUT
-    return terminal.NOT_CONVERGED if results.failed or len(results) < len(logs) else terminal.CONVERGED
-
-
-def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:
-    """Return the problem of a log and its estimate, or None for both, and what is wrong."""
-    from switchfit.io.problem_file import load_problem
-    from switchfit.io.user_files import describe_error
-    from switchfit.runtime.errors import InputError
-
-    try:
-        loaded = load_problem(model, log)
-        return loaded, estimate_problem(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
-    except Exception as error:
-        return None, None, str(error) if isinstance(error, InputError) else describe_error(error)
+    return terminal.NOT_CONVERGED if failed or left else terminal.CONVERGED
 
 
 def _import_figures() -> None:
@@ -238,12 +224,173 @@ def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None
 
 def _write_page(estimate: Any, provenance: Any, path: Path) -> None:
     """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
-    from switchfit.runtime.errors import MissingExtraError
-    from switchfit.runtime.presentation import format_page
 
     try:
         page = format_page(estimate, provenance=provenance)
     except MissingExtraError as missing:
         terminal.print_note(f"no {path.name}: {missing}")
     else:
-        terminal.write_file(path, page)
+        write_atomically(page, path)
+
+
+USABLE = {"FOUND", "UNIDENTIFIED", "AMBIGUOUS", "AT_LIMIT"}
+"""Statuses of a search whose best sequence explains the data."""
+
+
+ModesFolder = Annotated[
+    Path | None, output_folder("modes.txt, modes.json, modes.png and best.toml, which switchfit fit reads")
+]
+MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most switches of a run. Default: 8.")]
+Criterion = Annotated[
+    Literal["bic", "mbic", "aicc", "cost"],
+    option(help="Price of a switch. bic, the default: log n; mbic: twice as much; cost: --switch-cost."),
+]
+SwitchCost = Annotated[
+    float | None, option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost.")
+]
+Method = Annotated[
+    Literal["auto", "beam", "insertion"],
+    option(help="What proposes sequences. Default: auto, the beam for data if the model has machine code."),
+]
+Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
+
+
+@terminal.command("json", "quiet", "verbose")
+def modes(
+    problem: terminal.ProblemPath,
+    out: ModesFolder = None,
+    max_switches: MaxSwitches = 8,
+    criterion: Criterion = "bic",
+    switch_cost: SwitchCost = None,
+    method: Method = "auto",
+    width: Width = 40,
+    figures: terminal.FigureFormat = "png",
+) -> None:
+    """Find which modes were active, in which order, and when.
+
+    Fits mode sequences of the model to the data, and prints the best with a table by number of switches. The [library]
+    of the problem file says which sequences there may be. Ctrl-C ends the search after the current fit and keeps the
+    best so far.
+
+    Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
+    fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
+    """
+    settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
+    settings |= {"criterion": criterion, "switch_cost": switch_cost}
+    loaded = terminal.load(problem, out, searched=True)
+    from switchfit.io.command_line import summarize_modes
+
+    terminal.print_list("Logs", loaded.issues)
+    search = _search(loaded, loaded.library | settings)
+    best = None if out is None else _write_best(search, loaded, out)
+    summary, drawn = summarize_modes(search) | {"problem_file": best}, figures if search.chosen else ""
+    terminal.show(search, summary, out, "modes", drawn, saved=True)
+    terminal.fail_for_refused(loaded.issues)
+    if search.status.name == "NO_SUCCESSION":
+        terminal.fail(search.message)
+    if search.status.name not in USABLE:
+        terminal.end_unreliable("no mode sequence to rely on; the first line of the result says why, and what to do.")
+
+
+def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
+    """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
+
+    def describe(progress: Any) -> str:
+        best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
+        return f"{progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}"
+
+    with terminal.stop_on_interrupt(describe, "fit") as report:
+        return sf.find_modes(loaded.problem, callback=report, **settings)
+
+
+def _write_best(search: Any, loaded: ProblemFile, folder: Path) -> Path | None:
+    """Write the best mode sequence as a problem file; return its path, None if there is none."""
+    from switchfit.io.problem_file.writing import write_fitted_problem
+
+    if search.best is None:
+        return None
+    try:
+        text = write_fitted_problem(loaded, search.best, folder)
+    except InputError as error:
+        terminal.print_note(f"no best.toml: {error}")
+        return None
+    write_atomically(text, folder / "best.toml")
+    return folder / "best.toml"
+
+
+OtherRun = Annotated[Path, argument("LOG|PROBLEM.toml", "A log like the one that was fitted, or a problem file.")]
+ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
+SavedPaths = Annotated[
+    list[Path],
+    argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", exists=True, dir_okay=False),
+]
+ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
+
+
+@terminal.command("json", "quiet")
+def validate(
+    saved: terminal.SavedPath,
+    other: OtherRun,
+    out: ValidationFolder = None,
+    folder: terminal.Folder = None,
+    figures: terminal.FigureFormat = "png",
+) -> None:
+    """Check whether the parameters of a fit hold for another run.
+
+    The parameters are those of the saved estimate. Only what is the other run's own is estimated from it: transition
+    times, unknown initial states. A log is read as the one that was fitted: the same columns, modes and first guesses.
+    If these differ, name a problem file for the other run; its parameters get the values of the fit.
+
+    Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
+    """
+    from switchfit.estimation.estimator import Estimate
+    from switchfit.io.command_line import summarize_validation
+    from switchfit.io.saved_problem import list_changed_models, load_other_run
+
+    estimate = Estimate.load(saved)
+    loaded = load_other_run(saved, estimate.provenance, other, folder)
+    terminal.make_folder(out)
+    changes = list_changed_models(estimate.provenance, loaded)
+    terminal.print_list("Changed since", changes)
+    terminal.print_list("Logs", loaded.issues)
+    found = estimate.validate(loaded.problem)
+    terminal.show(found, summarize_validation(found) | {"changes": changes}, out, "validation", figures)
+    terminal.fail_for_refused(loaded.issues)
+    if found.verdict.level == "bad":
+        terminal.end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
+
+
+@terminal.command("json", "quiet")
+def compare(
+    saved: SavedPaths,
+    out: ComparisonFolder = None,
+    folder: terminal.Folder = None,
+    figures: terminal.FigureFormat = "png",
+) -> None:
+    """Compare models that were fitted to the same data.
+
+    Prints a row for each saved estimate, the best one first: unknowns, likelihood, AICc, BIC. Each is named by its
+    file, or by its folder if the files are named alike.
+
+    Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
+    fits to different data.
+    """
+    from switchfit.io.command_line import summarize_comparison
+    from switchfit.io.logs import name_files
+    from switchfit.io.saved_problem import load_with_problem
+
+    terminal.make_folder(out)
+    names = name_files(saved)
+    estimates, changes = [], []
+    for name, path in zip(names, saved, strict=True):
+        estimate, changed = load_with_problem(path, folder)
+        estimates.append(estimate)
+        changes += [f"{name}: {change}" for change in changed]
+    terminal.print_list("Changed since", changes)
+    found = sf.compare(estimates, names=names)
+    terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", figures)
+    failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
+    if failed:
+        terminal.end_unreliable(
+            f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small."
+        )

@@ -5,21 +5,22 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import switchfit as sf
 from switchfit.cli import terminal
 from switchfit.cli.terminal import option, output_folder
+from switchfit.runtime.presentation import format_count
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
     from switchfit.online.estimator import OnlineEstimator
     from switchfit.online.state import Now
-    from switchfit.problem.experiment import Experiment
     from switchfit.report.html.live import LivePage
 
 LEAST_ROOM = 4096
@@ -57,6 +58,7 @@ Live = Annotated[
 ]
 
 
+@terminal.command("quiet", "verbose")
 def online(
     problem: terminal.ProblemPath,
     replay: Replayed = None,
@@ -71,9 +73,6 @@ def online(
     live: Live = None,
     out: Annotated[Path | None, output_folder("online.txt and online.png")] = None,
     figures: terminal.FigureFormat = "png",
-    quiet: terminal.Quiet = False,
-    verbose: terminal.Verbose = False,
-    debug: terminal.Debug = False,
 ) -> None:
     """Estimate while the samples come in: which mode is it now, since when, with which parameters?
 
@@ -84,54 +83,48 @@ def online(
     Exit code 0: the model follows the samples. 1: at the end it does not. 2: the input is wrong, or was in some lines
     of stdin, which are reported and left out.
     """
-    with terminal.report_errors(debug, json=not quiet, quiet=quiet, verbose=verbose):
-        if stdin and replay is not None:
-            terminal.fail("--replay and --stdin contradict each other; give one of them.")
-        from switchfit.io.problem_file import load_problem
+    if stdin and replay is not None:
+        terminal.fail("--replay and --stdin contradict each other; give one of them.")
+    loaded = terminal.load(problem, out, log=replay, searched=True, streamed=stdin)
+    for issue in loaded.issues:
+        terminal.print_note(issue)
+    from switchfit.online.log import build_log
+    from switchfit.problem.data import Measurements
+    from switchfit.problem.structure import select_kind
+    from switchfit.strategy.library import build_library
 
-        loaded = load_problem(problem, replay, searched=True, streamed=stdin)
-        for issue in loaded.issues:
-            terminal.print_note(issue)
-        from switchfit.online.log import build_log
-        from switchfit.problem.data import Measurements
-        from switchfit.problem.structure import select_kind
-        from switchfit.runtime.presentation import format_count
-        from switchfit.strategy.library import build_library
-
-        terminal.make_folder(out)
-        for file in filter(None, (state, journal)):
-            file.parent.mkdir(parents=True, exist_ok=True)
-        sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
-        room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
-        settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
-        settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
-        library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
-        settings |= {"successions": library.successions, "min_duration": library.durations}
-        estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
-        with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
-            recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
-            if estimator.now is None:
-                terminal.fail("there were no samples.")
-            if state is not None:
-                estimator.save(state)
-            if out is not None and recorded:
-                terminal.write_result(build_log(loaded.problem, recorded), out / "online", figures)
-            if page is not None and not interrupted:
-                with contextlib.suppress(terminal.CtrlC):
-                    terminal.print_note("the samples have ended; Ctrl-C ends the page")
-                    page.wait()
-        terminal.fail_for_refused(loaded.issues)
-        if refused:
-            terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
-        if estimator.now.status.name == "LOST":
-            terminal.end_unreliable(f"{estimator.now.status.value}.")
+    for file in filter(None, (state, journal)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
+    room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
+    settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
+    settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
+    library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
+    settings |= {"successions": library.successions, "min_duration": library.durations}
+    estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
+    with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
+        recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
+        if estimator.now is None:
+            terminal.fail("there were no samples.")
+        if state is not None:
+            estimator.save(state)
+        if out is not None and recorded:
+            terminal.write_result(build_log(loaded.problem, recorded), out / "online", figures)
+        if page is not None and not interrupted:
+            with contextlib.suppress(terminal.CtrlC):
+                terminal.print_note("the samples have ended; Ctrl-C ends the page")
+                page.wait()
+    terminal.fail_for_refused(loaded.issues)
+    if refused:
+        terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
+    if estimator.now.status.name == "LOST":
+        terminal.end_unreliable(f"{estimator.now.status.value}.")
 
 
 def _start(
     loaded: ProblemFile, settings: dict[str, Any], alarms: dict[str, Any], state: Path | None, journal: Path | None
 ) -> OnlineEstimator:
     """Return the estimator: a new one, or that of a state and a journal."""
-    import switchfit as sf
     from switchfit.online.tracker import read_journal
 
     written = journal if journal is not None and journal.exists() else None
@@ -154,57 +147,41 @@ def _start(
 def _run(
     loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, page: LivePage | None, records: bool
 ) -> tuple[list[Now], int, bool]:
-    """Feed all samples, until Ctrl-C, and print what the estimator says.
+    """Feed all samples, until Ctrl-C, and print what the estimator says; of a log, those that it has not had yet.
 
-    Return what it said, if that is recorded, how many lines it refused, and whether it was interrupted.
+    Return what it said, if that is recorded, how many lines of stdin it refused, and whether it was interrupted.
     """
-    from switchfit.io.command_line import summarize_now
+    from switchfit.io.command_line import read_sample, summarize_now
+    from switchfit.online.state import list_updates
 
-    recorded: list[Now] = []
-    refused: list[int] = []
+    recorded, refused = [], 0
     (run,) = loaded.problem.experiments
+    last = -math.inf if estimator.now is None else estimator.now.time
     with terminal.stop_on_interrupt(repr, "sample") as report:
         stopped = partial(report, None)
-        said = _replay_lines(run, estimator, stopped, refused) if stdin else _replay_log(run, estimator)
-        for now in said:
-            line = summarize_now(now, run)
+        logged = list_updates([(item.times, item.values) for item in run.data])
+        samples: Iterable[Any] = _read_lines(stopped) if stdin else ((t, y, None) for t, y in logged if t > last)
+        for number, sample in enumerate(samples, start=1):
+            if stdin and not sample.strip():
+                continue
+            try:
+                t, y, u = read_sample(sample, run) if stdin else sample
+                now = estimator.update(t, y, u=u)
+            except REFUSED as error:
+                if not stdin:
+                    raise
+                terminal.print_error(f"line {number}: {error}")
+                refused += 1
+                continue
+            line = terminal.format_json(summarize_now(now, run))
             if page is not None:
-                page.show(terminal.format_json(line))
-            terminal.print_json(line)
+                page.show(line)
+            terminal.print_text(line)
             if records:
                 recorded.append(now)
             if stopped():
                 break
-    return recorded, len(refused), stopped()
-
-
-def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
-    """Feed the samples of the log after those that the estimator has had; yield what it says after each."""
-    from switchfit.online.state import list_updates
-
-    last = -math.inf if estimator.now is None else estimator.now.time
-    for t, y in list_updates([(item.times, item.values) for item in run.data]):
-        if t > last:
-            yield estimator.update(t, y)
-
-
-def _replay_lines(
-    run: Experiment, estimator: OnlineEstimator, stopped: Callable[[], bool], refused: list[int]
-) -> Iterator[Now]:
-    """Feed the lines of stdin; yield what the estimator says after each, and report those that it refuses."""
-    from switchfit.io.command_line import read_sample
-
-    for number, line in enumerate(_read_lines(stopped), start=1):
-        if not line.strip():
-            continue
-        try:
-            t, y, u = read_sample(line, run)
-            now = estimator.update(t, y, u=u)
-        except REFUSED as error:
-            terminal.print_error(f"line {number}: {error}")
-            refused.append(number)
-        else:
-            yield now
+    return recorded, refused, stopped()
 
 
 def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:

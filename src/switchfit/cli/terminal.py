@@ -8,6 +8,8 @@ The arguments that several commands take.
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import io
 import logging
 import os
@@ -17,45 +19,36 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
+from switchfit.io.user_files import describe_error, find_user_place
+from switchfit.runtime.errors import InputError, Issue
+from switchfit.runtime.files import write_atomically
+
 if TYPE_CHECKING:
-    from switchfit.runtime.errors import Issue
+    from switchfit.io.problem_file.building import ProblemFile
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Voice:
-    """What a command prints: of its result the text, the JSON or nothing, and notes about what it does."""
-
-    text: bool = True
-    json: bool = False
-    notes: bool = True
-    log: bool = False
-
-
-_TEXT = Voice()
-
-_voice: ContextVar[Voice] = ContextVar("what is printed", default=_TEXT)
+_asked: ContextVar[frozenset[str]] = ContextVar("of json, quiet and verbose those that hold", default=frozenset())
 
 
 @contextlib.contextmanager
-def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
-    """Return a context in which the options --json, --quiet and --verbose hold."""
-    if quiet and verbose:
+def _ask(asked: frozenset[str]) -> Iterator[None]:
+    """Return a context in which some of the options --json, --quiet and --verbose hold."""
+    if asked >= {"quiet", "verbose"}:
         fail("--quiet and --verbose contradict each other; give one of them.")
-    token = _voice.set(Voice(text=not (json or quiet), json=json, notes=not quiet, log=verbose))
+    token = _asked.set(asked)
     logger, handler = logging.getLogger("switchfit"), logging.StreamHandler()
     level = logger.level
-    if verbose:
+    if is_asked("verbose"):
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
     try:
@@ -63,23 +56,23 @@ def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = Fal
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)
-        _voice.reset(token)
+        _asked.reset(token)
 
 
-def is_verbose() -> bool:
-    """Return whether --verbose was given."""
-    return _voice.get().log
+def is_asked(name: str) -> bool:
+    """Return whether --json, --quiet or --verbose was given."""
+    return name in _asked.get()
 
 
 def print_text(text: object) -> None:
     """Print a part of the result as text."""
-    if _voice.get().text:
+    if not (is_asked("json") or is_asked("quiet")):
         _print(text)
 
 
 def print_json(value: Any) -> None:
     """Print the result as JSON, if it is asked for."""
-    if _voice.get().json:
+    if is_asked("json"):
         _print(format_json(value))
 
 
@@ -92,7 +85,7 @@ def format_json(value: Any) -> str:
 
 def print_note(text: object) -> None:
     """Print what the command does, to stderr."""
-    if _voice.get().notes:
+    if not is_asked("quiet"):
         _print(text, err=True)
 
 
@@ -123,17 +116,15 @@ def interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 @contextlib.contextmanager
-def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+def report_errors(debug: bool, **options: bool) -> Iterator[None]:
     """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file.
 
-    The other options hold as in `choose_voice`.
+    In this context the options --json, --quiet and --verbose hold, too.
     """
     try:
-        with choose_voice(json=json, quiet=quiet, verbose=verbose), handle_interrupt(interrupt):
+        with _ask(frozenset(name for name, given in options.items() if given)), handle_interrupt(interrupt):
             yield
     except BaseException as error:
-        from switchfit.io.user_files import find_user_place
-
         users = find_user_place(error) is not None
         if isinstance(error, typer.Exit) and not users:
             raise
@@ -148,9 +139,6 @@ def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbo
 
 def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
     """Print the error and exit; `users` is whether it was raised in a file of the user."""
-    from switchfit.io.user_files import describe_error
-    from switchfit.runtime.errors import InputError
-
     if users and not isinstance(error, InputError):
         fail(f"{describe_error(error)}. (--debug shows the full traceback.)")
     if isinstance(error, OSError) and error.filename is not None:
@@ -188,7 +176,7 @@ def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
 
 def end_unreliable(reason: str) -> NoReturn:
     """Print why the result is not to be relied on, except with --quiet, and exit with the code that says so."""
-    if _voice.get().notes:
+    if not is_asked("quiet"):
         print_error(reason)
     raise typer.Exit(NOT_CONVERGED)
 
@@ -218,7 +206,7 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
         print_note(f"stopping after this {part}; Ctrl-C again to stop at once")
 
     def report(progress: Any) -> bool:
-        if is_verbose() and progress is not None:
+        if is_asked("verbose") and progress is not None:
             print_note(f"  {describe(progress)}")
         return requested.is_set()
 
@@ -229,17 +217,19 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
+def load(problem: Path, out: Path | None = None, **how: Any) -> ProblemFile:
+    """Load a problem file as `load_problem` does, and create the folder for the results."""
+    from switchfit.io.problem_file import load_problem
+
+    loaded = load_problem(problem, **how)
+    make_folder(out)
+    return loaded
+
+
 def make_folder(folder: Path | None) -> None:
     """Create a folder, with those above it, unless it exists or none is asked for."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-
-
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file atomically."""
-    from switchfit.runtime.files import write_atomically
-
-    write_atomically(content, path)
 
 
 DOTS = 150
@@ -272,10 +262,6 @@ Folder = Annotated[
 FigureFormat = Annotated[
     Literal["png", "pdf", "svg"], option("--figures", help="Format of the figure in --out. Default: png.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
 
 
 def select_given(**options: Any) -> dict[str, Any]:
@@ -294,7 +280,7 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
 
     The files differ in their endings. Say where they are.
     """
-    write_file(stem.with_suffix(".txt"), f"{result}\n")
+    write_atomically(f"{result}\n", stem.with_suffix(".txt"))
     if saved:
         result.save(stem.with_suffix(".json"))
     if figures:
@@ -302,12 +288,22 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
     print_note(f"written to {stem.parent}")
 
 
+def show(
+    result: Any, summary: dict[str, Any], out: Path | None, name: str, figures: str, *, saved: bool = False
+) -> None:
+    """Print a result, and write it as `write_result` does, if there is a folder for it."""
+    print_text(result)
+    if out is not None:
+        write_result(result, out / name, figures, saved=saved)
+    print_json(summary | {"out": out})
+
+
 def write_figure(result: Any, path: Path) -> None:
     """Write the figure of a result; the ending of the name is its format."""
     os.environ.setdefault("MPLBACKEND", "Agg")
     content = io.BytesIO()
     result.plot().savefig(content, format=path.suffix[1:], dpi=DOTS)
-    write_file(path, content.getvalue())
+    write_atomically(content.getvalue(), path)
 
 
 def fail_for_refused(issues: Sequence[Issue]) -> None:
@@ -317,3 +313,34 @@ def fail_for_refused(issues: Sequence[Issue]) -> None:
         print_error(issue)
     if refused:
         raise typer.Exit(BAD_INPUT)
+
+
+COMMON = {
+    "json": Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")],
+    "quiet": Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")
+    ],
+    "verbose": Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")],
+    "debug": Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")],
+}
+"""Options of which a command has some, and --debug in any case."""
+
+
+def command(*options: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that gives a command some of the common options, and runs it in `report_errors`."""
+    names = (*options, "debug")
+
+    def decorate(run: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(run)
+        def run_command(**given: Any) -> None:
+            common = {name: given.pop(name) for name in names}
+            with report_errors(**common):
+                run(**given)
+
+        kind = inspect.Parameter.KEYWORD_ONLY
+        added = [inspect.Parameter(name, kind, default=False, annotation=COMMON[name]) for name in names]
+        own = inspect.signature(run, eval_str=True)
+        run_command.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
+        return run_command
+
+    return decorate

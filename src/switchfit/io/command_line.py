@@ -1,11 +1,14 @@
-"""What the command line reads and shows: times to simulate, samples and results as JSON, the summary of a problem."""
+"""What the command line reads and shows: times, samples, summaries of problems, results as JSON, tables as CSV."""
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
-from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -13,8 +16,9 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.experiment_design import Design, DesignRecord
 from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
-from switchfit.io.result_tables import list_unknowns, zip_rows
+from switchfit.io.logs import find_logs, name_files
 from switchfit.modes.result import ModeSearch
 from switchfit.online.state import Now
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -24,23 +28,16 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.validation import shorten
-from switchfit.report.formats import (
-    add_dates,
-    describe_origin,
-    format_iso,
-    format_span,
-    format_table,
-    format_time,
-    label_quantity,
-    list_dated,
-    list_jumps,
-    suffix_time,
-)
+from switchfit.report import formats
+from switchfit.report.frames import ERROR
 from switchfit.report.sentences import write_reason, write_step
-from switchfit.runtime.errors import InputError
+from switchfit.report.text import SCREEN
+from switchfit.runtime.errors import InputError, import_library
+from switchfit.runtime.frames import describe_frame
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.certificate import DerivativeCheck, Identifiability
+from switchfit.uncertainty.residuals import UNLIKELY, ChannelQuality, measure_quality
 from switchfit.uncertainty.verdict import Verdict
 
 MOST_TIMES = 10_000_000
@@ -59,19 +56,16 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["sa
     InputError
         If it is neither, or the step makes no or too many times.
     """
-    if not given:
-        return None
-    if given == "samples":
-        return "samples"
-    try:
-        step = float(given)
-    except ValueError:
-        raise InputError(f"--times must be a step, such as 0.1, or 'samples'; got {given!r}.") from None
+    if given in ("", "samples"):
+        return "samples" if given else None
     t0, tf = experiment.ends_of_modes(experiment.initial_times)[[0, -1]].tolist()
+    step = np.nan
+    with contextlib.suppress(ValueError):
+        step = float(given)
     if not (0 < step < np.inf and (tf - t0) / step < MOST_TIMES):
         raise InputError(
-            f"--times must be a positive step that makes at most {MOST_TIMES:,} times from t0 = {t0:g} to tf = {tf:g}; "
-            f"got {given}."
+            f"--times must be 'samples', or a positive step, such as 0.1, that makes at most {MOST_TIMES:,} times from "
+            f"t0 = {t0:g} to tf = {tf:g}; got {given!r}."
         )
     count = int(np.floor((tf - t0) / step * (1 + 1e-12)))
     return np.minimum(t0 + step * np.arange(count + 1), tf)
@@ -129,21 +123,20 @@ def describe(problem: Problem, *, full: bool = False) -> str:
     full : bool
         All of them, not one screen.
     """
-    lines = [describe_experiments(problem.experiments, full=full)]
-    unknowns = problem.unknowns
-    rows = []
+    unknowns, rows = problem.unknowns, []
     numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
     columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
-    dated = list_dated(problem)
+    dated = formats.list_dated(problem)
     for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
-        ends = [format_time(end, run) for end in (lower, upper)]
-        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{ends[0]}, {ends[1]}]"
+        first, least, most = (formats.format_time(number, run) for number in (value, lower, upper))
+        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{least}, {most}]"
         known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
-        rows.append((name, f"{format_time(value, run)}{'' if run else unit_suffix(unit)}", bounds, known, scale))
+        rows.append((name, f"{first}{'' if run else unit_suffix(unit)}", bounds, known, scale))
     if not full and len(rows) > MOST_UNKNOWNS:
-        kept = MOST_UNKNOWNS - 2
-        rows = [*rows[:kept], (f"and {len(rows) - kept} more", "", "", "", "")]
-    return "\n".join([*lines, "Unknowns, first guess and bounds", *format_table(rows, "<<<<<")])
+        left = len(rows) - MOST_UNKNOWNS + 2
+        rows[-left:] = [(f"and {left} more", "", "", "", "")]
+    experiments = describe_experiments(problem.experiments, full=full)
+    return "\n".join([experiments, "Unknowns, first guess and bounds", *formats.format_table(rows, "<<<<<")])
 
 
 def describe_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
@@ -155,13 +148,13 @@ def describe_experiments(experiments: Sequence[Experiment], *, full: bool = Fals
     full : bool
         All of them, not one screen.
     """
+    shown = experiments if full else experiments[:MOST_EXPERIMENTS]
     lines = []
-    for k, experiment in enumerate(experiments, start=1):
+    for k, experiment in enumerate(shown, start=1):
         lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
         lines += [f"  {line}" for line in _describe_experiment(experiment)]
-        if not full and k == MOST_EXPERIMENTS < len(experiments):
-            lines.append(f"and {len(experiments) - k} more experiments: --full lists them")
-            break
+    if left := len(experiments) - len(shown):
+        lines.append(f"and {left} more experiments: --full lists them")
     return "\n".join(lines)
 
 
@@ -181,10 +174,9 @@ def describe_steps(problem: Problem, *, full: bool = False) -> str:
     """
     evaluator = evaluator_of(problem)
     rows = []
-    given = zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True)
-    for name, structure, mesh in given:
+    for name, structure, mesh in zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True):
         run = "" if len(problem.experiments) == 1 else f"{name}: "
-        rows.append(f"  {run}{mesh.cells:,} {_describe_method(structure)}{''.join(f'; {s}' for s in mesh.stiffness)}")
+        rows.append("; ".join([f"  {run}{mesh.cells:,} {_describe_method(structure)}", *mesh.stiffness]))
     if not full and len(rows) > MOST_EXPERIMENTS:
         total = sum(mesh.cells for mesh in evaluator.meshes)
         rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
@@ -202,56 +194,50 @@ def _describe_method(structure: Structure) -> str:
 
 
 def _describe_experiment(experiment: Experiment) -> list[str]:
-    step_unit, unit = unit_suffix(experiment.time_unit), suffix_time(experiment)
+    unit = formats.suffix_time(experiment)
     ends = experiment.ends_of_modes(experiment.initial_times)
-    show = partial(format_time, run=experiment)
-    times = ", ".join(map(show, ends[1:-1]))
-    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{show(ends[0])}, {show(ends[-1])}]{unit}"
+    start, *times, end = (formats.format_time(time, experiment) for time in ends)
+    sequence = f"{' -> '.join(experiment.mode_sequence)} on [{start}, {end}]{unit}"
     if experiment.has_free_tf:
-        horizon += " (tf is estimated)"
+        sequence += " (tf is estimated)"
     if experiment.taken_from_data:
-        horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
-    lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
-    jumps = list_jumps(experiment.jump_times, experiment)
-    lines += [jumps] if jumps else []
-    lines += [f"times in {text}"] if (text := describe_origin(experiment)) else []
-    for item in experiment.data:
-        if isinstance(item, Measurements):
-            step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
-            missing = item.values.size - item.count
-            lines.append(
-                f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}, "
-                f"{format_span(item.times[0], item.times[-1], experiment)}, typically {step:.4g}{step_unit} apart, "
-                f"{missing} values missing{_describe_sensor(item, step_unit)}"
-            )
-        elif isinstance(item, ReferenceSignal):
-            knots = item.signal.knots
-            names = _join_channel_names(item.names, item.units, item.signal.channels)
-            lines.append(
-                f"reference signal of {names}, {format_span(knots[0], knots[-1], experiment)}, {len(knots)} knots"
-            )
-        else:
-            lines.append(type(item).__name__)
-    return lines
+        sequence += f" ({' and '.join(experiment.taken_from_data)} from the data)"
+    lines = [f"{sequence}, at {', '.join(times)}{unit}" if times else sequence]
+    lines.append(formats.list_jumps(experiment.jump_times, experiment))
+    lines += [f"times in {text}"] if (text := formats.describe_origin(experiment)) else []
+    lines += [_describe_data(item, experiment) for item in experiment.data]
+    return [line for line in lines if line]
 
 
-def _describe_sensor(item: Measurements, unit: str) -> str:
-    """Return a description of delay, noise and loss, empty for a sensor without these."""
+def _describe_data(item: Any, experiment: Experiment) -> str:
+    """Return the channels of data, their span and number, and what is known of the sensor."""
+    if isinstance(item, ReferenceSignal):
+        knots, names = item.signal.knots, _join_channel_names(item.names, item.units, item.signal.channels)
+        span = formats.format_span(knots[0], knots[-1], experiment)
+        return f"reference signal of {names}, {span}, {len(knots)} knots"
+    if not isinstance(item, Measurements):
+        return type(item).__name__
+    unit = unit_suffix(experiment.time_unit)
+    step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
     named = sorted({name for name in item.sigma_names if name})
     said = [
+        f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}",
+        formats.format_span(item.times[0], item.times[-1], experiment),
+        f"typically {step:.4g}{unit} apart",
+        f"{item.values.size - item.count} values missing",
         f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",
         "noise unknown" if item.sigma is None else "",
         f"sigma: {', '.join(named)}" if named else "",
         f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
     ]
-    return "".join(f", {text}" for text in said if text)
+    return ", ".join(filter(None, said))
 
 
 def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
     """Return names with their units, or the number of channels where they have no names."""
     if names is None:
         return f"{channels} channels"
-    return ", ".join(map(label_quantity, names, units or ("",) * channels))
+    return ", ".join(map(formats.label_quantity, names, units or ("",) * channels))
 
 
 KEYS = {
@@ -277,7 +263,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
         "converged": estimate.status.successful,
-        "message": add_dates(estimate.message, estimate),
+        "message": formats.add_dates(estimate.message, estimate),
         **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
@@ -321,23 +307,14 @@ def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
     name : str
     trajectory : Trajectory
     """
-    run = trajectory if trajectory.origin is not None else None
-    return {
-        "name": name,
-        "time_unit": trajectory.time_unit,
-        **({} if run is None or run.origin is None else {"origin": run.origin.date}),
-        "modes": [
-            {"mode": mode, "begin": begin, "end": end, **_list_dates({"_begin": begin, "_end": end}, run)}
-            for mode, begin, end in trajectory.mode_spans
-        ],
-        "jumps": trajectory.jump_times,
-        **({} if run is None else {"jump_dates": [format_iso(time, run) for time in trajectory.jump_times.tolist()]}),
-    }
-
-
-def _list_dates(times: dict[str, float], run: Trajectory | None) -> dict[str, str | None]:
-    """Return times as dates under the key "date" with a suffix each; {} where they are no dates."""
-    return {} if run is None else {f"date{suffix}": format_iso(time, run) or None for suffix, time in times.items()}
+    modes = [{"mode": mode, "begin": begin, "end": end} for mode, begin, end in trajectory.mode_spans]
+    found = {"name": name, "time_unit": trajectory.time_unit, "modes": modes, "jumps": trajectory.jump_times}
+    if trajectory.origin is None:
+        return found
+    for span in modes:
+        span |= {f"date_{end}": formats.format_iso(span[end], trajectory) or None for end in ("begin", "end")}
+    dates = [formats.format_iso(time, trajectory) for time in trajectory.jump_times.tolist()]
+    return found | {"origin": trajectory.origin.date, "jump_dates": dates}
 
 
 def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
@@ -448,8 +425,7 @@ def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
     now : Now
     run : Experiment
     """
-    dates = {} if run.origin is None else {"date": format_iso(now.time, run), "since_date": format_iso(now.since, run)}
-    return {
+    found = {
         "t": now.time,
         **_pick(now, "mode", "since", "mode_sequence", "transition_times", "mode_probability"),
         **_pick(now, "parameters", "standard_errors", "statistic", "threshold"),
@@ -457,8 +433,10 @@ def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
         "alarm": None if now.alarm is None else now.alarm._asdict(),
         "retracted": None if now.retracted is None else now.retracted._asdict(),
         "seconds": now.seconds,
-        **dates,
     }
+    if run.origin is not None:
+        found |= {"date": formats.format_iso(now.time, run), "since_date": formats.format_iso(now.since, run)}
+    return found
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:
@@ -483,3 +461,268 @@ def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: I
         },
         "identifiability": {"without_effect": found.without, **_pick(found, "undetermined", "condition_number")},
     }
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def list_unknowns(estimate: Estimate) -> list[dict[str, Any]]:
+    """Return a row for each unknown, with the columns of `Estimate.to_pandas`.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    frame = describe_frame(estimate)
+    columns = (*frame.index, *(each for each in frame.variables if each.dimensions == (frame.rows,)))
+    return zip_rows({each.name: each.values.tolist() for each in columns})
+
+
+def zip_rows(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
+    """Return the rows of a table, each a dict, from its columns.
+
+    Parameters
+    ----------
+    columns : mapping of str to iterable
+        All of one length.
+    """
+    return [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
+
+
+def write_unknowns(estimate: Estimate) -> str:
+    """Return a CSV table with a line for each unknown, with the columns of `Estimate.to_pandas`.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    return write_rows(list_unknowns(estimate))
+
+
+def write_runs(estimate: Estimate) -> str:
+    """Return a CSV table with a line for each run: modes, data, how well it fits, and what is wrong with it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    quality = measure_quality(estimate)
+    rows = []
+    for e, (name, trajectory) in enumerate(zip(estimate.run_names, estimate.trajectories, strict=True)):
+        here = [channel for channel in quality.channels if channel.experiment == e]
+        row = {
+            "run": name,
+            "modes": " -> ".join(mode for mode, _, _ in trajectory.mode_spans),
+            "t0": trajectory.times[0],
+            "tf": trajectory.times[-1],
+            "time unit": trajectory.time_unit,
+            "values": sum(channel.count for channel in here),
+            "chi2": sum(channel.chi_square for channel in here) if here else np.nan,
+            "explained": min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan),
+            "flags": "; ".join(_list_flags(estimate, name, here, len(quality.channels))),
+        }
+        if trajectory.origin is not None:
+            row["origin"] = trajectory.origin.date
+        rows.append(row)
+    return write_rows(rows)
+
+
+def write_trajectories(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
+    """Return trajectories as CSV: a row for each node or time, with the run, the mode and the states.
+
+    Parameters
+    ----------
+    names : sequence of str
+    runs : sequence of Trajectory
+
+    Raises
+    ------
+    ValueError
+        If they have times in different units.
+    """
+    units = {run.time_unit for run in runs}
+    if len(units) > 1:
+        raise ValueError(
+            f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
+            "CSV file would mix them: give each its own problem file."
+        )
+    (unit,) = units
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\r\n")
+    dated = any(run.origin is not None for run in runs)
+    columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
+    table.writerow(["experiment", *columns, "mode", *runs[0].state_names])
+    for name, run in zip(names, runs, strict=True):
+        dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
+        for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
+            table.writerow([name, t, *([date] if dated else []), mode, *x])
+    return text.getvalue()
+
+
+def _list_flags(fit: Fit, run: str, channels: Sequence[ChannelQuality], tested: int) -> Iterator[str]:
+    """Yield the flags of a run; the false alarms of chi-square are shared among all channels `tested`."""
+    words = {"model": "residuals of {} correlated", "outliers": "outliers in {}", "sigma": "chi2 of {} too large"}
+    for channel in channels:
+        failed = [name for name, probability in channel.tests.items() if probability * tested < UNLIKELY]
+        yield from (words[name].format(channel.label) for name in failed)
+    for constraint in fit.active:
+        if constraint.position is not None and constraint.run == run:
+            state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
+            yield f"mode {constraint.mode} {state}"
+
+
+def write_rows(rows: Sequence[Mapping[str, Any]], columns: Iterable[str] = ()) -> str:
+    """Return CSV; numbers have the digits that it takes to read the same ones, and NaN is an empty cell.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Of each row its cells by columns, an empty one where a column is left out.
+    columns : iterable of str, optional
+        Left out, those of all rows as they come.
+    """
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(columns) or list_columns(rows), restval="", lineterminator="\r\n")
+    table.writeheader()
+    for row in rows:
+        table.writerow({name: "" if isinstance(cell, float) and np.isnan(cell) else cell for name, cell in row.items()})
+    return text.getvalue()
+
+
+def list_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the columns that any row has.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+    """
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def list_tables(estimate: Estimate) -> dict[str, str]:
+    """Return the tables that a screen of the report has no room for, as CSV, by the names of their files.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    runs = {"runs": write_runs(estimate)} if len(estimate.run_names) > SCREEN["experiments"] else {}
+    return runs | ({"unknowns": write_unknowns(estimate)} if len(estimate.theta) > SCREEN["unknowns"] else {})
+
+
+def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Return (name, path) of all logs that paths, patterns and folders stand for.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+
+    Raises
+    ------
+    InputError
+        If a pattern matches nothing.
+    """
+    named = [log for path in paths for log in find_logs(Path(), str(path)) or [str(path)]]
+    found = list(dict.fromkeys(named))
+    return list(zip(name_files(found), map(Path, found), strict=True))
+
+
+PARQUET = (".parquet", ".pq")
+"""Endings of tables that are written as Parquet; all others are CSV."""
+
+
+def check_table(path: Path) -> None:
+    """Raise for a table that cannot be written, before any log is fitted.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    InputError
+        If it is to be Parquet, and pyarrow is not installed.
+    """
+    if path.suffix.lower() in PARQUET:
+        import_library(
+            "pyarrow.parquet", str(path), "'switchfit[parquet]'", ", or give the table a name that ends in .csv"
+        )
+
+
+def describe_fit(log: str, estimate: Estimate | None, error: str) -> dict[str, Any]:
+    """Return the row of a log: its estimate, or the error that kept it from being fitted.
+
+    A column that does not apply to it is left out. The message is empty for a fit that is good or doubtful.
+
+    Parameters
+    ----------
+    log : str
+    estimate : Estimate or None
+    error : str
+    """
+    if estimate is None:
+        return {"log": log, "verdict": "refused", "message": error}
+    message = "" if estimate.status.successful else formats.add_dates(estimate.message, estimate)
+    if not message and not estimate.success:
+        message = write_reason(estimate.verdict.reasons[0])
+    quality, trajectory = measure_quality(estimate), estimate.trajectories[0]
+    row: dict[str, Any] = {
+        "log": log,
+        "verdict": estimate.verdict.level,
+        "status": estimate.status.name,
+        "cost": float(estimate.cost),
+        "values": estimate.samples,
+        "chi2": float(quality.chi_square),
+        "degrees of freedom": estimate.freedom,
+        "explained": float(quality.explained),
+        "t0": float(trajectory.times[0]),
+        "tf": float(trajectory.times[-1]),
+        "time unit": trajectory.time_unit,
+        "iterations": estimate.iterations,
+        "seconds": float(estimate.seconds),
+    }
+    unknowns = list_unknowns(estimate)
+    for unknown in unknowns:
+        shown = formats.label_quantity(unknown["unknown"], unknown["unit"])
+        row |= {shown: unknown["value"], ERROR.format(shown): unknown["std_error"]}
+    row |= {f"{unknown['unknown']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
+    return {**row, "message": message}
+
+
+def describe_row(row: Mapping[str, Any]) -> str:
+    """Return the row of a log as one line of text: verdict and numbers, or the error.
+
+    Parameters
+    ----------
+    row : mapping
+    """
+    numbers = []
+    for name in (name for name in row if ERROR.format(name) in row):
+        value, error, _ = formats.format_rounded(row[name], row[ERROR.format(name)])
+        numbers.append(f"{name} = {value} {error}".rstrip())
+    return ". ".join(filter(None, [f"{row['log']}: {row['verdict']}", ", ".join(numbers), row["message"]]))
+
+
+def write_logs(rows: Sequence[Mapping[str, Any]], path: Path) -> str | bytes:
+    """Return the content of the table of logs, with the columns that any of them has.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+    path : Path
+        Its ending says whether it is Parquet or CSV.
+    """
+    columns = sorted(list_columns(rows), key=lambda name: name == "message")  # which comes last
+    if path.suffix.lower() not in PARQUET:
+        return write_rows(rows, columns)
+    import pyarrow.parquet
+
+    def find_unit(column: str) -> str:  # of an unknown, which has it in parentheses
+        name = column.removesuffix(ERROR.format(""))
+        return name[:-1].rpartition(" (")[2] if ERROR.format(name) in columns and name.endswith(")") else ""
+
+    table, file = pyarrow.table({name: [row.get(name) for row in rows] for name in columns}), io.BytesIO()
+    units = map(find_unit, columns)
+    fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
+    pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
+    return file.getvalue()

@@ -15,18 +15,26 @@ from switchfit.problem.validation import join_names
 from switchfit.runtime.errors import InputError
 
 
-def check_provenance(path: Path, given: Provenance | None) -> Provenance:
-    """Return the provenance of a saved estimate, whose problem can be built again.
+def rebuild_problem(
+    path: Path, given: Provenance | None, folder: Path | None = None, log: Path | None = None
+) -> ProblemFile:
+    """Return the problem of a saved estimate, built from the text that was saved with it.
 
     Parameters
     ----------
     path : Path
+        Of the saved estimate.
     given : Provenance or None
+        Of the saved estimate.
+    folder : Path, optional
+        Where the files are; left out, where the problem file was, seen from the folder of the saved estimate.
+    log : Path, optional
+        A log in place of that which was fitted.
 
     Raises
     ------
     InputError
-        If the problem cannot be built again.
+        If the problem cannot be built again, or a file is missing or wrong.
     """
     if given is None:
         raise InputError(f"{path} does not say what it was made from: fit its problem file again.")
@@ -36,34 +44,10 @@ def check_provenance(path: Path, given: Provenance | None) -> Provenance:
             "data. Validate and compare in the script that fitted it: estimate.validate(...), sf.compare([...]). "
             "switchfit fit PROBLEM.toml --out DIR saves what is needed."
         )
-    return given
-
-
-def rebuild_problem(
-    path: Path, given: Provenance, folder: Path | None = None, log: Path | None = None
-) -> tuple[ProblemFile, Path]:
-    """Return the problem of a saved estimate, built from the text that was saved with it, and its folder.
-
-    Parameters
-    ----------
-    path : Path
-        Of the saved estimate.
-    given : Provenance
-        As from `check_provenance`.
-    folder : Path, optional
-        Where the files are; left out, where the problem file was, seen from the folder of the saved estimate.
-    log : Path, optional
-        A log in place of that which was fitted.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or wrong.
-    """
     where = Path(given.folder) if folder is None else folder
     own = where / given.log if given.log else None
     try:
-        return load_problem(where / given.problem_file, own if log is None else log, text=given.text), where
+        return load_problem(where / given.problem_file, own if log is None else log, text=given.text)
     except InputError as error:
         needed = [digest for digest in given.files if log is None or digest.name.endswith(".py")]
         changed = [each.name for each in needed if digest_file(where, where / each.name).sha256 != each.sha256]
@@ -91,7 +75,7 @@ def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Pa
     """
     if other.suffix.lower() == ".toml":
         return load_problem(other)
-    return rebuild_problem(path, check_provenance(path, given), folder, other)[0]
+    return rebuild_problem(path, given, folder, other)
 
 
 def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, list[str]]:
@@ -109,11 +93,13 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     InputError
         If the problem cannot be built again, or its data are no longer those that were fitted.
     """
-    given = check_provenance(path, load_saved(path)[2])
-    loaded, where = rebuild_problem(path, given, folder)
+    given = load_saved(path)[2]
+    loaded = rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):
-        raise InputError(f"{path} was fitted to other values than the files in {where} have now: fit them again.")
+        raise InputError(
+            f"{path} was fitted to other values than the files in {loaded.path.parent} have now: fit them again."
+        )
     return estimate, list_changed_models(given, loaded)
 
 
@@ -127,16 +113,18 @@ def _has_data(estimate: Estimate, problem: Problem) -> bool:
     )
 
 
-def list_changed_models(given: Provenance, loaded: ProblemFile) -> list[str]:
+def list_changed_models(given: Provenance | None, loaded: ProblemFile) -> list[str]:
     """Return the Python files that are not as they were when a fit was saved, a line for each.
 
     Parameters
     ----------
-    given : Provenance
+    given : Provenance or None
         Of the saved fit.
     loaded : ProblemFile
         The problem that was built again.
     """
+    if given is None:
+        return []
     before, now = (
         {digest.name: digest.sha256 for digest in each.files if digest.name.endswith(".py")}
         for each in (given, loaded.provenance)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
+import inspect
 import os
 import re
 import sys
@@ -36,7 +38,9 @@ def load_object(reference: str, folder: Path, what: str) -> Any:
         If the file or the object is missing, or running the file raises.
     """
     path, name = find_object(reference, folder, what)
-    module = _run(path)
+    key = str(path.resolve())
+    _files[key] = path
+    module = _run(key, path.stat().st_mtime_ns)
     if not hasattr(module, name):
         public = [key for key in vars(module) if not key.startswith("_")]
         raise InputError(f"{what} {reference!r}: {path} defines no {name!r}; it has {', '.join(public) or 'nothing'}.")
@@ -87,8 +91,13 @@ def replace_files(contents: Any, change: Callable[[str], str]) -> Any:
     return contents if match is None else f"{change(match[1])}:{match[2]}"
 
 
-def call(function: Any, what: str, **arguments: Any) -> Any:
-    """Call a user's factory; raise InputError with the place if it fails."""
+def call(function: Callable[..., Any], what: str, **arguments: Any) -> Any:
+    """Call a user's factory; raise InputError if it does not take the arguments, or with the place if it fails."""
+    try:
+        inspect.signature(function).bind(**arguments)
+    except TypeError as error:
+        takes = ", ".join(inspect.signature(function).parameters) or "no arguments"
+        raise InputError(f"{what}: {error}; it takes {takes}.") from error
     with _explain_failure(what):
         return function(**arguments)
 
@@ -165,21 +174,15 @@ def find_user_place(error: BaseException | None) -> str | None:
 #: Files that were run: absolute path -> path as the user wrote it.
 _files: dict[str | None, Path] = {}
 
-#: Modules of the files that ran without error, with the time of their last change (ns).
-_modules: dict[str, tuple[int, Any]] = {}
 
-
-def _run(path: Path) -> Any:
-    """Return the module of a file; a file that several keys name runs once unless it changes."""
-    key = str(path.resolve())
-    stamp = path.stat().st_mtime_ns
-    if key in _modules and _modules[key][0] == stamp:
-        return _modules[key][1]
+@functools.cache
+def _run(key: str, changed: int) -> Any:
+    """Return the module of a file; one that several keys name runs once, until the time of its last change differs."""
+    path = _files[key]
     specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", key)
     if specification is None or specification.loader is None:
         raise InputError(f"{path} cannot be loaded as a Python file.")
     module = importlib.util.module_from_spec(specification)
-    _files[key] = path
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:
@@ -187,5 +190,4 @@ def _run(path: Path) -> Any:
             specification.loader.exec_module(module)
     finally:
         sys.path.remove(str(path.parent))
-    _modules[key] = (stamp, module)
     return module

@@ -7,7 +7,6 @@ and `build_xarray` make the same list into either. The libraries are imported wh
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import singledispatch
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from switchfit.runtime.errors import MissingExtraError
+from switchfit.runtime.errors import import_library
 from switchfit.runtime.presentation import call_registered
 
 if TYPE_CHECKING:
@@ -155,7 +154,7 @@ def build_pandas(frame: Frame) -> pandas.DataFrame:
     MissingExtraError
         If pandas is not installed.
     """
-    pandas = _import_library("pandas", "a DataFrame")
+    pandas = import_library("pandas", "a DataFrame", "pandas")
     units = {variable.name: variable.unit for variable in frame.index if variable.unit}
     index = {variable.name: np.asarray(variable.values) for variable in frame.index}
     columns: dict[str, Any] = {}
@@ -205,7 +204,7 @@ def build_xarray(frame: Frame) -> xarray.Dataset:
     MissingExtraError
         If xarray is not installed.
     """
-    xarray = _import_library("xarray", "a Dataset")
+    xarray = import_library("xarray", "a Dataset", "xarray")
     coordinates = {
         variable.name: (frame.rows, np.asarray(variable.values), _make_attributes(variable.unit))
         for variable in frame.index
@@ -241,18 +240,11 @@ def build_arviz(draws: Iterable[Variable], attributes: Mapping[str, str]) -> Any
     MissingExtraError
         If ArviZ or xarray is not installed.
     """
-    xarray, arviz = _import_library("xarray", "draws for ArviZ"), _import_library("arviz", "draws for ArviZ")
+    xarray, arviz = (
+        import_library("xarray", "draws for ArviZ", "xarray"),
+        import_library("arviz", "draws for ArviZ", "arviz"),
+    )
     posterior = {each.name: (each.dimensions, each.values, _make_attributes(each.unit)) for each in draws}
     chains, size = next((np.shape(values) for _, values, _ in posterior.values()), (0, 0))
     places = {"chain": np.arange(chains), "draw": np.arange(size)}
     return arviz.InferenceData(posterior=xarray.Dataset(posterior, places, dict(attributes)))
-
-
-def _import_library(name: str, what: str) -> Any:
-    """Return a library; MissingExtraError with the command that installs it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{what} needs {name}, which cannot be imported ({error}): pip install {name}"
-        ) from error

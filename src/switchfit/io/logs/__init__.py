@@ -1,19 +1,16 @@
 """Logs: files of robots and test rigs, read into times and channels with units; each format has a module of its own.
 
 Which logs a pattern or a folder stands for, and what to call them.
-
-Libraries that read or write a format, which are installed with an extra of switchfit.
 """
 
 from __future__ import annotations
 
 import contextlib
 import glob
-import importlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NoReturn
 
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -83,33 +80,20 @@ def name_files(paths: Sequence[str | Path]) -> list[str]:
     return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
 
 
-def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any:
-    """Import a library.
+def refuse_without_times(source: str, names: Iterable[str]) -> NoReturn:
+    """Raise InputError for a table in which no column is found that has the times.
 
     Parameters
     ----------
-    name : str
-        Such as ``"pyarrow.parquet"``.
-    extra : str
-        The extra of switchfit that it comes with.
-    what : str
-        What it is needed for, with the name of the file, as the begin of a sentence.
-    otherwise : str, optional
-        What else to do, as the end of a sentence.
-
-    Raises
-    ------
-    InputError
-        If it is not installed, with the command that installs it.
+    source : str
+    names : iterable of str
     """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        library = name.partition(".")[0]
-        raise InputError(
-            f"{what} needs {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'"
-            f"{', ' if otherwise else ''}{otherwise}."
-        ) from error
+    from switchfit.problem.validation import join_names  # here, since it imports NumPy
+
+    raise InputError(
+        f"{source}: no column is called time; its columns are {join_names(names)}. Name the one with the times: "
+        "time = ..."
+    )
 
 
 @contextlib.contextmanager

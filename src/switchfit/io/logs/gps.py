@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from switchfit.io.logs import import_library
-from switchfit.io.logs.log import Event, FloatArray, Log, Options
-from switchfit.io.logs.tables import build_log
+from switchfit.io.logs.log import Event, Log, Options, build_log
 from switchfit.io.logs.text import decode
-from switchfit.runtime.errors import InputError, Issue
+from switchfit.runtime.errors import InputError, Issue, import_library
 
 UNITS = {
     "latitude": "deg", "longitude": "deg", "altitude": "m", "speed": "m/s", "course": "deg", "hdop": "", "quality": "",
@@ -37,7 +36,7 @@ def read_gpx(path: Path, options: Options) -> Log:
         If the file cannot be read, or has no points with a time.
     """
     text = decode(path)
-    gpxpy = import_library("gpxpy", "gps", f"{path}: GPX")
+    gpxpy = import_library("gpxpy", f"{path}: GPX", "'switchfit[gps]'")
     try:
         gpx = gpxpy.parse(text)
     except Exception as error:  # of the parser of XML, of numbers, of dates
@@ -46,13 +45,10 @@ def read_gpx(path: Path, options: Options) -> Log:
     if not any(point.time for point in points):
         raise InputError(f"{path} has no track with times: of {len(points)} points, none has a time.")
     times = np.array([None if p.time is None else _count_micros(p.time) for p in points], dtype="datetime64[us]")
-    fields = {
-        "latitude": "latitude", "longitude": "longitude", "altitude": "elevation", "speed": "speed", "course": "course",
-        "hdop": "horizontal_dilution",
-    }  # fmt: skip
-    columns = {name: _make_column([getattr(point, field) for point in points]) for name, field in fields.items()}
+    fields = {"altitude": "elevation", "hdop": "horizontal_dilution"}
+    records = [{name: getattr(point, fields.get(name, name), None) for name in UNITS} for point in points]
+    log = _build_log(path, times, records, options, place="point")
     named = [point for point in gpx.waypoints if point.time and point.name]
-    log = _build_log(path, times, columns, options, place="point")
     events = [Event(_count_micros(point.time) * 1e-6 - log.offset, "waypoint", point.name) for point in named]
     return replace(log, events=tuple(events))
 
@@ -68,7 +64,7 @@ def read_nmea(path: Path, options: Options) -> Log:
     InputError
         If there is no fix.
     """
-    pynmea2 = import_library("pynmea2", "gps", f"{path}: NMEA 0183")
+    pynmea2 = import_library("pynmea2", f"{path}: NMEA 0183", "'switchfit[gps]'")
     fixes: list[dict[str, Any]] = []
     damaged: list[int] = []
     day: date | None = None
@@ -86,14 +82,13 @@ def read_nmea(path: Path, options: Options) -> Log:
             f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
         )
     micros = _count_fixes(fixes)
-    times = np.array(micros, dtype="datetime64[us]") if day else np.array(micros) * 1e-6
-    columns = {name: _make_column([fix.get(name) for fix in fixes]) for name in UNITS}
+    times = micros.astype("datetime64[us]") if day else micros * 1e-6
     rows = np.array([fix["line"] for fix in fixes], dtype=np.intp)
     issues: tuple[Issue, ...] = ()
     if damaged:
         figures = {"line": float(damaged[0]), "count": float(len(damaged))}
         issues = (Issue("log: damaged sentences", (str(path), "line"), figures),)
-    return _build_log(path, times, columns, options, rows=rows, place="line", issues=issues)
+    return _build_log(path, times, fixes, options, rows=rows, place="line", issues=issues)
 
 
 def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tuple[int, Any]]:
@@ -147,14 +142,12 @@ def _read_float(given: Any) -> float | None:
         return None
 
 
-def _count_fixes(fixes: list[dict[str, Any]]) -> list[int]:
+def _count_fixes(fixes: list[dict[str, Any]]) -> NDArray[np.int64]:
     """Return microseconds of all fixes, since 1970 if a sentence states the date; days go on after midnight."""
-    first = next((k for k, fix in enumerate(fixes) if fix["day"]), None)
-    days = 0 if first is None else (fixes[first]["day"] - EPOCH).days
-    clocks = [_count_micros(datetime.combine(EPOCH, fix["clock"].replace(tzinfo=UTC))) for fix in fixes]
-    midnights = np.cumsum(np.append(0, np.diff(clocks) < -DAY // 2)).astype(int)
-    passed = 0 if first is None else int(midnights[first])
-    return [(days + int(night) - passed) * DAY + clock for night, clock in zip(midnights, clocks, strict=True)]
+    clocks = np.array([_count_micros(datetime.combine(EPOCH, fix["clock"].replace(tzinfo=UTC))) for fix in fixes])
+    midnights = np.cumsum(np.append(0, np.diff(clocks) < -DAY // 2))
+    dated = ((fix["day"] - EPOCH).days - night for fix, night in zip(fixes, midnights, strict=True) if fix["day"])
+    return (midnights + next(dated, 0)) * DAY + clocks
 
 
 def _count_micros(moment: datetime) -> int:
@@ -162,12 +155,9 @@ def _count_micros(moment: datetime) -> int:
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
 
 
-def _make_column(entries: list[Any]) -> FloatArray:
-    return np.array([np.nan if entry is None else float(entry) for entry in entries])
-
-
-def _build_log(path: Path, times: Any, columns: dict[str, FloatArray], options: Options, **more: Any) -> Log:
+def _build_log(path: Path, times: Any, records: list[dict[str, Any]], options: Options, **more: Any) -> Log:
     """Return a log of the channels that have a value; its times are stamps of a receiver."""
+    columns = {name: np.array([record.get(name) for record in records], dtype=np.float64) for name in UNITS}
     kept = {name: column for name, column in columns.items() if np.isfinite(column).any()}
     log = build_log(str(path), {"time": times, **kept}, UNITS | {"time": "s"}, options, zones={"time": "UTC"})
     return replace(log, has_positions=True, has_dates=False, **more)

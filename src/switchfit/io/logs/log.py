@@ -1,12 +1,9 @@
-"""`Log`: times, named channels with units, and what is odd about them.
-
-Units as they stand in the headers of logs: which texts are units, and how long units of time are.
-"""
+"""`Log`: times, named channels with units, and what is odd about them; made from columns of which one has the times."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, overload
@@ -14,8 +11,8 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.dates import SECONDS as SECONDS
-from switchfit.problem.dates import TIME_UNITS, Dates
+from switchfit.io.logs import refuse_without_times
+from switchfit.problem.dates import SECONDS, TIME_UNITS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
 from switchfit.runtime.frames import Frame, Variable, build_pandas
@@ -71,18 +68,6 @@ def split_unit(name: str) -> tuple[str, str]:
 def normalize_time_unit(text: str) -> str:
     """Return the key of `SECONDS` that a text stands for, or the text itself if it is no unit of time."""
     return TIME_UNITS.get(strip_brackets(text).lower(), text)
-
-
-def find_spelled_unit(name: str) -> str:
-    """Return the unit of time that is a word in a name, such as in ``seconds_elapsed`` or ``millis``; "" if none is."""
-    words = re.split(r"[ _.\-/]", name.lower())
-    return next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
-
-
-def find_epoch_unit(time: float) -> str | None:
-    """Return the unit in which a number is a time since 1970, None if it is too small for one."""
-    low, high = EPOCH_SECONDS
-    return next((unit for unit in ("s", "ms", "us", "ns") if low <= time * SECONDS[unit] < high), None)
 
 
 FloatArray = NDArray[np.float64]
@@ -156,7 +141,7 @@ class Log:
     labels : mapping of str to str
         Other names in the header, and the channel that each of them means.
     rows : (K,) array of int
-        Number of each sample's line in the file; left out, they are counted from 1.
+        Number of each sample's line in the file.
     place : str
         What `rows` counts: "line", "row", "message" or "point".
     time_name : str
@@ -202,10 +187,6 @@ class Log:
     time_zone: str = "UTC"
     has_dates: bool = False
 
-    def __post_init__(self) -> None:
-        if len(self.rows) != len(self.times):
-            object.__setattr__(self, "rows", np.arange(1, len(self.times) + 1))
-
     @property
     def dates(self) -> Dates | None:
         """The times as dates, for `Measurements`, `Input` and `Experiment`; None where the file has no dates.
@@ -226,10 +207,8 @@ class Log:
         """Names of the channels, in the order of the file."""
         return tuple(self.values)
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """The same as `channels`, by the name that tables of other libraries have for it."""
-        return self.channels
+    columns = channels
+    """By the name that tables of other libraries have for it."""
 
     @property
     def attrs(self) -> dict[str, Any]:
@@ -261,7 +240,13 @@ class Log:
         if isinstance(name, str):
             return self.values[self.find_channel(name)]
         if isinstance(name, Sequence):
-            return self._select([self.find_channel(entry) for entry in name])
+            names = [self.find_channel(entry) for entry in name]
+            return replace(
+                self,
+                values={own: self.values[own] for own in names},
+                units={own: self.units.get(own, "") for own in names},
+                labels={label: own for label, own in self.labels.items() if own in names},
+            )
         raise TypeError(f'A log is indexed by a name or a list of names, as in log["x"]; got {shorten(name)}.')
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -295,15 +280,6 @@ class Log:
         if name in self.labels:
             return self.labels[name]
         raise InputError(f"{self.source} has no column {shorten(name)}; its columns are {join_names(self.values)}.")
-
-    def _select(self, names: Sequence[str]) -> Log:
-        kept = {label: name for label, name in self.labels.items() if name in names}
-        return replace(
-            self,
-            values={name: self.values[name] for name in names},
-            units={name: self.units.get(name, "") for name in names},
-            labels=kept,
-        )
 
     def to_pandas(self) -> Any:
         """Return a pandas DataFrame with the times as its index, and the units in ``attrs["units"]``.
@@ -340,3 +316,141 @@ class Log:
         if self.events:
             lines.append(f"  events: {len(self.events)}")
         return "\n".join([*lines, *(f"  {issue}" for issue in self.issues)])
+
+
+# --- from columns to a log --------------------------------------------------------------------------------------------
+
+_NAMES = (
+    re.compile(
+        r"_*(t|times?|timestamps?|stamp|zeit|utc|clock|date_?time|secs?|seconds|millis|micros|elapsed.*|.*[ _]elapsed)"
+    ),
+    re.compile(
+        r"_*(t_(rel|abs|[num]?s|sec|min|h)|(time|timestamp|stamp|zeit)[ _.\-/].*|.*[ _./](time|timestamp|stamp))"
+    ),
+    re.compile(r"date|datum|days?|hours?|hrs|minutes|mins"),
+)
+"""Names of columns of times: those of the first kind before those of the second."""
+
+TEMPERATURE = "T"
+"""Rather the name of a temperature; of times only if no other column has such a name, as with MATLAB's ``[T, Y]``."""
+
+
+def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str | None:
+    """Return the name that is most clearly one of times; None if there is none.
+
+    Parameters
+    ----------
+    names : iterable of str
+    channels : collection of str
+        Names that are known to be those of measured values.
+    """
+    given = list(names)
+    for kind in _NAMES:
+        for name in given:
+            if kind.fullmatch(name.strip().lower()) and name.strip() != TEMPERATURE:
+                return name
+    return next((name for name in given if name.strip() == TEMPERATURE and name not in channels), None)
+
+
+def _find_spelled_unit(name: str) -> str:
+    """Return the unit of time that is a word in a name, such as in ``seconds_elapsed`` or ``millis``; "" if none is."""
+    words = re.split(r"[ _.\-/]", name.lower())
+    return next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
+
+
+def _find_epoch_unit(time: float) -> str | None:
+    """Return the unit in which a number is a time since 1970, None if it is too small for one."""
+    low, high = EPOCH_SECONDS
+    return next((unit for unit in ("s", "ms", "us", "ns") if low <= time * SECONDS[unit] < high), None)
+
+
+def _are_uptimes(times: FloatArray) -> bool:
+    """Return whether times that could be seconds since 1970 are rather microseconds since a start: whole, far apart."""
+    steps = np.diff(times)
+    if len(steps) == 0 or _find_epoch_unit(float(times[0])) != "s":
+        return False
+    step = float(np.median(steps))
+    return bool(np.all(times == np.rint(times)) and step >= 1000 and step % 60 != 0)
+
+
+def build_log(
+    source: str,
+    columns: Mapping[str, Any],
+    units: Mapping[str, str],
+    options: Options,
+    zones: Mapping[str, str] | None = None,
+) -> Log:
+    """Return a log from columns, one of which has the times.
+
+    Parameters
+    ----------
+    source : str
+    columns : mapping of str to (K,) array
+        Of numbers, or of ``datetime64`` where they are dates.
+    units : mapping of str to str
+        Those that are stated; others may stand in the names.
+    options : Options
+    zones : mapping of str to str, optional
+        Time zones of columns of dates, which are in UTC then.
+
+    Raises
+    ------
+    InputError
+        If there is no such column.
+    """
+    time = find_time_name(list(columns)) if options.time is None else options.time
+    if time is None:
+        refuse_without_times(source, columns)
+    if time not in columns:
+        raise InputError(f"{source} has no column {shorten(time)}; its columns are {join_names(columns)}.")
+    stated = {name: units.get(name, "") or split_unit(name)[1] for name in columns}
+    if columns[time].dtype.kind not in "biufMm":
+        raise InputError(
+            f"{source}: column {time!r} has neither numbers nor dates. Name the one with the times: time = ..."
+        )
+    times, time_unit, offset = _convert_times(columns[time], time, stated[time], options.keep_epoch)
+    values = {
+        name: np.asarray(column, dtype=np.float64)
+        for name, column in columns.items()
+        if name != time and column.dtype.kind in "biuf"
+    }
+    labels = {name: split_unit(name)[0] for name in values}
+    return Log(
+        times=times,
+        values=values,
+        units={name: stated[name] for name in values},
+        time_unit=time_unit,
+        source=source,
+        offset=offset,
+        labels={short: name for name, short in labels.items() if short not in values},
+        rows=np.arange(1, len(times) + 1),
+        time_name=time,
+        time_zone=(zones or {}).get(time, "") if columns[time].dtype.kind == "M" else "UTC",
+        has_dates=columns[time].dtype.kind == "M",
+    )
+
+
+def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
+    """Return times, their unit, and what was subtracted from them: the first one, if they count from 1970.
+
+    Integers are subtracted as such; doubles would round them. With `keep_epoch` numbers are left as they are.
+    """
+    second = np.timedelta64(1, "s")
+    if column.dtype.kind == "M":
+        first = column[~np.isnat(column)][0]
+        micros = first.astype("datetime64[us]").astype(np.int64)
+        return (column - first) / second, "s", float(micros) / 1e6
+    if column.dtype.kind == "m":
+        return column / second, "s", 0.0
+    numbers = np.asarray(column, dtype=np.float64)
+    unit = normalize_time_unit(unit)
+    unit = unit if unit in SECONDS else _find_spelled_unit(name)
+    finite = numbers[np.isfinite(numbers)]
+    epoch = _find_epoch_unit(float(finite[0])) if len(finite) else None
+    if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):
+        return numbers, unit, 0.0
+    if keep_epoch:
+        return numbers, epoch, 0.0
+    if column.dtype.kind in "iu":
+        return (column.astype(np.int64) - int(column[0])).astype(np.float64), epoch, float(column[0])
+    return numbers - finite[0], epoch, float(finite[0])

@@ -1,6 +1,8 @@
 """`read_log`: the reader of a file's format, then the local frame, the checks and the repairs.
 
-What is odd about the times and channels of a log, and the repairs that a user may ask for.
+Positions on the globe become metres to the east, to the north and up from an origin by `pymap3d.geodetic2enu`: one
+function that does this and no more, in plain NumPy, exact on the ellipsoid of WGS 84. (pyproj would bring PROJ with its
+database of grids for the same numbers.)
 """
 
 from __future__ import annotations
@@ -11,17 +13,17 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.io.logs import BAGS
-from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
-from switchfit.io.logs.log import SECONDS, FloatArray, Log, Options
-from switchfit.problem.dates import LENGTHS
-from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, join_names, shorten
-from switchfit.runtime.errors import InputError, Issue
+from switchfit.io.logs.log import FloatArray, Log, Options
+from switchfit.problem import validation
+from switchfit.problem.dates import LENGTHS, SECONDS
+from switchfit.problem.validation import join_names, shorten
+from switchfit.runtime.errors import InputError, Issue, import_library
 from switchfit.runtime.files import explain_read_errors
 
 REPAIRS = ("sort", "drop-duplicates", "drop-missing-times", "drop-broken-lines")
@@ -36,45 +38,10 @@ NEAR = 5.0
 _ANGLE = re.compile(r".*(yaw|heading|course|azimuth|theta|psi|angle|hdg|cog|bearing).*|ang", re.IGNORECASE)
 
 
-def check_repairs(repair: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the names of repairs, checked.
-
-    Parameters
-    ----------
-    repair : str or sequence of str
-
-    Raises
-    ------
-    InputError
-        If one is not known.
-    """
-    names = as_names((repair,) if isinstance(repair, str) else repair, "repair", "a sequence of strings")
-    for name in names:
-        if name not in REPAIRS and not (name.startswith("unwrap:") and len(name) > len("unwrap:")):
-            raise InputError(f"repair must be among {', '.join(REPAIRS)} and unwrap:CHANNEL; got {shorten(name)}.")
-    return names
-
-
-def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
-    """Return the log with its issues, and repaired where asked for.
-
-    Parameters
-    ----------
-    log : Log
-    repairs : sequence of str
-        As `check_repairs` returns them.
-
-    Raises
-    ------
-    InputError
-        If a time is missing, or a channel that is to be unwrapped is.
-    """
+def _inspect_log(log: Log, repairs: Sequence[str]) -> Log:
+    """Return the log with its issues, and repaired where asked for."""
     issues = list(log.issues)
-    for name, find in (
-        ("drop-missing-times", _find_missing),
-        ("sort", _find_falls),
-        ("drop-duplicates", _find_repeats),
-    ):
+    for name, find in _FLAWS.items():
         kind, flawed, kept, figures = find(log)
         if not flawed.any():
             continue
@@ -94,16 +61,12 @@ def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
     return replace(log, issues=tuple(issues))
 
 
-Flaw = tuple[str, NDArray[np.bool_], NDArray[Any], dict[str, float]]
-"""What is odd about times: the kind of issue, in which samples, the samples that a repair keeps, and more figures."""
-
-
-def _find_missing(log: Log) -> Flaw:
+def _find_missing(log: Log) -> tuple[str, NDArray[np.bool_], NDArray[Any], dict[str, float]]:
     missing = ~np.isfinite(log.times)
     return "log: missing times", missing, ~missing, {}
 
 
-def _find_falls(log: Log) -> Flaw:
+def _find_falls(log: Log) -> tuple[str, NDArray[np.bool_], NDArray[Any], dict[str, float]]:
     steps = np.append(0.0, np.diff(log.times))[: len(log)]
     falls = steps < 0
     far = -steps[falls].min(initial=0.0) > NEAR * _find_typical_step(log.times)  # not so beside NaN
@@ -111,9 +74,13 @@ def _find_falls(log: Log) -> Flaw:
     return kind, falls, np.argsort(log.times, kind="stable"), {"step": -steps[falls][:1].sum()}
 
 
-def _find_repeats(log: Log) -> Flaw:
+def _find_repeats(log: Log) -> tuple[str, NDArray[np.bool_], NDArray[Any], dict[str, float]]:
     same = np.append(False, np.diff(log.times) == 0)[: len(log)]
     return "log: repeated time", same, ~same, {}
+
+
+_FLAWS = {"drop-missing-times": _find_missing, "sort": _find_falls, "drop-duplicates": _find_repeats}
+"""What may be odd about times, by its repair: kind of issue, in which samples, what a repair keeps, more figures."""
 
 
 def _find_gaps(log: Log) -> list[Issue]:
@@ -258,7 +225,7 @@ def read_log(
     ('Weg',)
     >>> Path("drive.csv").unlink()
     """
-    path = as_path(path, "path")
+    path = validation.as_path(path, "path")
     if len(path.name) > LONGEST_NAME:
         raise InputError(f"path must name a file, with at most {LONGEST_NAME} characters; got {shorten(str(path))}.")
     return read_source(path, Options(columns, time, time_unit, topic, origin, range_error, repair))
@@ -272,39 +239,38 @@ def read_source(path: Path, given: Options) -> Log:
     path : Path
     given : Options
     """
-    options, origin = _check_options(given), check_origin(given.origin)
+    options = _check_options(given)
     log = _read_format(path, options)
     wanted = any(name in FRAME and name not in log for name in options.columns or ())
-    if wanted or origin is not None or options.range_error is not None or log.has_positions:
-        log = add_local_frame(log, origin, options.range_error)
+    if wanted or options.origin is not None or options.range_error is not None or log.has_positions:
+        log = _add_local_frame(log, options.origin, options.range_error)
     log = log if options.columns is None else log[list(options.columns)]
-    log = inspect_log(log, options.repair)
-    return log if options.time_unit is None else convert_times(log, options.time_unit)
+    log = _inspect_log(log, options.repair)
+    return log if options.time_unit is None else _convert_times(log, options.time_unit)
 
 
 def _check_options(given: Options) -> Options:
     """Return arguments with names as tuples; raise InputError if one is wrong."""
-    columns, error = given.columns, given.range_error
+    columns, repair, error = given.columns, given.repair, given.range_error
     if columns is not None:
-        columns = as_names((columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings")
+        columns = validation.as_names(
+            (columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings"
+        )
     for what in ("time", "topic"):
         if getattr(given, what) is not None:
-            as_name(getattr(given, what), what)
+            validation.as_name(getattr(given, what), what)
     if given.time_unit is not None:
-        as_choice(given.time_unit, "time_unit", tuple(SECONDS))
-    error = None if error is None else as_positive(error, "range_error")
-    return given._replace(columns=columns, range_error=error, repair=check_repairs(given.repair))
+        validation.as_choice(given.time_unit, "time_unit", tuple(SECONDS))
+    error = None if error is None else validation.as_positive(error, "range_error")
+    repair = validation.as_names((repair,) if isinstance(repair, str) else repair, "repair", "a sequence of strings")
+    for name in repair:
+        if name not in REPAIRS and not (name.startswith("unwrap:") and len(name) > len("unwrap:")):
+            raise InputError(f"repair must be among {', '.join(REPAIRS)} and unwrap:CHANNEL; got {shorten(name)}.")
+    return given._replace(columns=columns, origin=_check_origin(given.origin), range_error=error, repair=repair)
 
 
-def convert_times(log: Log, unit: str) -> Log:
-    """Return the log with its times in another unit; times without a unit are taken to be in it.
-
-    Parameters
-    ----------
-    log : Log
-    unit : str
-        A key of `SECONDS`.
-    """
+def _convert_times(log: Log, unit: str) -> Log:
+    """Return the log with its times in another unit; times without a unit are taken to be in it."""
     if log.time_unit in ("", unit):
         return replace(log, time_unit=unit)
     # A quotient of integers: 40 ms are 0.04 s.
@@ -334,53 +300,35 @@ def _map_times(log: Log, change: Callable[[Any], Any], **more: Any) -> Log:
     return replace(log, times=change(log.times), events=events, **more)
 
 
-class _Format(NamedTuple):
-    """A format of logs: its reader in a module of this folder, its name, and the options that it does not have."""
-
-    module: str
-    reader: str
-    what: str
-    lacks: tuple[str, ...] = ()
-
-
-_TEXT = _Format("text", "read_text", "a table of text", ("topic",))
-_NMEA = _Format("gps", "read_nmea", "an NMEA 0183 log", ("time", "topic"))
-_BAG = _Format("ros", "read_bag", "a ROS bag", ("time",))
-_PARQUET = _Format("tables", "read_parquet", "a Parquet file", ("topic",))
-_FORMATS = {
-    ".gpx": _Format("gps", "read_gpx", "a GPX track", ("time", "topic")),
-    ".mat": _Format("matlab", "read_mat", "a .mat file"),
+_TEXT = ("text", "read_text", "a table of text", ("topic",))
+_NMEA = ("gps", "read_nmea", "an NMEA 0183 log", ("time", "topic"))
+_BAG = ("ros", "read_bag", "a ROS bag", ("time",))
+_PARQUET = ("arrays", "read_parquet", "a Parquet file", ("topic",))
+_FORMATS: dict[str, tuple[str, str, str, tuple[str, ...]]] = {
+    ".gpx": ("gps", "read_gpx", "a GPX track", ("time", "topic")),
+    ".mat": ("arrays", "read_mat", "a .mat file", ()),
     ".nmea": _NMEA,
     ".nma": _NMEA,
     ".parquet": _PARQUET,
     ".pq": _PARQUET,
     **dict.fromkeys(BAGS, _BAG),
 }
-"""By the end of the name."""
+"""By the end of the name: module and reader, what it is, and the options that mean nothing for it."""
 
 _SENTENCE = re.compile(rb"\s*\$[A-Z]{5},")
 
 
 def _read_format(path: Path, options: Options) -> Log:
-    """Read a file of any format."""
-    form = _choose_format(path)
-    for name in form.lacks:
+    """Read a file of any format, which the end of its name tells, or how it begins."""
+    ending = Path(path.name.lower().removesuffix(".gz")).suffix
+    form = _BAG if os.path.isfile(path / "metadata.yaml") else _FORMATS.get(ending)
+    module, reader, what, lacks = form or (_NMEA if _is_nmea(path) else _TEXT)
+    for name in lacks:
         value = getattr(options, name)
         if value is not None:
-            raise InputError(
-                f"{path} is {form.what}, for which {name} means nothing; leave out {name} = {shorten(value)}."
-            )
-    module = importlib.import_module(f"switchfit.io.logs.{form.module}")
-    log: Log = getattr(module, form.reader)(path, options)
+            raise InputError(f"{path} is {what}, for which {name} means nothing; leave out {name} = {shorten(value)}.")
+    log: Log = getattr(importlib.import_module(f"switchfit.io.logs.{module}"), reader)(path, options)
     return log
-
-
-def _choose_format(path: Path) -> _Format:
-    """Return the format of a file, by the end of its name or by how it begins."""
-    if os.path.isfile(path / "metadata.yaml"):
-        return _BAG
-    ending = Path(path.name.lower().removesuffix(".gz")).suffix
-    return _FORMATS.get(ending) or (_NMEA if _is_nmea(path) else _TEXT)
 
 
 def _is_nmea(path: Path) -> bool:
@@ -389,3 +337,87 @@ def _is_nmea(path: Path) -> bool:
         return False
     with explain_read_errors(path), path.open("rb") as file:
         return bool(_SENTENCE.match(file.read(400)))
+
+
+# --- positions --------------------------------------------------------------------------------------------------------
+
+LOCAL = ("east", "north", "up")
+"""Names of the channels of the local frame, in metres."""
+SIGMA = ("sigma_east", "sigma_north", "sigma_up")
+"""Names of the channels of their standard deviations, in metres."""
+FRAME = (*LOCAL, *SIGMA[:2])
+"""Channels that can be computed from a position and HDOP."""
+
+_POSITION = (
+    re.compile(r"(.*[ ._])?lat(itude)?([ _.]?deg)?", re.IGNORECASE),
+    re.compile(r"(.*[ ._])?(lon|lng|long|longitude)([ _.]?deg)?", re.IGNORECASE),
+    re.compile(r"(.*[ ._])?(alt|altitude|ele|elevation|height)([ _.]?m)?", re.IGNORECASE),
+)
+
+
+def find_position(names: Sequence[str]) -> list[str] | None:
+    """Return the names of latitude and longitude, and of the altitude if there is one; None if one is missing."""
+    found = [next((name for name in names if pattern.fullmatch(name)), None) for pattern in _POSITION]
+    return [name for name in found if name is not None] if found[0] and found[1] else None
+
+
+def _check_origin(origin: Sequence[float] | None) -> tuple[float, float, float] | None:
+    """Return an origin as (latitude, longitude, altitude), the altitude 0 if it is left out."""
+    if origin is None:
+        return None
+    form = "[latitude, longitude] or [latitude, longitude, altitude]"
+    numbers = validation.as_array(origin, "origin", form=form).ravel().tolist()
+    if len(numbers) not in (2, 3) or not np.all(np.isfinite(numbers)) or abs(numbers[0]) > 90 or abs(numbers[1]) > 360:
+        raise InputError(
+            f"origin must be [latitude, longitude] in degrees, or with the altitude in metres; got {shorten(origin)}."
+        )
+    latitude, longitude, altitude = (*numbers, 0.0)[:3]
+    return latitude, longitude, altitude
+
+
+def _add_local_frame(log: Log, origin: tuple[float, float, float] | None, range_error: float | None) -> Log:
+    """Return the log with the channels east, north and up, and their standard deviations where they are known.
+
+    Without an origin, it is the first position.
+    """
+    names = find_position(log.channels)
+    if names is None:
+        raise InputError(f"{log.source} has no latitude and longitude; its columns are {', '.join(log.channels)}.")
+    latitude, longitude = log[names[0]], log[names[1]]
+    altitude = log[names[2]] if len(names) == 3 else np.zeros(len(log))
+    known = np.isfinite(latitude) & np.isfinite(longitude)
+    if not known.any():
+        raise InputError(f"{log.source} has no position: all of {names[0]} and {names[1]} are missing.")
+    if np.abs(latitude[known]).max() > 90 or np.abs(longitude[known]).max() > 360:
+        raise InputError(f"{log.source}: {names[0]} and {names[1]} must be in degrees; some are beyond 90 or 360.")
+    first = int(known.argmax())
+    if origin is None:
+        height = altitude[first] if np.isfinite(altitude[first]) else 0.0
+        origin = (float(latitude[first]), float(longitude[first]), float(height))
+    local = np.full((3, len(log)), np.nan)
+    heights = np.where(np.isfinite(altitude[known]), altitude[known], origin[2])
+    pymap3d = import_library("pymap3d", f"{log.source}: a position", "'switchfit[gps]'")
+    local[:, known] = pymap3d.geodetic2enu(latitude[known], longitude[known], heights, *origin)
+    local[2, ~np.isfinite(altitude)] = np.nan
+    added = LOCAL[: len(names)]
+    values = {**log.values, **dict(zip(added, local, strict=False))}
+    log = replace(log, values=values, units={**log.units, **dict.fromkeys(added, "m")}, origin=origin)
+    return log if range_error is None else _add_sigma(log, range_error)
+
+
+def _add_sigma(log: Log, range_error: float) -> Log:
+    """Return the log with sigma_east and sigma_north from HDOP where they are not known otherwise.
+
+    HDOP**2 is the sum of the two variances in units of the squared range error.
+    """
+    hdop = next((log[name] for name in log.channels if name.lower() == "hdop"), None)
+    if hdop is None:
+        raise InputError(
+            f"{log.source} has no channel hdop, of which range_error makes a sigma; leave out range_error."
+        )
+    values, units = dict(log.values), dict(log.units)
+    for name in SIGMA[:2]:
+        known: FloatArray = values.get(name, np.full(len(log), np.nan))
+        values[name] = np.where(np.isfinite(known), known, hdop * range_error / np.sqrt(2))
+        units[name] = "m"
+    return replace(log, values=values, units=units)

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs import explain_damage, import_library
-from switchfit.io.logs.geodesy import LOCAL, SIGMA
-from switchfit.io.logs.log import Event, Log, Options
-from switchfit.io.logs.tables import build_log
+from switchfit.io.logs import explain_damage
+from switchfit.io.logs.log import Event, Log, Options, build_log
+from switchfit.io.logs.reader import LOCAL, SIGMA
 from switchfit.problem.validation import shorten
-from switchfit.runtime.errors import InputError, Issue
+from switchfit.runtime.errors import InputError, Issue, import_library
 
 SECOND = 10**9
 """Nanoseconds."""
 FAR = 86_400 * SECOND
-"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are of another clock."""
+"""By how much stamps of headers may differ from the clock of the recorder; beyond, they are of another clock, as that
+of a simulation, and stay as they are."""
 LONGEST_ARRAY = 36
 """Entries of an array in a message that become channels; longer ones are pictures and scans."""
 
@@ -42,8 +42,8 @@ def read_bag(path: Path, options: Options) -> Log:
         If the bag cannot be read, or the topic is missing or has no numbers.
     """
     what = f"{path}: a ROS bag"
-    highlevel = import_library("rosbags.highlevel", "ros", what)
-    typesys = import_library("rosbags.typesys", "ros", what)
+    highlevel = import_library("rosbags.highlevel", what, "'switchfit[ros]'")
+    typesys = import_library("rosbags.typesys", what, "'switchfit[ros]'")
     with explain_damage(path, "a ROS bag"):
         store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
@@ -52,37 +52,33 @@ def read_bag(path: Path, options: Options) -> Log:
 
 def _read_topic(path: Path, reader: Any, options: Options) -> Log:
     connections = _choose_connections(path, reader.connections, options.topic)
-    kind = connections[0].msgtype
+    kind, topic = connections[0].msgtype, connections[0].topic
     read = _READERS.get(kind, _flatten)
     start = reader.start_time
-    records: list[Record] = []
-    events: list[Event] = []
-    stamps: list[int] = []
-    received: list[int] = []
-    for connection, time, data in reader.messages(connections=connections):
+
+    def unpack(connection: Any, time: int, data: bytes) -> tuple[int, int, Record, Event | None]:
         message = reader.deserialize(data, connection.msgtype)
-        received.append(time)
-        stamps.append(_read_stamp(message))
-        records.append(read(message))
-        if isinstance(getattr(message, "data", None), str):
-            events.append(Event((time - start) / SECOND, connection.topic, message.data))
-    if not records:
-        raise InputError(f"{path}: topic {connections[0].topic} has no messages; there is nothing to read.")
+        text = getattr(message, "data", None)
+        event = Event((time - start) / SECOND, topic, text) if isinstance(text, str) else None
+        return time, _read_stamp(message), read(message), event
+
+    found = [unpack(*given) for given in reader.messages(connections=connections)]
+    if not found:
+        raise InputError(f"{path}: topic {topic} has no messages; there is nothing to read.")
+    received, stamps, records, events = zip(*found, strict=True)
     has_stamps = any(stamps)
-    clock, offset = _choose_clock(stamps if has_stamps else received, start)
+    moments = np.array(stamps if has_stamps else received)
+    zero = start if abs(int(moments[0]) - start) < FAR else 0  # all topics of a bag count from its begin
     names = dict.fromkeys(name for record in records for name in record)
     values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
     units = {name: _UNITS.get(_strip(name), "") if kind in _READERS else "" for name in values}
-    issues = () if has_stamps else (Issue("log: no stamps", (str(path), connections[0].topic)),)
+    issues = () if has_stamps else (Issue("log: no stamps", (str(path), topic)),)
     name = "stamp" if has_stamps else "received"
-    log = build_log(
-        f"{path} ({connections[0].topic})",
-        {**values, name: clock},
-        units | {name: "s"},
-        options._replace(time=name, keep_epoch=True),
-    )
+    columns = {**values, name: (moments - zero) / SECOND}
+    log = build_log(f"{path} ({topic})", columns, units | {name: "s"}, options._replace(time=name, keep_epoch=True))
+    said = tuple(filter(None, events))
     return replace(
-        log, offset=offset, issues=issues, events=tuple(events), place="message", has_positions=read is _read_fix
+        log, offset=zero / SECOND, issues=issues, events=said, place="message", has_positions=read is _read_fix
     )
 
 
@@ -107,16 +103,6 @@ def _read_stamp(message: Any) -> int:
     return 0 if stamp is None else int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
-def _choose_clock(stamps: Sequence[int], start: int) -> tuple[Any, float]:
-    """Return seconds since the bag began, which all topics of a bag share, and when that was.
-
-    Stamps of another clock, as those of a simulation, are left as they are.
-    """
-    near = abs(stamps[0] - start) < FAR
-    zero = start if near else 0
-    return np.array([stamp - zero for stamp in stamps], dtype=np.int64) / SECOND, zero / SECOND
-
-
 def _strip(name: str) -> str:
     """Return the quantity that a channel is of: "x" for "sigma_x", "velocity" for "left.velocity"."""
     return name.rpartition(".")[2].removeprefix("sigma_")
@@ -126,9 +112,10 @@ def _strip(name: str) -> str:
 
 
 def _read_fix(message: Any) -> Record:
+    position = ("latitude", "longitude", "altitude")
     if message.status.status < 0:  # no fix
-        return {"latitude": np.nan, "longitude": np.nan, "altitude": np.nan}
-    found = {"latitude": message.latitude, "longitude": message.longitude, "altitude": message.altitude}
+        return dict.fromkeys(position, np.nan)
+    found = {name: getattr(message, name) for name in position}
     variances = np.asarray(message.position_covariance)[[0, 4, 8]]
     if message.position_covariance_type > 0 and np.all(variances > 0):
         found |= dict(zip(SIGMA, np.sqrt(variances).tolist(), strict=True))

@@ -29,8 +29,7 @@ from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
 
 if TYPE_CHECKING:
-    from switchfit.io.problem_file.building import ProblemFile
-    from switchfit.io.problem_file.experiments import Runs
+    from switchfit.io.problem_file.building import ProblemFile, Runs
     from switchfit.io.problem_file.logs import Opened
 
 
@@ -166,7 +165,7 @@ def load_problem(
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> import switchfit as sf
-    >>> from switchfit.io.first_problem import write_first_problem
+    >>> from switchfit.io.problem_file.writing import write_first_problem
     >>> from switchfit.io.problem_file import load_problem
 
     >>> with TemporaryDirectory() as folder:
@@ -203,19 +202,19 @@ def read_experiments(path: str | Path) -> Runs:
     """
     path = Path(path)
     contents, opened = _open(path, read_contents(path)[1], None)
-    from switchfit.io.problem_file.building import build_without_python
+    from switchfit.io.problem_file.building import build_experiments, build_parameters
 
-    return build_without_python(path, contents, opened)
+    build_parameters(path, contents)
+    return build_experiments(path, contents, opened, run=False)
 
 
 def _open(
     path: Path, contents: Contents, log: str | Path | None, *, streamed: bool = False
 ) -> tuple[Contents, list[Opened]]:
     """Return the tables of a file, with another log in them if one is given, and its open logs."""
-    if contents.problem is not None:
-        find_object(contents.problem, path.parent, f"{path}: problem")
-    elif contents.model is not None and ".py" in contents.model.name:
-        find_object(contents.model.name, path.parent, f"{path}: model")
+    for key, table in (("problem", contents.problem), ("model", contents.model)):
+        if table is not None and (key == "problem" or ".py" in table.name):
+            find_object(table.name, path.parent, f"{path}: {key}")
     if log is not None:
         contents = _replace_log(path, contents, os.path.abspath(log))
     expanded = [

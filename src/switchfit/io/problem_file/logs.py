@@ -12,31 +12,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs.log import SECONDS, Log, Options, normalize_time_unit
+from switchfit.io.logs.log import Log, Options, normalize_time_unit
 from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable, LogTable, is_date
 from switchfit.io.user_files import build_at
 from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Dates, as_date, make_origin
+from switchfit.problem.dates import SECONDS, Dates, as_date, make_origin
 from switchfit.runtime.errors import InputError
 
 
 def cut_log(
-    log: Log, table: LogTable, columns: Sequence[str], run: ExperimentTable, what: str
+    log: Log, table: DataTable | InputTable, contents: Contents, run: ExperimentTable, what: str
 ) -> tuple[FloatArray | Dates, FloatArray, tuple[str, ...]]:
-    """Return times (K,), which may be dates, and the values of some columns (K, q) in the rows inside the window, and
+    """Return times (K,), which may be dates, and the values of the columns (K, q) in the rows inside the window, and
     their units.
 
     Parameters
     ----------
     log : Log
-    table : LogTable
-    columns : sequence of str
+    table : DataTable or InputTable
+    contents : Contents
     run : ExperimentTable
     what : str
         What is made from them, for messages.
     """
-    times, inside = log.times, np.ones(len(log), dtype=bool)
+    columns, times, inside = _list_columns(table, contents, run), log.times, np.ones(len(log), dtype=bool)
     if not len(log):  # of a stream
         return times, np.zeros((0, len(columns))), ("",) * len(columns)
     if table.window is not None:
@@ -51,11 +51,11 @@ def cut_log(
             )
     times = times[inside]
     _check_order(log, times, log.rows[inside], what)
-    offset = times[0] if table.time_offset is None else table.time_offset
     values = np.stack([log[name][inside] for name in columns], axis=1)
     units = tuple(log.units[log.find_channel(name)] for name in columns)
     if log.dates is not None and _keep_dates(table, log, run):
         return log.dates[inside], values, units
+    offset = times[0] if table.time_offset == "first" else table.time_offset
     return (times - offset) * _find_time_scale(log, table, run.time_unit), values, units
 
 
@@ -107,8 +107,6 @@ def _keep_dates(item: LogTable, log: Log, run: ExperimentTable) -> bool:
     Those that are written as dates are, unless time_offset or time_scale makes numbers of them; the stamps of a
     recorder, and numbers since 1970, only if the file says that they are dates, or gives a date to compare them with.
     """
-    if not log.offset:
-        return False
     stated = item.epoch is not None or run.origin is not None or run.time_zone is not None or _has_dates(run)
     if item.time_offset == 0.0 and item.time_scale is None:
         return log.has_dates or stated
@@ -148,7 +146,17 @@ def open_experiments(
     """
     opened = []
     for k, tables in enumerate(expanded, start=1):
-        runs = [(table, _open_logs(path, f"experiments[{k}]", contents, table, streamed)) for table in tables]
+        runs: Opened = []
+        for table in tables:
+            where = f"{path}: experiments[{k}]"
+            try:
+                logs = [
+                    build_at(f"{where}.{place}", _open_log, path.parent, item, contents, table, streamed)
+                    for place, item in table.list_logs().items()
+                ]
+                runs.append((table, align_starts(logs)))
+            except ValueError as error:
+                runs.append((table, error))
         errors = [logs for _, logs in runs if isinstance(logs, ValueError)]
         if len(errors) == len(runs):
             raise errors[0]
@@ -156,35 +164,10 @@ def open_experiments(
     return opened
 
 
-def _open_logs(
-    path: Path, where: str, contents: Contents, table: ExperimentTable, streamed: bool
-) -> list[Log] | ValueError:
-    """Return the logs of data and inputs, in this order, whose dates begin together; or what is wrong with them."""
-    parameters = find_parameters(contents, table)
-    try:
-        return align_starts(
-            [
-                build_at(f"{path}: {where}.{place}", _open_log, path.parent, item, parameters, streamed)
-                for place, item in table.list_logs().items()
-            ]
-        )
-    except ValueError as error:
-        return error
-
-
-def find_parameters(contents: Contents, table: ExperimentTable) -> frozenset[str]:
-    """Return the names of parameters in an experiment, which a sigma may have without being a column.
-
-    Parameters
-    ----------
-    contents : Contents
-    table : ExperimentTable
-    """
-    return frozenset(contents.parameters) | frozenset(table.parameter_map)
-
-
-def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str], streamed: bool) -> Log:
-    columns = list(dict.fromkeys(list_columns(table, parameters)))
+def _open_log(
+    folder: Path, table: DataTable | InputTable, contents: Contents, run: ExperimentTable, streamed: bool
+) -> Log:
+    columns = list(dict.fromkeys(_list_columns(table, contents, run)))
     if table.file is None and streamed:
         return Log(np.zeros(0), dict.fromkeys(columns, np.zeros(0)), dict.fromkeys(columns, ""), "", "the stream")
     if table.file is None:
@@ -194,15 +177,9 @@ def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset
     return log if table.epoch is None else _count_from_1970(log, table.epoch)
 
 
-def list_columns(table: DataTable | InputTable, parameters: frozenset[str]) -> list[str]:
-    """Return the columns of a log with values, and after them those that hold sigma.
-
-    Parameters
-    ----------
-    table : DataTable or InputTable
-    parameters : frozenset of str
-        Names that a sigma may have without being a column.
-    """
+def _list_columns(table: DataTable | InputTable, contents: Contents, run: ExperimentTable) -> list[str]:
+    """Return the columns of a log with values, and after them those that hold sigma, unless parameters do."""
+    parameters = {*contents.parameters, *run.parameter_map}
     columns = list(table.columns.values() if isinstance(table.columns, dict) else table.columns)
     given = table.sigma if isinstance(table, DataTable) and isinstance(table.sigma, list) else []
     named = [entry for entry in given if isinstance(entry, str)]

@@ -62,17 +62,13 @@ def is_date(given: Any) -> bool:
 
 def _check_time(given: Any) -> Any:
     """Return a number or a date."""
-    is_number = isinstance(given, (int, float)) and not isinstance(given, bool)
-    return float(given) if is_number else _check_date(given, "a number or a date")
-
-
-def _check_date(given: Any, form: str = "a date") -> Any:
-    """Return a date."""
+    if isinstance(given, (int, float)) and not isinstance(given, bool):
+        return float(given)
     if is_date(given):
         return given
     from switchfit.problem.dates import EXAMPLES
 
-    raise PydanticCustomError("time_type", f"Input should be {form} such as {EXAMPLES}")
+    raise PydanticCustomError("time_type", f"Input should be a number or a date such as {EXAMPLES}")
 
 
 def _wrap_value(given: Any) -> Any:
@@ -95,11 +91,6 @@ def _wrap_entry(given: Any) -> Any:
     return given if isinstance(given, list) else [given]
 
 
-def _drop_first(given: Any) -> Any:
-    """Return None for ``"first"``, the time of the first row."""
-    return None if given == "first" else given
-
-
 ENTRY = BeforeValidator(_wrap_entry)
 
 Other = TypeVar("Other")
@@ -113,7 +104,6 @@ OrTable = Annotated[
 Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
 """A number in the experiment's time unit, or a date."""
 
-Date = Annotated[Any, pydantic.PlainValidator(lambda given: _check_date(given))]
 Positive = Annotated[float, Field(gt=0)]
 Duration = Annotated[float, Field(ge=0)]
 Names = Annotated[list[str], Field(min_length=1)]
@@ -194,7 +184,7 @@ class LogTable(Table):
     """the numbers in the time column count from 1970 (UTC) in this unit: they are dates"""
     window: Annotated[list[Time], Field(min_length=2, max_length=2)] | None = None
     """[from, to]: only rows with the time column, or the date, in between are used"""
-    time_offset: Annotated[float | None, BeforeValidator(_drop_first)] = 0.0
+    time_offset: float | Literal["first"] = 0.0
     """subtracted from the time column; 'first': the time of the first row"""
     time_scale: Positive | None = None
     """then multiplied: 1e-3 turns ms into s; left out, 1"""
@@ -267,7 +257,7 @@ class ExperimentTable(Table):
     is searched"""
     time_unit: str = Field(default="s", min_length=1)
     """unit of all times of the run; dates are converted to it, numbers are not"""
-    origin: Date = None
+    origin: Time = None
     """date at which times are 0; left out, t0 if it is a date, else the first date"""
     time_zone: str | None = None
     """zone of the dates that state none, and in which dates are shown, such as 'Europe/Berlin'"""
@@ -298,7 +288,7 @@ class ExperimentTable(Table):
 class LibraryTable(Table):
     """The mode sequences among which ``switchfit modes`` searches."""
 
-    modes: Names | None = None
+    modes: Names | None = Field(default=None, serialization_alias="library")
     """names of the modes that may occur; left out, all of the model"""
     first: NameOrNames | None = None
     """mode or modes with which a sequence may begin; left out, any"""
@@ -370,7 +360,7 @@ class Contents(Table):
 
     model: Annotated[ModelTable, BeforeValidator(_wrap_name)] | None = None
     """a built-in model, or 'file.py:object', or a table with name and arguments"""
-    problem: str | None = None
+    problem: Annotated[ModelTable, BeforeValidator(_wrap_name)] | None = None
     """'file.py:object' with an sf.Problem or a function making one, instead of all the rest"""
     parameters: dict[str, Annotated[ParameterTable, BeforeValidator(_wrap_value)]] = {}
     """the model's parameters"""

@@ -1,7 +1,4 @@
-"""A first problem file, with a model and data: what ``switchfit init`` writes.
-
-Write TOML as problem files have it.
-"""
+"""Write problem files: a first one, with a model and data, and one with a mode sequence that was found."""
 
 from __future__ import annotations
 
@@ -17,10 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io import find_examples
-from switchfit.io.logs.log import SECONDS, Log
+from switchfit.estimation.estimator import Estimate, make_relative
+from switchfit.io import find_examples, refuse_existing
+from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
+from switchfit.io.problem_file.building import ProblemFile
+from switchfit.io.user_files import replace_files
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import SECONDS
+from switchfit.problem.experiment import Experiment
 from switchfit.runtime.errors import InputError
 
 TABLES = {"parameters", "inputs", "library", "successions", "options"}
@@ -98,7 +100,7 @@ MOST_CHANNELS = 3
 """Channels that the first model has; the others are named in a comment."""
 
 FEWEST_SAMPLES = 8
-TEMPLATES = Path(__file__).parent / "templates"
+TEMPLATES = Path(__file__).parents[1] / "templates"
 
 
 def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
@@ -116,8 +118,7 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     InputError
         If the folder has something in it, or the log cannot be used.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} exists already, and nothing is overwritten: give another NAME.")
+    refuse_existing(folder, "NAME")
     texts: dict[str, str] = {}
     if log is None:
         copied = [find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")]
@@ -171,34 +172,27 @@ def choose_channels(log: Log) -> tuple[list[str], list[str]]:
 def _is_varying(values: FloatArray) -> bool:
     """Return whether a channel has enough samples, is not constant, and does not just count the rows."""
     known = values[np.isfinite(values)]
-    if len(known) < FEWEST_SAMPLES or np.ptp(known) == 0:
-        return False
-    return bool(np.ptp(np.diff(known)) > 1e-9 * np.ptp(known))
+    return len(known) >= FEWEST_SAMPLES and bool(np.ptp(np.diff(known)) > 1e-9 * np.ptp(known))
 
 
 def _fill_gaps(values: FloatArray) -> FloatArray:
     """Return values with missing samples interpolated."""
     places, known = np.arange(len(values)), np.isfinite(values)
-    return np.interp(places, places[known], values[known]) if known.any() else np.zeros(len(values))
-
-
-def _find_change(values: FloatArray) -> int:
-    """Return the row at which a step from one mean to another explains most of the values (K, q), scaled alike."""
-    scaled = (values - values.mean(0)) / np.where(values.std(0) > 0, values.std(0), 1.0)
-    sums, count = np.cumsum(scaled, axis=0), len(values)
-    k = np.arange(1, count)
-    explained = (sums[:-1] ** 2).sum(1) * (1 / k + 1 / (count - k))
-    inside = slice(max(count // 20, 1), -max(count // 20, 1))
-    return int(k[inside][explained[inside].argmax()])
+    return np.interp(places, places[known], values[known])
 
 
 def _guess_levels(values: FloatArray) -> tuple[int, FloatArray, FloatArray, FloatArray]:
     """Return the row of the transition, the levels before and after it, (q,), and how far values (K, q) are off them.
 
-    The second level is that of the second half of the rows after it.
+    A step from one mean to another at that row explains most of the values, scaled alike. The second level is that of
+    the second half of the rows after it.
     """
-    k = _find_change(values)
-    half = k + (len(values) - k) // 2
+    sums, count = np.cumsum((values - values.mean(0)) / values.std(0), axis=0), len(values)
+    rows = np.arange(1, count)
+    explained = (sums[:-1] ** 2).sum(1) * (1 / rows + 1 / (count - rows))
+    inside = slice(max(count // 20, 1), -max(count // 20, 1))
+    k = int(rows[inside][explained[inside].argmax()])
+    half = k + (count - k) // 2
     before, after = values[:k].mean(0), values[half:].mean(0)
     off = np.concatenate([values[:k] - before, values[half:] - after]).std(0)
     return k, before, after, np.where(off > 0, off, np.abs(after - before) * 1e-3 + 1e-12)
@@ -258,11 +252,9 @@ def _describe_data(
     if others:
         yield f"# further channels: {', '.join(others)}"
     yield from (f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues)
-    flaws = {
-        "sort": np.any(np.diff(log.times) < 0),
-        "drop-duplicates": len(np.unique(log.times)) < len(log),
-    }
-    if repairs := [repair for repair, is_needed in flaws.items() if is_needed]:
+    repairs = ["sort"] if np.any(np.diff(log.times) < 0) else []
+    repairs += ["drop-duplicates"] if len(np.unique(log.times)) < len(log) else []
+    if repairs:
         yield f"repair = {write_value(repairs)}   # what may be changed of that"
     sigma = f"sigma = {write_value(sigmas)}   # <- standard deviations of the noise; numbers, if they are known"
     yield sigma if sigmas else "# sigma = 0.1   # <- standard deviation of the noise, if it is known"
@@ -276,3 +268,66 @@ def _format(values: Any, digits: int = 4) -> str:
     """Return a number with a few digits, as a float of TOML; a list of them for an array of several."""
     shown = [repr(float(f"{value:.{digits}g}")) for value in np.ravel(values).tolist()]
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
+
+
+def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) -> str:
+    """Return the text of a problem file with the mode sequences and the values of an estimate.
+
+    Initial states that the model has, and not the file, stay with the model.
+
+    Parameters
+    ----------
+    loaded : ProblemFile
+        That was searched.
+    estimate : Estimate
+        Of the sequences that were found.
+    folder : Path
+        Where the text will be, from which paths in it lead to data and models.
+
+    Raises
+    ------
+    InputError
+        If the problem is built in Python.
+    """
+    contents, problem = loaded.contents, estimate.evaluator_at_solution().problem
+    if contents.problem is not None:
+        raise InputError(
+            f"{loaded.path} names a problem that {contents.problem.name!r} builds in Python: write the sequence there."
+        )
+    tables = contents.model_dump(exclude_unset=True, exclude_none=True)
+    for e, (table, run) in enumerate(zip(tables["experiments"], problem.experiments, strict=True)):
+        table |= _describe_run(estimate, e, run)
+        for entry, value in zip(table.get("initial_state", ()), estimate.initial_state[e], strict=False):
+            if not entry.get("fixed"):
+                entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
+    parameters = tables.get("parameters", {})
+    for name, table in parameters.items():
+        parameter = problem.parameters[name]
+        table["value"] = _confine(estimate.parameters[name], parameter.lower, parameter.upper)
+        if parameter.fixed:  # the search has held it
+            table["fixed"] = True
+        parameters[name] = table["value"] if set(table) == {"value"} else table
+    options = {key: value for key, value in tables.get("options", {}).items() if key != "min_duration"}
+    durations = problem.min_duration  # the library may have had a shorter one
+    if isinstance(durations, Mapping):
+        durations = {mode: seconds for mode, seconds in durations.items() if seconds}
+    tables["options"] = options | ({"min_duration": durations} if durations else {})
+    home = loaded.path.absolute().parent
+    moved = replace_files(tables, lambda name: name if Path(name).is_absolute() else make_relative(home / name, folder))
+    head = f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses."
+    return "\n".join([head, *write_table(moved), ""])
+
+
+def _describe_run(estimate: Estimate, e: int, run: Experiment) -> dict[str, Any]:
+    """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
+    found = {"mode_sequence": list(run.mode_sequence), "transition_times": estimate.transition_times[e].tolist()}
+    if run.origin is not None:
+        found["origin"] = run.origin.date
+        if run.time_zone is not None:
+            found["time_zone"] = run.time_zone
+    return found
+
+
+def _confine(value: Any, lower: Any, upper: Any) -> Any:
+    """Return an estimate as numbers of Python; rounding must not take it over a bound."""
+    return np.clip(np.asarray(value, dtype=float), lower, upper).tolist()

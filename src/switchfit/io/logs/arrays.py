@@ -1,7 +1,8 @@
-"""MATLAB's .mat files: version 5 to 7.2 by SciPy, version 7.3 by h5py."""
+"""Files of arrays: Parquet by pyarrow; MATLAB's .mat files, version 5 to 7.2 by SciPy, version 7.3 by h5py."""
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -9,12 +10,41 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs import explain_damage, import_library
-from switchfit.io.logs.log import Log, Options
-from switchfit.io.logs.tables import build_log, find_time_name
+from switchfit.io.logs import explain_damage
+from switchfit.io.logs.log import Log, Options, build_log, find_time_name
 from switchfit.problem.validation import join_names, shorten
-from switchfit.runtime.errors import InputError
+from switchfit.runtime.errors import InputError, import_library
 from switchfit.runtime.files import explain_read_errors
+
+
+def read_parquet(path: Path, options: Options) -> Log:
+    """Read the columns of a Parquet file; units are those in the metadata of the fields, or of pandas.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    parquet = import_library("pyarrow.parquet", f"{path}: Parquet", "'switchfit[parquet]'")
+    with explain_damage(path, "a Parquet file"):
+        table = parquet.read_table(path)
+        columns = {name: table.column(name).to_numpy() for name in table.column_names}
+    zones = {field.name: getattr(field.type, "tz", None) or "" for field in table.schema}
+    return build_log(str(path), columns, _find_units(table.schema), options, zones=zones)
+
+
+def _find_units(schema: Any) -> dict[str, str]:
+    """Return units from the metadata "unit" or "units" of each field, and from the attrs that pandas writes."""
+    pandas = json.loads((schema.metadata or {}).get(b"pandas", b"{}"))
+    attributes = pandas.get("attributes", {})
+    units = dict(attributes.get("units", {})) if isinstance(attributes, dict) else {}
+    for field in schema:
+        metadata = field.metadata or {}
+        stated = metadata.get(b"units", metadata.get(b"unit"))
+        if stated is not None:
+            units[field.name] = stated.decode("utf-8", "replace")
+    return {name: unit for name, unit in units.items() if isinstance(unit, str)}
+
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -73,7 +103,7 @@ def _load(path: Path) -> dict[str, Any]:
         head = file.read(520)
     with explain_damage(path, "a .mat file"), warnings.catch_warnings():
         if HDF5 in (head[:8], head[512:520]):
-            h5py = import_library("h5py", "matlab", f"{path}: a .mat file of version 7.3")
+            h5py = import_library("h5py", f"{path}: a .mat file of version 7.3", "'switchfit[matlab]'")
             with h5py.File(path, "r") as file:
                 return {name: _read_hdf(h5py, item) for name, item in file.items() if not name.startswith("#")}
         from scipy.io import loadmat  # here, since importing it takes long
@@ -119,12 +149,7 @@ def _find_times(arrays: Mapping[str, Any], time: str | None) -> dict[str, str]:
 
 
 def _is_vector(value: Any) -> bool:
-    return (
-        isinstance(value, np.ndarray)
-        and value.dtype.kind in "biuf"
-        and value.size > 1
-        and value.size == max(value.shape)
-    )
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and 1 < value.size == max(value.shape)
 
 
 def _split_channels(name: str, value: Any, samples: int) -> dict[str, Any]:
