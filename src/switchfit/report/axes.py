@@ -105,34 +105,24 @@ LONGEST = 1000 * 365.25
 """Days from 1970 that an axis may reach."""
 
 
-class Scale:
-    """Times as the days of matplotlib, and back."""
+class DateLocator(Locator):
+    """Ticks of an axis of times at round dates of a zone.
+
+    Parameters
+    ----------
+    origin : Origin
+    time_unit : str
+    """
 
     def __init__(self, origin: Origin, time_unit: str) -> None:
         self.zone: datetime.tzinfo = origin.zone or datetime.UTC
         self.start = float(date2num(origin.instant))
         self.length = SECONDS[normalize_time_unit(time_unit)] / SECONDS["d"]
+        self.dates = AutoDateLocator(tz=self.zone, minticks=2, maxticks=MOST_TICKS)
 
     def to_days(self, times: Sequence[float]) -> FloatArray:
         """Return times as days since 1970."""
         return self.start + np.asarray(times, dtype=np.float64) * self.length
-
-    def to_times(self, days: Sequence[float]) -> FloatArray:
-        """Return days since 1970 as times."""
-        return (np.asarray(days, dtype=np.float64) - self.start) / self.length
-
-
-class DateLocator(Locator):
-    """Ticks at round dates of a zone.
-
-    Parameters
-    ----------
-    scale : Scale
-    """
-
-    def __init__(self, scale: Scale) -> None:
-        self.scale = scale
-        self.dates = AutoDateLocator(tz=scale.zone, minticks=2, maxticks=MOST_TICKS)
 
     def __call__(self) -> Sequence[float]:
         """Return the ticks of what the axis shows."""
@@ -143,9 +133,9 @@ class DateLocator(Locator):
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the ticks between two times."""
-        days = np.clip(self.scale.to_days([vmin, vmax]), -LONGEST, LONGEST)
-        ends = num2date(np.sort(days), tz=self.scale.zone)
-        return self.scale.to_times(self.dates.tick_values(*ends)).tolist()
+        days = np.clip(self.to_days([vmin, vmax]), -LONGEST, LONGEST)
+        ticks = self.dates.tick_values(*num2date(np.sort(days), tz=self.zone))
+        return ((np.asarray(ticks) - self.start) / self.length).tolist()
 
 
 class DateFormatter(Formatter):
@@ -153,23 +143,22 @@ class DateFormatter(Formatter):
 
     Parameters
     ----------
-    scale : Scale
     locator : DateLocator
     """
 
-    def __init__(self, scale: Scale, locator: DateLocator) -> None:
-        self.scale = scale
+    def __init__(self, locator: DateLocator) -> None:
+        self.locator = locator
         self.dates = ConciseDateFormatter(
-            locator.dates, tz=scale.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
+            locator.dates, tz=locator.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
         )
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         """Return the label of one tick, or of a place under the pointer."""
-        return num2date(float(self.scale.to_days([x])[0]), tz=self.scale.zone).strftime("%Y-%m-%d %H:%M:%S")
+        return num2date(float(self.locator.to_days([x])[0]), tz=self.locator.zone).strftime("%Y-%m-%d %H:%M:%S")
 
     def format_ticks(self, values: Sequence[float]) -> list[str]:
         """Return the labels of all ticks."""
-        return self.dates.format_ticks(self.scale.to_days(values).tolist())
+        return self.dates.format_ticks(self.locator.to_days(values).tolist())
 
     def get_offset(self) -> str:
         """Return what all labels leave out, such as the year."""

@@ -44,7 +44,8 @@ from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_cou
 from switchfit.uncertainty.residuals import correct_errors
 
 CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of switches"}
-"""Names of criteria."""
+DISCOUNTED = "mBIC discounted"
+"""Names of criteria; the last is that of one for residuals that are not noise."""
 
 LISTED, LISTED_MINIMA = 6, 3
 """Alternatives in a report of a search; minima of each mode in a table of insertion rates, and in its figure."""
@@ -101,14 +102,17 @@ def _is_exchanged(ending: ModeEnding) -> bool:
     return same_lengths and renamed and abs(ending.difference) < ROUNDING
 
 
-def is_discounted(search: ModeSearch) -> bool:
-    """Return whether residuals that are not noise have discounted the criteria."""
-    return any(warning.kind == "discounted" for warning in search.warnings)
+def list_criteria(search: ModeSearch) -> dict[str, str]:
+    """Return the criteria of a `ModeFit` that are shown, by the names of its attributes, with their titles.
 
-
-def name_decider(search: ModeSearch) -> str:
-    """Return the name of `ModeFit.criterion`, by which the number of switches was chosen."""
-    return "mBIC discounted" if is_discounted(search) else name_criterion(search.criterion)
+    Parameters
+    ----------
+    search : ModeSearch
+    """
+    likely = ("bic", "mbic", "aicc") if search.sigma_known is not None else ()
+    discounted = any(warning.kind == "discounted" for warning in search.warnings)
+    own = {"criterion": DISCOUNTED if discounted else name_criterion(search.criterion)}
+    return (own if discounted or search.criterion not in likely else {}) | {name: CRITERIA[name] for name in likely}
 
 
 _ENDINGS = {
@@ -293,27 +297,26 @@ def list_parameters(search: ModeSearch) -> list[str]:
 
 def tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
-    likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
-    discounted = is_discounted(search)
-    extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
-    rows = []
+    criteria, rows = list_criteria(search), []
     for fit in search.fitted:
         cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
-        if extra:
-            cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
-        rows.append((fit, [*cells, *(f"{getattr(fit, name):.1f}" for name in likely)]))
-    titles = ["", "switches", "J", *extra, *map(name_criterion, likely)]
+        for name, title in criteria.items():
+            digits = ".8g" if name == "criterion" and title != DISCOUNTED else ".1f"
+            cells.append(f"{getattr(fit, name):{digits}}".replace("nan", ""))
+        rows.append((fit, cells))
+    titles = ["", "switches", "J", *criteria.values()]
     return _format_sequences(search, rows, "<" + ">" * (len(titles) - 1), titles, "sequence")
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
-    name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
+    criteria = list_criteria(search)
+    name = "criterion" if "criterion" in criteria else "aicc" if search.criterion == "aicc" else "mbic"
     lowest = getattr(search.chosen[0], name)
-    titles = ["weight", f"{name_criterion(name) if name == 'mbic' else name_decider(search)} above the best"]
     chosen = search.chosen[:LISTED]
     rows = [(fit, [f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"]) for fit in chosen]
     more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
+    titles = ["weight", f"{criteria[name]} above the best"]
     return [*_format_sequences(search, rows, ">>", titles, "alternatives"), *more]
 
 
@@ -343,17 +346,19 @@ def plot_search(search: ModeSearch) -> Figure:
     ----------
     search : ModeSearch
     """
-    runs = range(min(len(search.run_names), DRAWN_RUNS)) if search.best is not None else range(0)
+    runs = range(min(len(search.run_names), DRAWN_RUNS) if search.best is not None else 0)
     figure = style.make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
     axes = figure.subplots(1 + 2 * len(runs), 1, squeeze=False, height_ratios=[1.0, *([1.2, 0.6] * len(runs))])[:, 0]
     plot_numbers(search, axes[0])
     for place, e in enumerate(runs):
         _plot_best(search, e, axes[1 + 2 * place])
-        plot_probabilities(search, e, axes[2 + 2 * place])
+        t = np.linspace(search.starts[e], search.ends[e], POINTS)
+        stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), axes[2 + 2 * place])
+        style.label_axis(axes[2 + 2 * place], search.best.trajectories[e])
     return style.turn_off_formulas(figure)
 
 
-def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
+def plot_numbers(search: ModeSearch, ax: Axes) -> None:
     """Draw the criteria over the number of switches, each less its lowest.
 
     Parameters
@@ -362,14 +367,12 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax : matplotlib.axes.Axes
     """
     numbers = [fit.switches for fit in search.fitted]
-    names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
-    names += ["criterion"] if is_discounted(search) or not names else []
-    for k, name in enumerate(names):
+    colours = style.assign_colours([*CRITERIA, "criterion"], LINE_COLOURS)
+    for name, label in list_criteria(search).items():
         values = np.array([getattr(fit, name) for fit in search.fitted])
         if np.isfinite(values).any():
-            label = name_decider(search) if name == "criterion" else name_criterion(name)
             above = values - np.nanmin(np.where(np.isfinite(values), values, np.nan))
-            ax.plot(numbers, above, "o-", color=LINE_COLOURS[k], linewidth=LINE, markersize=4, label=label)
+            ax.plot(numbers, above, "o-", color=colours[name], linewidth=LINE, markersize=4, label=label)
     if search.chosen:
         ax.axvline(search.chosen[0].switches, color=FIT, linewidth=THIN, zorder=0)
     ax.set_yscale("symlog", linthresh=10.0)
@@ -379,7 +382,6 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax.locator_params(axis="x", integer=True)
     if ax.lines:
         ax.legend(fontsize=SMALL)
-    return ax
 
 
 def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
@@ -387,7 +389,7 @@ def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
     best: Any = search.best
     trajectory = best.trajectories[e]
     if best.comparisons[e]:
-        plot_comparison(best.comparisons[e][0], trajectory, 0, ax)
+        plot_comparison(best.comparisons[e][0], 0, ax)
     else:
         plot_state(trajectory, 0, ax)
     plot_modes(trajectory, ax, colours=style.assign_colours(search.modes, MODE_COLOURS))
@@ -395,24 +397,7 @@ def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
         ax.set_title(search.run_names[e], loc="left", fontsize=SMALL)
 
 
-def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
-    """Draw the probability of each mode over time, one upon the other; modes without any are left out.
-
-    Parameters
-    ----------
-    search : ModeSearch
-    e : int
-        Index of the experiment.
-    ax : matplotlib.axes.Axes
-    """
-    t = np.linspace(search.starts[e], search.ends[e], POINTS)
-    stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), ax)
-    if search.best is not None:
-        style.label_axis(ax, search.best.trajectories[e])
-    return ax
-
-
-def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatArray, ax: Axes) -> Axes:
+def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatArray, ax: Axes) -> None:
     """Draw probabilities over time, one upon the other, with a legend; modes without any are left out.
 
     Parameters
@@ -430,7 +415,7 @@ def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatA
     ax.set_xlim(t[0], t[-1])
     ax.set_ylabel("probability")
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
-    return style.draw_legend_above(ax)
+    style.draw_legend_above(ax)
 
 
 # --- insertion rates --------------------------------------------------------------------------------------------------
@@ -476,7 +461,7 @@ def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure
     return style.draw_on(ax, lambda ax: _draw_insertion(found, ax), (7.2, 3.8))
 
 
-def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
+def _draw_insertion(found: Insertion, ax: Axes) -> None:
     run = found.trajectory
     order = [*choose_mode_colours([run]), *found.modes]
     colours, shades = (style.assign_colours(order, palette) for palette in (LINE_COLOURS, MODE_COLOURS))  # of one hue
@@ -492,7 +477,6 @@ def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
     ax.set_ylabel(label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
-    return ax
 
 
 # --- what an online estimator said -----------------------------------------------------------------------------------
@@ -573,33 +557,22 @@ def plot_log(log: OnlineLog) -> Figure:
     figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))
     figure.get_layout_engine().set(h_pad=ROOM)  # type: ignore[union-attr,call-arg]
     axes = figure.subplots(2 + len(values), 1, sharex=True, squeeze=False)[:, 0]
-    plot_probability(log, axes[0])
+    stack_probabilities(log.times, log.modes, log.probability, axes[0])
+    now = log.now
+    reach = QUANTILE * now.time_errors
+    ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
+    plot_transitions(now.transition_times, ends, axes[0])
     plot_statistic(log, axes[1])
     for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
         _plot_value(log.times, value, error, ax)
         ax.set_ylabel(label_quantity(name, unit))
-    for ax in axes[:-1]:
-        style.put_ticks(ax, log)
-    style.label_axis(axes[-1], log)
+    for ax in axes:
+        style.label_axis(ax, log)
+        ax.label_outer()
     return style.turn_off_formulas(figure)
 
 
-def plot_probability(log: OnlineLog, ax: Axes) -> Axes:
-    """Draw the probability of each mode as it was known at each time, and the transition times as they are known now.
-
-    Parameters
-    ----------
-    log : OnlineLog
-    ax : matplotlib.axes.Axes
-    """
-    stack_probabilities(log.times, log.modes, log.probability, ax)
-    now = log.now
-    reach = QUANTILE * now.time_errors
-    ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
-    return plot_transitions(now.transition_times, ends, ax)
-
-
-def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
+def plot_statistic(log: OnlineLog, ax: Axes) -> None:
     """Draw the statistic with its threshold, and a dot for each alarm, an empty one if it was retracted.
 
     Parameters
@@ -616,10 +589,9 @@ def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
         ax.set_yscale("symlog", linthresh=log.threshold, linscale=2.0)
     ax.set_ylim(0.0, max(1.5 * log.threshold, ax.get_ylim()[1]))
     ax.set_ylabel("statistic")
-    return ax
 
 
-def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> Axes:
+def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> None:
     """Draw a parameter with its 95 % band, which is cut off where it is much wider than at the end."""
     band = np.stack([value - QUANTILE * error, value + QUANTILE * error], axis=1)
     ax.plot(times, value, "-", color=FIT, linewidth=LINE, zorder=3)
@@ -629,4 +601,3 @@ def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axe
     plot_band(times, replace_infinities(band), ax, alpha=0.2, label="95 %")
     ax.axhline(value[-1], color=TRANSITION, linestyle=":", linewidth=THIN, zorder=1)
     ax.tick_params(labelsize=SMALL)
-    return ax
