@@ -14,30 +14,8 @@ from switchfit.online.log import OnlineLog
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
-from switchfit.report import style
-from switchfit.report.formats import (
-    Clock,
-    Table,
-    Timed,
-    format_estimate,
-    format_rounded,
-    format_table,
-    format_time,
-    join_sections,
-    label_quantity,
-    label_time,
-    suffix_time,
-    wrap_text,
-)
-from switchfit.report.plot import (
-    choose_mode_colours,
-    plot_band,
-    plot_comparison,
-    plot_modes,
-    plot_state,
-    plot_transitions,
-    replace_infinities,
-)
+from switchfit.report import formats, plot, style
+from switchfit.report.formats import Table, Timed, format_estimate, format_table, format_time, label_time, wrap_text
 from switchfit.report.sentences import ALLOWED, capitalise
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
@@ -246,7 +224,7 @@ def write_search(search: ModeSearch) -> str:
     best = list_segments(search), list_parameters(search), [ALLOWED] if corrected else []
     alternatives = list_alternatives(search) if len(search.chosen) > 1 else []
     effort = f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"
-    return join_sections(head, *best, tabulate_numbers(search), alternatives, [effort])
+    return formats.join_sections(head, *best, tabulate_numbers(search), alternatives, [effort])
 
 
 def _tabulate_segments(
@@ -265,7 +243,7 @@ def list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
     best, errors, lines = search.chosen[0], _list_time_errors(search), []
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
-        run = Clock(None if search.best is None else search.best.trajectories[e].origin, search.time_units[e])
+        run = formats.Clock(None if search.best is None else search.best.trajectories[e].origin, search.time_units[e])
         ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
         if len(best.sequences) > 1:
             lines.append(f"{search.run_names[e]}:")
@@ -290,7 +268,7 @@ def list_parameters(search: ModeSearch) -> list[str]:
             rows.append([name, f"{value:.6g}", "a guess: acts in none of the modes"])
         elif search.best is not None and name in search.best.theta_names:
             k = search.best.theta_names.index(name)
-            number, error, relative = format_rounded(search.best.theta[k], correct_errors(search.best)[k])
+            number, error, relative = formats.format_rounded(search.best.theta[k], correct_errors(search.best)[k])
             rows.append([name, number, f"{error} {relative}".strip()])
     return format_table(rows, "<><")
 
@@ -389,10 +367,10 @@ def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
     best: Any = search.best
     trajectory = best.trajectories[e]
     if best.comparisons[e]:
-        plot_comparison(best.comparisons[e][0], 0, ax)
+        plot.plot_comparison(best.comparisons[e][0], 0, ax)
     else:
-        plot_state(trajectory, 0, ax)
-    plot_modes(trajectory, ax, colours=style.assign_colours(search.modes, MODE_COLOURS))
+        plot.plot_state(trajectory, 0, ax)
+    plot.plot_modes(trajectory, ax, colours=style.assign_colours(search.modes, MODE_COLOURS))
     if len(search.run_names) > 1:
         ax.set_title(search.run_names[e], loc="left", fontsize=SMALL)
 
@@ -432,7 +410,7 @@ def write_insertion(found: Insertion) -> str:
     run, pulses = found.trajectory, found.minima(LISTED_MINIMA)
     text, rows = "No short pulse of any mode lowers J.", []
     if pulses:
-        at = format_time(pulses[0].time, run) + suffix_time(run)
+        at = format_time(pulses[0].time, run) + formats.suffix_time(run)
         speed = f"{-pulses[0].rate:.4g} per {run.time_unit} of its length"
         text = f"A short pulse of {pulses[0].mode} at {at} lowers J fastest: by {speed}."
     for pulse in pulses:
@@ -446,7 +424,7 @@ def write_insertion(found: Insertion) -> str:
         if np.isnan(found.rate[found.active == m, k]).all()
     ]
     why = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
-    return join_sections(wrap_text(text), table, wrap_text(why) if undefined else [])
+    return formats.join_sections(wrap_text(text), table, wrap_text(why) if undefined else [])
 
 
 @draw_figure.register(Insertion)
@@ -463,7 +441,7 @@ def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure
 
 def _draw_insertion(found: Insertion, ax: Axes) -> None:
     run = found.trajectory
-    order = [*choose_mode_colours([run]), *found.modes]
+    order = [*plot.choose_mode_colours([run]), *found.modes]
     colours, shades = (style.assign_colours(order, palette) for palette in (LINE_COLOURS, MODE_COLOURS))  # of one hue
     ax.axhline(0.0, color=REFERENCE, linewidth=THIN, zorder=2)
     for k, mode in enumerate(found.modes):
@@ -473,8 +451,8 @@ def _draw_insertion(found: Insertion, ax: Axes) -> None:
             minima = [pulse for pulse in found.minima(LISTED_MINIMA) if pulse.mode == mode]
             times, rates = [pulse.time for pulse in minima], [pulse.rate for pulse in minima]
             ax.plot(times, rates, "o", markersize=4.5, color=colours[mode], zorder=4)
-    plot_modes(run, ax, colours=shades)
-    ax.set_ylabel(label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
+    plot.plot_modes(run, ax, colours=shades)
+    ax.set_ylabel(formats.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
 
@@ -490,7 +468,7 @@ def write_log(log: OnlineLog) -> str:
     ----------
     log : OnlineLog
     """
-    unit = suffix_time(log)
+    unit = formats.suffix_time(log)
     now, end = log.now, format_time(log.now.time, log)
     error = now.time_errors[-1] if len(now.time_errors) else np.nan
     since = format_estimate(now.since, float(error), log)[0]
@@ -502,7 +480,7 @@ def write_log(log: OnlineLog) -> str:
     p50, p90, p99, most = (f"{1e3 * took[name]:.3g}" for name in ("p50", "p90", "p99", "max"))
     effort = wrap_text(f"{format_count(len(log.times), 'update')}: {counted}")
     effort.append(f"an update took {p50} ms (median), {p90} (90 %), {p99} (99 %), {most} (the longest)")
-    return join_sections(head, _list_modes(log), _list_parameters(log), _list_alarms(log), effort)
+    return formats.join_sections(head, _list_modes(log), _list_parameters(log), _list_alarms(log), effort)
 
 
 def _list_modes(log: OnlineLog) -> list[str]:
@@ -561,11 +539,11 @@ def plot_log(log: OnlineLog) -> Figure:
     now = log.now
     reach = QUANTILE * now.time_errors
     ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
-    plot_transitions(now.transition_times, ends, axes[0])
+    plot.plot_transitions(now.transition_times, ends, axes[0])
     plot_statistic(log, axes[1])
     for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
         _plot_value(log.times, value, error, ax)
-        ax.set_ylabel(label_quantity(name, unit))
+        ax.set_ylabel(formats.label_quantity(name, unit))
     for ax in axes:
         style.label_axis(ax, log)
         ax.label_outer()
@@ -598,6 +576,6 @@ def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axe
     reach = 3.0 * QUANTILE * np.nan_to_num(error[-1], posinf=0.0)
     ax.set_ylim(*ax.get_ylim() + reach * np.array([-1.0, 1.0]))
     ax.set_autoscaley_on(False)
-    plot_band(times, replace_infinities(band), ax, alpha=0.2, label="95 %")
+    plot.plot_band(times, plot.replace_infinities(band), ax, alpha=0.2, label="95 %")
     ax.axhline(value[-1], color=TRANSITION, linestyle=":", linewidth=THIN, zorder=1)
     ax.tick_params(labelsize=SMALL)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -21,7 +22,7 @@ from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
-from switchfit.report.formats import format_unit, label_quantity
+from switchfit.report.formats import count_worst, format_unit, label_quantity
 from switchfit.report.style import DATA, FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
 from switchfit.strategy.validation import Validation
@@ -84,8 +85,7 @@ def plot_fit(fit: Fit, *, bands: bool = True, level: float = 0.95) -> Figure:
     intervals = {e: find_transition_intervals(fit, e, level) for e in runs}
     drawn = {e: predict(fit, experiment=e) for e in runs} if wanted and has_bands(fit) else {}
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
-    if len(runs) < len(fit.trajectories):
-        notes.append(_count_worst(fit, runs))
+    notes += filter(None, [count_worst(runs, fit.trajectories, "experiments")])
     figure = plot_runs(fit, intervals, drawn, level=level, notes=notes)
     figure.legends[0].get_title().set_color("black" if fit.status.successful else FIT)
     return figure
@@ -329,14 +329,14 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
         Of the intervals, which allow for correlated residuals, as in the report.
     ax : matplotlib.axes.Axes, optional
     """
-    intervals = [find_transition_intervals(estimate, e, level) for e in range(len(estimate.trajectories))]
-    height = 1.3 + 0.4 * min(len(estimate.trajectories), LONGEST_TIMELINE)
-    return style.draw_on(ax, lambda ax: _draw_timeline(estimate, intervals, level, ax), (8.0, height))
+    runs = choose_runs(estimate, LONGEST_TIMELINE)
+    title = count_worst(runs, estimate.trajectories, "experiments")
+    draw = partial(_draw_timeline, estimate, runs, level)
+    return style.draw_on(ax, draw, (8.0, 1.3 + 0.4 * len(runs)), legend=1.0, title=title)
 
 
-def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: Axes) -> None:
-    """Draw the rows of a timeline, the first on top; of many experiments those that are explained worst."""
-    runs = choose_runs(fit, LONGEST_TIMELINE)
+def _draw_timeline(fit: Fit, runs: Sequence[int], level: float, ax: Axes) -> None:
+    """Draw the rows of a timeline, the first on top."""
     colours = choose_mode_colours(fit.trajectories)
     ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
     first, last = float(ends.min()), float(ends.max())
@@ -348,7 +348,7 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
             ax.barh(row, end - begin, 0.7, begin, label="" if fits else mode, **bar)
             if fits:
                 ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
-        for low, high in intervals[e].tolist():
+        for low, high in find_transition_intervals(fit, e, level).tolist():
             if np.isfinite(high - low):
                 look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
                 ax.plot([low, high], [row, row], "|-", label=f"transition time, {100 * level:g} % interval", **look)
@@ -357,12 +357,6 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
     ax.set_ylim(len(ends) - 0.5, -0.5)
     ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
-    title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
-    style.draw_legend_above(ax, title=title)
-
-
-def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
-    return f"the worst {len(shown)} of {len(fit.trajectories)} experiments"
 
 
 def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = False) -> dict[str, str]:
@@ -539,7 +533,7 @@ def plot_plane(
     if named is not None and len(named) != 2:
         raise ValueError(f"channels must be two names; got {shorten(channels)}.")
     (comparison, plane), trajectory = _choose_plane(estimate, experiment, named), estimate.trajectories[experiment]
-    return style.draw_on(ax, lambda ax: _draw_plane(comparison, plane, trajectory, ax), (6.4, 5.6))
+    return style.draw_on(ax, partial(_draw_plane, comparison, plane, trajectory), (6.4, 5.6), legend=1.0)
 
 
 def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> tuple[Comparison, list[int]]:
@@ -571,7 +565,6 @@ def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory,
     for k, set_label in zip(both, (ax.set_xlabel, ax.set_ylabel), strict=True):
         set_label(label_quantity(comparison.names[k], comparison.units[k]))
     ax.set_aspect("equal", adjustable="datalim")
-    style.draw_legend_above(ax)
 
 
 PLOTS: dict[str, Callable[..., Any]]

@@ -70,16 +70,21 @@ def list_figures(issue: Issue, name: str) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-def write_places(names: Sequence[str], values: Sequence[float], digits: int = 8) -> str:
-    """Return values of unknowns, such as "mu = 0.3, tau_1 = 2".
+def list_each(issue: Issue, template: str, *names: str, first: int = 0) -> str:
+    """Return subjects of an issue, each with its figures, such as "mu = 0.3, tau_1 = 2".
 
     Parameters
     ----------
-    names : sequence of str
-    values : sequence of float
-    digits : int, optional
+    issue : Issue
+    template : str
+        With a field for the subject, and one for each figure.
+    names : str
+        Of the figures.
+    first : int, optional
+        Of the subjects.
     """
-    return ", ".join(f"{name} = {value:.{digits}g}" for name, value in zip(names, values, strict=False))
+    each = zip(issue.subjects[first:], *(list_figures(issue, name) for name in names), strict=False)
+    return join_first([template.format(*entries) for entries in each])
 
 
 def join_words(words: Sequence[str]) -> str:
@@ -206,8 +211,8 @@ def _add_unit(issue: Issue, name: str) -> str:
 _REPAIRS = {
     "log: unsorted times": ("repair='sort' sorts by time", "sorted"),
     "log: clock jump": (
-        "if these are two recordings, split the file there; if lines are out of order, repair='sort' sorts them",
-        "sorted by time",
+        "if these are two recordings, split the file there; else repair='sort' sorts by time",
+        "sorted",
     ),
     "log: repeated time": ("repair='drop-duplicates' keeps the first sample of each", "the first sample is kept"),
     "log: wrapped angle": ("repair='unwrap:{2}' makes it continuous", "unwrapped"),
@@ -261,25 +266,10 @@ def _write_combination(issue: Issue) -> str:
     return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
 
 
-def _list_correlated(issue: Issue) -> str:
-    each = zip(issue.subjects, list_figures(issue, "correlation"), strict=False)
-    return join_first([f"{label} ({value:.2f})" for label, value in each])
-
-
-def _list_non_normal(issue: Issue) -> str:
-    each = zip(issue.subjects, list_figures(issue, "kurtosis"), list_figures(issue, "outliers"), strict=False)
-    return join_first([f"{name} (kurtosis {size:.1f}, {count:.0f} beyond 4 sigma)" for name, size, count in each])
-
-
 def _list_wrong(issue: Issue) -> str:
     """Return the entries of a gradient that are wrong."""
-    each = zip(issue.subjects, list_figures(issue, "derivatives"), list_figures(issue, "differences"), strict=False)
-    entries = [f"{name} (derivative {stated:.3g}, differences {found:.3g})" for name, stated, found in each]
-    return f"; it is wrong in {', '.join(entries)}" if entries else ""
-
-
-def _write_at(issue: Issue) -> str:
-    return write_places(issue.subjects, list_figures(issue, "at"))
+    entries = list_each(issue, "{} (derivative {:.3g}, differences {:.3g})", "derivatives", "differences")
+    return f"; it is wrong in {entries}" if entries else ""
 
 
 def _write_jump(issue: Issue) -> str:
@@ -326,6 +316,8 @@ EXAMPLES = {
 """What to keep from where an operation is not defined, or has no derivative."""
 
 
+_NOT_NORMAL = "{} (kurtosis {:.1f}, {:.0f} beyond 4 sigma)"
+"""Of a channel."""
 _DELAYED = (
     " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, and the "
     "fit may have ended at one. Fix the delay at its estimate to see."
@@ -630,7 +622,6 @@ def _write_prediction(issue: Issue) -> str:
 
 
 _REASONS: dict[str, Sentence] = {
-    "converged": "converged",
     "looked": _write_looks,
     "fits": _write_fit,
     "predicts": _write_prediction,
@@ -688,7 +679,6 @@ _STEPS = {
     "more starts": "strategy='thorough'",
     "more time": "time_budget with more seconds",
     "look at the residuals": "look at estimate.plot_residuals()",
-    "check sigma": "check sigma",
     "corrected errors": "take the corrected standard errors",
     "robust loss": "give the Measurements a robust loss",
     "leave the mode out": "leave the mode out of mode_sequence",
@@ -702,7 +692,6 @@ _STEPS = {
     "fix alone": "fix {names}, or measure something else",
     "more data": "add data",
     "smaller rtol": "give the Problem a smaller rtol",
-    "raise max_iterations": "raise max_iterations",
     "continue": "continue with start=estimate.theta",
     "start elsewhere": "start elsewhere, or check the model there",
     "start nearer": "start nearer to a point that meets it",
@@ -722,11 +711,11 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "names": _join,
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
     "held mode": lambda issue: capitalise(_name_mode(*issue.subjects[:2], position=get_figure(issue, "position"))),
-    "correlated": _list_correlated,
-    "non-normal": _list_non_normal,
+    "correlated": lambda issue: list_each(issue, "{} ({:.2f})", "correlation"),
+    "non-normal": lambda issue: list_each(issue, _NOT_NORMAL, "kurtosis", "outliers"),
     "wrong entries": _list_wrong,
     "jump": _write_jump,
-    "places": _write_at,
+    "places": lambda issue: list_each(issue, "{} = {:.8g}", "at"),
     "kind": lambda issue: issue.kind,
     "orders": lambda issue: ", ".join(f"{order:.2f}" for order in list_figures(issue, "orders")),
     "undefined": lambda issue: capitalise(write_undefined(issue)),
@@ -740,7 +729,7 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "least": _name_least,
     "per cent": lambda issue: 100 * get_figure(issue, "share"),
     "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
-    "where it failed": lambda issue: write_places(issue.subjects[2:], list_figures(issue, "at"), digits=6),
+    "where it failed": lambda issue: list_each(issue, "{} = {:.6g}", "at", first=2),
     "statuses": lambda issue: ", ".join(issue.subjects[:LISTED_NAMES]),
 }
 """What a field of a sentence stands for that is neither a subject nor a figure."""

@@ -49,7 +49,14 @@ def make_figure(width: float, height: float) -> NotebookFigure:
     return NotebookFigure(figsize=(width, height), layout="constrained")
 
 
-def draw_on(ax: Axes | None, draw: Callable[[Axes], None], size: tuple[float, float] = (6.4, 4.2)) -> Axes | Figure:
+def draw_on(
+    ax: Axes | None,
+    draw: Callable[[Axes], None],
+    size: tuple[float, float] = (6.4, 4.2),
+    *,
+    legend: float = 0.0,
+    title: str = "",
+) -> Axes | Figure:
     """Draw in the given axes and return them, or in a new figure and return that.
 
     Parameters
@@ -59,6 +66,10 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], None], size: tuple[float, fl
         ``draw(ax)`` draws one axes.
     size : (width, height)
         Of the new figure in inches.
+    legend : float, optional
+        Height of the lower edge of a legend, in heights of the axes; names of modes reach to 1.08. 0 draws none.
+    title : str, optional
+        Of the legend.
 
     Raises
     ------
@@ -67,14 +78,14 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], None], size: tuple[float, fl
     """
     from matplotlib.axes import Axes
 
-    if ax is None:
-        figure = make_figure(*size)
-        draw(figure.subplots())
-        return turn_off_formulas(figure)
-    if not isinstance(ax, Axes):
+    figure = make_figure(*size) if ax is None else None
+    panel = ax if figure is None else figure.subplots()
+    if not isinstance(panel, Axes):
         raise TypeError(f"ax must be a matplotlib Axes; got {type(ax).__name__}.")
-    draw(ax)
-    return turn_off_formulas(ax)
+    draw(panel)
+    if legend:
+        draw_legend_above(panel, title=title, height=legend)
+    return turn_off_formulas(figure or panel)
 
 
 def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:
@@ -119,15 +130,14 @@ def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
     return handles
 
 
-def draw_legend_above(ax: Axes, *, title: str | None = None, height: float = 1.0) -> None:
+def draw_legend_above(ax: Axes, *, title: str = "", height: float = 1.0) -> None:
     """Draw the legend of an axes above it, with as many columns as it has room for.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
-    title : str, optional
-    height : float, optional
-        Of its lower edge, in heights of the axes; names of modes reach to 1.08.
+    title, height : optional
+        As of `draw_on`.
     """
     from switchfit.report.axes import fit_legend
 
