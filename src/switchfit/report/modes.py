@@ -241,34 +241,26 @@ def _tabulate_segments(
 
 def list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
-    best, errors, lines = search.chosen[0], _list_time_errors(search), []
+    best, fit, lines = search.chosen[0], search.best, []
+    errors = np.append([] if fit is None else correct_errors(fit), np.nan)  # the last: not estimated
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
-        run = formats.Clock(None if search.best is None else search.best.trajectories[e].origin, search.time_units[e])
+        places = np.full(len(times), -1) if fit is None else fit.transition_places[e][: len(times)]
+        run = formats.Clock(None if fit is None else fit.trajectories[e].origin, search.time_units[e])
         ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
-        if len(best.sequences) > 1:
-            lines.append(f"{search.run_names[e]}:")
-        lines += format_table(*_tabulate_segments(sequence, times, errors[e], ends, run))
+        lines += [f"{search.run_names[e]}:"] if len(best.sequences) > 1 else []
+        lines += format_table(*_tabulate_segments(sequence, times, errors[places], ends, run))
     return lines
-
-
-def _list_time_errors(search: ModeSearch) -> list[FloatArray]:
-    known = search.chosen[0].transition_times
-    if search.best is None:
-        return [np.full(len(times), np.nan) for times in known]
-    errors = np.append(correct_errors(search.best), np.nan)  # the last: not estimated
-    return [errors[own[: len(times)]] for times, own in zip(known, search.best.transition_places, strict=True)]
 
 
 def list_parameters(search: ModeSearch) -> list[str]:
     """Return a line for each estimated parameter and initial state of the best."""
-    best = search.chosen[0]
-    rows = []
+    best, fit, rows = search.chosen[0], search.best, []
     for name, value, acts in zip(search.parameter_names, best.parameters, best.acting, strict=True):
         if not acts:
             rows.append([name, f"{value:.6g}", "a guess: acts in none of the modes"])
-        elif search.best is not None and name in search.best.theta_names:
-            k = search.best.theta_names.index(name)
-            number, error, relative = formats.format_rounded(search.best.theta[k], correct_errors(search.best)[k])
+        elif fit is not None and name in fit.theta_names:
+            k = fit.theta_names.index(name)
+            number, error, relative = formats.format_rounded(fit.theta[k], correct_errors(fit)[k])
             rows.append([name, number, f"{error} {relative}".strip()])
     return format_table(rows, "<><")
 

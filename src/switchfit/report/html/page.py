@@ -42,7 +42,7 @@ from switchfit.report.sentences import format_share, join_words, list_reasons, w
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.prediction import predict
-from switchfit.uncertainty.residuals import correct_errors, explain_worst, find_transition_intervals, rank_runs
+from switchfit.uncertainty.residuals import explain_worst, find_transition_intervals, rank_runs
 from switchfit.uncertainty.verdict import find_issues
 
 FIT, DATA = "#d0392b", "#5b6470"
@@ -193,28 +193,6 @@ def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], ND
     return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
 
 
-def list_transitions(fit: Fit, e: int) -> Columns:
-    """Return the transitions of one run: x, ends of the interval, and both as the table has them.
-
-    Parameters
-    ----------
-    fit : Fit
-    e : int, from 0
-    """
-    errors, run, intervals = correct_errors(fit), fit.trajectories[e], find_transition_intervals(fit, e)
-    own = [t for t in fit.transitions if t.experiment == e]
-    values, shown = [], []
-    for t, ends in zip(own, intervals, strict=True):
-        value, error = formats.format_estimate(t.time, np.nan if t.index is None else errors[t.index], run)
-        unit = format_unit(t.unit) if run.origin is None or error else ""
-        values.append(" ".join(filter(None, (value, error, unit))))
-        low, high = (text.format_end(end, ends, run) for end in ends)
-        shown.append(f"{low} to {high}" if low and high else "not known")
-    columns = {"x": np.array([t.time for t in own], dtype=float), "low": intervals[:, 0], "high": intervals[:, 1]}
-    columns |= {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
-    return columns | {"value": values, "interval": shown}
-
-
 # --- figures ----------------------------------------------------------------------------------------------------------
 
 
@@ -281,10 +259,7 @@ def _make_time_figure(
     plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
     own = sources["transitions"]
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
-    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
-    if height > RESIDUAL_HEIGHT:
-        tips = [("transition", "@name"), ("modes", "@modes"), ("time", "@value"), ("95 %", "@interval")]
-        _add_hover(plot, line, tips)
+    _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
     return plot
 
 
@@ -301,20 +276,18 @@ def _tag(renderer: Any, tag: str) -> Any:
     return renderer
 
 
-def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
-    """Show (label, column) under the pointer, and the time of a run before them.
+def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed) -> None:
+    """Show the time of a run and (label, column) under the pointer.
 
     Bokeh escapes what is in columns, but neither labels nor units.
     """
     formatters: dict[str, Any] = {text.partition("{")[0]: "printf" for _, text in tips if "%" in text}
-    if run is not None:
-        clock, unit = formats.describe_clock(run), run.time_unit
-        plain = unit if unit.isalnum() and unit != "1" else ""
-        tips = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
-        code = "return switchfitDates.show(value, 0.001, start, length, zone)"
-        formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
-    tool = models.HoverTool(renderers=[renderer], tooltips=list(tips), formatters=formatters, visible=False)
-    plot.add_tools(tool)
+    clock, unit = formats.describe_clock(run), run.time_unit
+    plain = unit if unit.isalnum() and unit != "1" else ""
+    shown = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
+    code = "return switchfitDates.show(value, 0.001, start, length, zone)"
+    formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
+    plot.add_tools(models.HoverTool(renderers=[renderer], tooltips=shown, formatters=formatters, visible=False))
 
 
 def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
@@ -433,7 +406,9 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         run, own = estimate.trajectories[e], curves[e]
         modes, left, right = zip(*run.mode_spans, strict=True)
         spans = {"left": np.array(left), "right": np.array(right), "colour": [colours[mode] for mode in modes]}
-        sources = {"modes": spans, "transitions": list_transitions(estimate, e)}
+        low, high = find_transition_intervals(estimate, e).T
+        transitions = {"x": np.array([begin for _, begin, _ in run.mode_spans[1:]]), "low": low, "high": high}
+        sources = {"modes": spans, "transitions": transitions}
         for c, part in enumerate(own):
             sources |= {f"curve-{c}": part.curve} | ({f"samples-{c}": part.samples} if part.samples else {})
         # What two runs have to share to be shown by the same drawing, which takes Bokeh a tenth of a second, while its
