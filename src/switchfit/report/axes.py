@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import io
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ LETTER, HANDLE = 0.55, 4.8
 
 
 def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | float) -> dict[str, Any]:
-    """Return settings of a legend with as many columns as a width has room for.
+    """Return settings of a legend with as many columns, all as wide as the widest, as a width has room for.
 
     Parameters
     ----------
@@ -39,18 +38,8 @@ def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | floa
     """
     # In points, so that it stays the same where the size is changed outside of a context with other fonts.
     size = FontProperties(size=fontsize).get_size_in_points()
-    columns = min(most, max(len(labels), 1))
-    while columns > 1 and _measure_legend(labels, columns) > 72 * inches / size:
-        columns -= 1
-    return {"fontsize": size, "ncols": columns, "frameon": False}
-
-
-def _measure_legend(labels: list[str], columns: int) -> float:
-    """Return the width of a legend in sizes of its font; matplotlib fills it column by column."""
-    rows, longer = divmod(len(labels), columns)
-    ends = [k * rows + min(k, longer) for k in range(columns + 1)]
-    parts = [labels[begin:end] for begin, end in pairwise(ends)]
-    return sum(HANDLE + LETTER * max(map(len, part), default=0) for part in parts)
+    widest = size * (HANDLE + LETTER * max(map(len, labels), default=0))
+    return {"fontsize": size, "ncols": int(np.clip(72 * inches / widest, 1, most)), "frameon": False}
 
 
 class NotebookFigure(Figure):
@@ -64,7 +53,9 @@ class NotebookFigure(Figure):
         self.savefig(picture, format="png", dpi=DOTS)
         return picture.getvalue()
 
-    def draw_legend(self, handles: Mapping[str, Any], *, most: int = 4, **settings: Any) -> Legend:
+    def draw_legend(
+        self, handles: Mapping[str, Any], *, most: int = 4, fontsize: str | float | None = None, **settings: Any
+    ) -> None:
         """Draw the legend of all axes, with as many columns as the width has room for, also after it changes.
 
         Parameters
@@ -72,22 +63,20 @@ class NotebookFigure(Figure):
         handles : mapping of label to handle
         most : int, optional
             Largest number of columns.
+        fontsize : str or float, optional
         settings
             Others of ``Figure.legend``.
         """
-        fontsize = settings.pop("fontsize", rcParams["legend.fontsize"])
-        look = fit_legend(list(handles), self.get_figwidth(), most, fontsize)
+        look = fit_legend(list(handles), self.get_figwidth(), most, fontsize or rcParams["legend.fontsize"])
         self.legend_settings = {"handles": handles, "most": most, "fontsize": look["fontsize"], **settings}
         self.legend_drawn = self.legend(list(handles.values()), list(handles), **look, **settings)
-        return self.legend_drawn
 
     def set_size_inches(self, w: Any, h: float | None = None, forward: bool = True) -> None:
         """Set the size in inches, and draw the legend in the columns that it has room for."""
         super().set_size_inches(w, h, forward)
-        before = self.legend_drawn
-        if before is not None and before in self.legends:
-            before.remove()
-            self.draw_legend(**self.legend_settings).get_title().set_color(before.get_title().get_color())
+        if self.legend_drawn is not None and self.legend_drawn in self.legends:
+            self.legend_drawn.remove()
+            self.draw_legend(**self.legend_settings)
 
 
 FEWEST_TICKS, MOST_TICKS = 5, 8

@@ -320,11 +320,15 @@ def plot_search(search: ModeSearch) -> Figure:
     figure = style.make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
     axes = figure.subplots(1 + 2 * len(runs), 1, squeeze=False, height_ratios=[1.0, *([1.2, 0.6] * len(runs))])[:, 0]
     plot_numbers(search, axes[0])
-    for place, e in enumerate(runs):
-        _plot_best(search, e, axes[1 + 2 * place])
+    colours = style.assign_colours(search.modes, MODE_COLOURS)
+    for e, above, below in zip(runs, axes[1::2], axes[2::2], strict=True):
+        best: Any = search.best
+        plot.plot_comparison(*plot.list_outputs(best, e)[0], above)
+        plot.plot_modes(best.trajectories[e], above, colours=colours)
+        above.set_title(search.run_names[e] if len(search.run_names) > 1 else "", loc="left", fontsize=SMALL)
         t = np.linspace(search.starts[e], search.ends[e], POINTS)
-        stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), axes[2 + 2 * place])
-        style.label_axis(axes[2 + 2 * place], search.best.trajectories[e])
+        stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), below)
+        style.label_axis(below, best.trajectories[e])
     return style.turn_off_formulas(figure)
 
 
@@ -352,19 +356,6 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> None:
     ax.locator_params(axis="x", integer=True)
     if ax.lines:
         ax.legend(fontsize=SMALL)
-
-
-def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
-    """Draw the first channel of an experiment, or its first state where there is no data, with the modes shaded."""
-    best: Any = search.best
-    trajectory = best.trajectories[e]
-    if best.comparisons[e]:
-        plot.plot_comparison(best.comparisons[e][0], 0, ax)
-    else:
-        plot.plot_state(trajectory, 0, ax)
-    plot.plot_modes(trajectory, ax, colours=style.assign_colours(search.modes, MODE_COLOURS))
-    if len(search.run_names) > 1:
-        ax.set_title(search.run_names[e], loc="left", fontsize=SMALL)
 
 
 def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatArray, ax: Axes) -> None:

@@ -86,9 +86,7 @@ def plot_fit(fit: Fit, *, bands: bool = True, level: float = 0.95) -> Figure:
     drawn = {e: predict(fit, experiment=e) for e in runs} if wanted and has_bands(fit) else {}
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     notes += filter(None, [count_worst(runs, fit.trajectories, "experiments")])
-    figure = plot_runs(fit, intervals, drawn, level=level, notes=notes)
-    figure.legends[0].get_title().set_color("black" if fit.status.successful else FIT)
-    return figure
+    return plot_runs(fit, intervals, drawn, level=level, notes=notes)
 
 
 def plot_runs(
@@ -121,8 +119,7 @@ def plot_runs(
     runs = list(intervals)
     columns = min(max(len(runs), 1), COLUMNS)
     blocks = [runs[first : first + columns] for first in range(0, len(runs), columns)]
-    states = {e: 0 if result.comparisons[e] else len(result.trajectories[e].state_names) for e in runs}
-    panels = [max(states[e] or len(list_outputs(result, e)) for e in block) for block in blocks]
+    panels = [max(len(list_outputs(result, e)) for e in block) for block in blocks]
     heights = [0.6 + 2.5 * number for number in panels]
     figure = style.make_figure(WIDTHS[columns] * columns, 0.7 + sum(heights))
     grid = figure.add_gridspec(len(blocks), columns, height_ratios=heights)
@@ -130,11 +127,7 @@ def plot_runs(
     for place, e in enumerate(runs):
         trajectory = result.trajectories[e]
         block = figure.add_subfigure(grid[divmod(place, columns)])
-        axes = _add_axes(block, panels[place // columns], states[e] or 2 * len(list_outputs(result, e)), states[e] > 0)
-        if states[e]:
-            _draw_states(trajectory, predictions.get(e), level, axes)
-        else:
-            _draw_channels(result, e, predictions.get(e), level, label, axes)
+        axes = _draw_outputs(result, e, block, panels[place // columns], predictions.get(e), level, label)
         for ax in axes:  # labels of transitions in one of them, so that they come last in the legend
             plot_modes(trajectory, ax, colours=colours, labels=ax is axes[0])
             times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
@@ -156,35 +149,23 @@ def plot_runs(
     return style.turn_off_formulas(figure)
 
 
-def _add_axes(block: Any, panels: int, count: int, are_states: bool) -> list[Axes]:
-    """Return the axes of one experiment below one another, leaving room at the bottom for panels of others only."""
-    ratios = [1.0] * panels if are_states else [3.0, 1.2] * panels
+def _draw_outputs(
+    result: Fit | Validation, e: int, block: Any, rows: int, prediction: Prediction | None, level: float, label: str
+) -> list[Axes]:
+    """Draw each channel of an experiment with its residuals below, leaving rows free at the bottom for others only."""
+    outputs, step = list_outputs(result, e), 2 if result.comparisons[e] else 1
+    ratios = ([3.0, 1.2] if step == 2 else [1.0]) * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
     axes: list[Axes] = [block.add_subplot(grid[0])]
-    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1:count]]
+    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1 : step * len(outputs)]]
+    for k, (comparison, channel) in enumerate(outputs):
+        plot_comparison(comparison, channel, axes[step * k], label=label)
+        if step == 2:
+            plot_residuals(comparison, channel, axes[2 * k + 1])
+        for ax in axes[step * k : step * (k + 1)] if prediction is not None else ():
+            plot_bands(prediction, k, level, ax, about_zero=ax is not axes[step * k])
     block.align_ylabels(axes)
     return axes
-
-
-def _draw_channels(
-    result: Fit | Validation, e: int, prediction: Prediction | None, level: float, label: str, axes: Sequence[Axes]
-) -> None:
-    """Draw each channel of an experiment with its residuals below."""
-    for k, (comparison, channel) in enumerate(list_outputs(result, e)):
-        plot_comparison(comparison, channel, axes[2 * k], label=label)
-        plot_residuals(comparison, channel, axes[2 * k + 1])
-        if prediction is not None:
-            plot_bands(prediction, k, level, axes[2 * k])
-            plot_bands(prediction, k, level, axes[2 * k + 1], about_zero=True)
-
-
-def _draw_states(trajectory: Trajectory, prediction: Prediction | None, level: float, axes: Sequence[Axes]) -> None:
-    """Draw each state of an experiment without data."""
-    for state, ax in enumerate(axes):
-        plot_state(trajectory, state, ax)
-        if prediction is not None:
-            label = _label_band("confidence", level, prediction)
-            plot_band(prediction.times, prediction.state_band(level)[:, state], ax, alpha=0.3, label=label)
 
 
 def plot_comparison(comparison: Comparison, channel: int, ax: Axes, *, label: str = "fitted") -> None:
@@ -231,21 +212,6 @@ def plot_residuals(comparison: Comparison, channel: int, ax: Axes) -> None:
     unit = format_unit(comparison.units[channel])
     ax.set_ylabel(f"residual\n({unit})" if unit else "residual")
     ax.margins(y=0.12)
-
-
-def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> None:
-    """Draw one state over time.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-    state : int
-        Which state, from 0.
-    ax : matplotlib.axes.Axes
-    """
-    times, curve = break_at_transitions(trajectory.times, replace_infinities(trajectory.states[:, state]))
-    ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
-    ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
 
 
 def plot_modes(
@@ -373,21 +339,24 @@ def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = Fal
 
 
 def list_outputs(result: Fit | Validation, e: int) -> list[tuple[Comparison, int]]:
-    """Return the outputs of an experiment, each as one of its data and the channel of that.
+    """Return the outputs of an experiment, each as one of its data and the channel of that; its states without data.
 
     Parameters
     ----------
     result : Fit or Validation
     e : int, from 0
     """
-    return [(comparison, k) for comparison in result.comparisons[e] for k in range(len(comparison.names))]
+    own, none = result.trajectories[e], result.trajectories[e].states[:0]
+    units = own.state_units
+    states = Comparison("states", own.state_names, own.times[:0], none, none, None, own.times, own.states, units=units)
+    return [(data, k) for data in result.comparisons[e] or (states,) for k in range(len(data.names))]
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
 def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_zero: bool = False) -> None:
-    """Draw both bands of one output: of a new sample, and of the curve.
+    """Draw both bands of one output, of a new sample and of the curve; without data, that of a state.
 
     Parameters
     ----------
@@ -400,20 +369,21 @@ def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_
         Draw them about the zero of the residuals, since about the curve they are often too narrow to be seen.
     """
     order, limits = np.argsort(prediction.times, kind="stable"), ax.get_ylim()
-    bands = ("prediction", prediction.prediction_band(level), 0.12), ("confidence", prediction.output_band(level), 0.3)
+    bands = [
+        ("prediction", prediction.prediction_band(level), 0.12),
+        ("confidence", prediction.output_band(level), 0.3),
+    ]
+    if not prediction.output_names:
+        bands = [("confidence", prediction.state_band(level), 0.3)]
     for kind, ends, alpha in bands:
         band = (ends[:, k] - (prediction.outputs[:, [k]] if about_zero else 0.0))[order]
-        plot_band(prediction.times[order], band, ax, alpha=alpha, label=_label_band(kind, level, prediction))
+        widened = ", widened" if prediction.corrected and kind == "confidence" else ""
+        plot_band(prediction.times[order], band, ax, alpha=alpha, label=f"{100 * level:g} % {kind}{widened}")
         if about_zero and np.isfinite(band).any():
             reach = 1.1 * np.nanmax(np.abs(band))
             limits = min(limits[0], -reach), max(limits[1], reach)
     if about_zero:
         ax.set_ylim(limits)
-
-
-def _label_band(kind: str, level: float, prediction: Prediction) -> str:
-    """Return the entry of a band in a legend, as short as the longest of the others."""
-    return f"{100 * level:g} % {kind}" + (", widened" if prediction.corrected and kind == "confidence" else "")
 
 
 def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> None:
@@ -446,7 +416,7 @@ def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes
     """
     if comparison.kind == "measurements":
         ax.plot(x, y, label="measured", zorder=3, **draw_dots(len(x)))
-    else:
+    elif comparison.kind == "reference":
         ax.plot(x, y, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
 
 

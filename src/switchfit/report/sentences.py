@@ -100,18 +100,14 @@ def capitalise(text: str) -> str:
 # --- constraints, kinks -----------------------------------------------------------------------------------------------
 
 
-def _name_mode(mode: str = "", run: str = "", *, position: float = np.nan) -> str:
-    number = f"{position + 1:.0f} ({mode!r})" if np.isfinite(position) else repr(mode)
-    return f"mode {number}{f' of {run}' if run else ''}"
-
-
 @format_text.register(Constraint)
 def write_constraint(constraint: Constraint) -> str:
     """Return which constraint is active."""
     if constraint.position is None:
         return f"{constraint.unknown} at its {constraint.kind} {constraint.value:g}"
     state = "has collapsed to nothing" if constraint.kind == "collapsed" else "is at its minimum duration"
-    return f"{_name_mode(constraint.mode, constraint.run, position=constraint.position)} {state}"
+    run = f" of {constraint.run}" if constraint.run else ""
+    return f"mode {constraint.position + 1} ({constraint.mode!r}){run} {state}"
 
 
 @format_text.register(Kink)
@@ -253,6 +249,8 @@ def write_issue(issue: Issue) -> str:
     """Return an issue as a sentence or two."""
     if issue.kind in _ISSUES:
         return write_sentence(_ISSUES[issue.kind], issue)
+    if issue.kind in _REASONS:
+        return f"{capitalise(write_sentence(_REASONS[issue.kind], issue))}."
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
@@ -324,34 +322,17 @@ _DELAYED = (
 )
 """Behind why a line search failed if a delay is estimated."""
 
-_BOUND = (
-    "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known. Move the "
-    "bound if it is not a physical one."
-)
+_BOUND = "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known."
 _ISSUES: dict[str, Sentence] = {
     "trade off": _write_combination,
     **_LOG_ISSUES,
     # Before the numbers are believed
-    "a mode collapsed": "{held mode} has collapsed to nothing: the data want no such mode there. Leave it out of "
-    "mode_sequence, start from another guess, or give min_duration.",
-    "a mode is short": "{held mode} is at its minimum duration: the data would have it shorter. Lower min_duration, "
-    "or leave the mode out.",
     "lower bound": _BOUND,
     "upper bound": _BOUND,
     "idle times": "Where the collapsed mode would stand does not matter, since the same mode is active before and "
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "at kinks": "{first names}: at a kink of the cost, as where a transition meets a sample. There it has no standard "
-    "error, and those of the others take it as known; its profile gives an interval.",
-    "not read": "No function of the model reads {names}: the data say nothing about it, and its value above is the "
-    "first guess. Remove it from parameters, or use it in the model, whose functions may spell its name otherwise.",
-    "acts elsewhere": "{names}: read only by modes, or at transitions, that do not occur in mode_sequence. The data "
-    "say nothing about it, and its value above is the first guess. Fix it, or fit a log in which it acts too.",
-    "without effect": "The cost does not depend on {names}, to second order: the data say nothing about it, and its "
-    "value above is the first guess. Fix it, or let it act on what is measured.",
-    "not determined": "The data hardly determine {first names} (smallest eigenvalue {eigenvalue:.2g} of the "
-    "Hessian scaled to unit curvature). Fix one of the unknowns, or add data that tell them apart.",
     "no errors: not finite": "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "
     "Measurements alone, with sigma or without.",
@@ -710,7 +691,6 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     **{name: partial(_add_unit, name=name) for name in ("time", "step", "typical")},
     "names": _join,
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
-    "held mode": lambda issue: capitalise(_name_mode(*issue.subjects[:2], position=get_figure(issue, "position"))),
     "correlated": lambda issue: list_each(issue, "{} ({:.2f})", "correlation"),
     "non-normal": lambda issue: list_each(issue, _NOT_NORMAL, "kurtosis", "outliers"),
     "wrong entries": _list_wrong,
@@ -722,7 +702,7 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "definition": lambda issue: capitalise(suggest_definition(issue.subjects[1])),
     "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
     "first names": lambda issue: _name(issue.subjects),
-    "mode": lambda issue: _name_mode(*issue.subjects[:2]),
+    "mode": lambda issue: " of ".join((f"mode {issue.subjects[0]!r}", *filter(None, issue.subjects[1:2]))),
     "explanation of the worst": _explain_worst,
     "agreement": _count_starts,
     "fits": _count_fits,

@@ -57,7 +57,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
         The failures of its certificate count in the verdict if it is known.
     full : bool
         All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
-        screen, without the warnings that the verdict covers.
+        screen.
     files : mapping of str to str, optional
         Names of the files with all "runs" and all "unknowns", for the lines that count what was left out.
 
@@ -79,7 +79,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
         "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
         f"Correlations above {SMALL_CORRELATION:g}": correlations,
         "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
-        "Warnings": _format_warnings(estimate, limits["others"], full=full),
+        "Warnings": _list_sentences(list_warnings(estimate), limits["others"], "warning"),
     }
     written = [[title, *lines] for title, lines in sections.items() if lines]
     shown = formats.join_sections(wrap_text(str(estimate.verdict)), *written)
@@ -398,12 +398,16 @@ _COVERED = {
 """Other kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
 
 
-def _format_warnings(estimate: Estimate, most: int, *, full: bool) -> list[str]:
-    """Return the warnings as lines; on one screen without those that the verdict covers."""
-    reasons = set() if full else {reason.kind for reason in estimate.verdict.reasons}
+def list_warnings(estimate: Estimate) -> list[str]:
+    """Return the warnings that the verdict does not cover, as sentences.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    reasons = {reason.kind for reason in estimate.verdict.reasons}
     covered = reasons.union(*(_COVERED.get(kind, set()) for kind in reasons))
-    issues = [formats.add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
-    return _list_sentences(issues, most, "warning")
+    return [formats.add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------

@@ -75,7 +75,8 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     comparison, k = plot.list_outputs(fit, e)[number]
     trajectory = fit.trajectories[e]
     order, end = np.argsort(prediction.times, kind="stable"), trajectory.mode_spans[-1][2]
-    times, y = prediction.times[order], prediction.outputs[order, number]
+    times = prediction.times[order]
+    y = (prediction.outputs if prediction.output_names else prediction.states)[order, number]
     plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
     plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
@@ -101,20 +102,15 @@ def write_validation(found: Validation) -> str:
     ----------
     found : Validation
     """
-    sections = [wrap_text(str(found.verdict))]
-    errors, names = found.corrected_standard_errors, found.theta_names
-    rows = {}
+    errors, names, rows = found.corrected_standard_errors, found.theta_names, []
+    refit = () if found.refit is None else found.refit.theta_names
     known = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
     for (name, value, error, unit), run in zip(known, formats.list_dated(found.problem), strict=True):
         shown, spread = formats.format_estimate(float(value), float(error), run)
-        rows[name] = [name, shown, spread if spread != "held" else "", unit]
-    refit = () if found.refit is None else found.refit.theta_names
-    estimated = [name for name in names if name in refit and name not in found.kept]
-    given = [name for name in names if name not in (*found.kept, *estimated)]
-    titles = {"Kept from the fit": found.kept, "Estimated from this run": estimated, "As given": given}
-    sections += [
-        [title, *format_table([rows[name] for name in listed], "<>><")] for title, listed in titles.items() if listed
-    ]
+        origin = "estimated from this run" if name in refit else "as given"
+        origin = "kept from the fit" if name in found.kept else origin
+        rows.append([name, shown, spread if spread != "held" else "", unit, origin])
+    sections = [wrap_text(str(found.verdict)), format_table(rows, "<>><<")]
     if not np.array_equal(errors, found.standard_errors, equal_nan=True):
         sections.append([ALLOWED])
     sections.append(["Channels", *format_table(*tabulate_predicted(found))])

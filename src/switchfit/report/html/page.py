@@ -43,7 +43,6 @@ from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate,
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.prediction import predict
 from switchfit.uncertainty.residuals import explain_worst, find_transition_intervals, rank_runs
-from switchfit.uncertainty.verdict import find_issues
 
 FIT, DATA = "#d0392b", "#5b6470"
 """Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
@@ -355,8 +354,8 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    functions: list[Any] = [formats.add_dates, formats.format_span, certify, find_issues, join_words, list_reasons]
-    functions += [unit_suffix, tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
+    functions: list[Any] = [formats.format_span, certify, join_words, list_reasons, unit_suffix]
+    functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
     environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
     drawings: dict[str, str] = {}
