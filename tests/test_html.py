@@ -5,10 +5,10 @@ import gzip
 import hashlib
 import html.parser
 import importlib.metadata
-import importlib.util
 import io
 import json
 import re
+import sys
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -226,7 +226,9 @@ def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
     assert (*array_of(sources, "transitions", "low"), *array_of(sources, "transitions", "high")) == (low, high)
     bands = [array_of(sources, "curve-0", name)[there] for name in ("lo0", "hi0")]
     band = sf.predict(toss).output_band()[:, 0]
-    np.testing.assert_allclose(bands, [np.interp(times[there], toss.trajectory.times, edge) for edge in band.T], rtol=1e-5)
+    np.testing.assert_allclose(
+        bands, [np.interp(times[there], toss.trajectory.times, edge) for edge in band.T], rtol=1e-5
+    )
     first, last = toss.trajectory.times[[0, -1]]
     margins = first - run["ranges"]["times"]["start"], run["ranges"]["times"]["end"] - last
     assert margins[0] == pytest.approx(margins[1])
@@ -342,8 +344,8 @@ def test_many_runs_stay_small_and_the_worst_come_first():
 
 
 def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
-    real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "bokeh" else real(name, *more))
+    monkeypatch.delitem(sys.modules, "switchfit.report.html.page")
+    monkeypatch.setitem(sys.modules, "bokeh", None)
     with pytest.raises(ImportError, match=r"needs bokeh, not installed here: pip install 'switchfit\[report\]'"):
         heater.save_report(tmp_path / "report.html")
     done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])

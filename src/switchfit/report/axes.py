@@ -79,11 +79,8 @@ class NotebookFigure(Figure):
             self.draw_legend(**self.legend_settings)
 
 
-FEWEST_TICKS, MOST_TICKS = 5, 8
-"""Between which numbers of ticks the largest is chosen: with less than 5, matplotlib finds no interval for some
-spans."""
-ROOM = 0.7
-"""How many inches each tick needs."""
+MOST_TICKS = 6
+"""There is room for as many in a narrow figure; with less than 5, matplotlib finds no interval for some spans."""
 FORMATS = ["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%S.%f"]
 ZERO_FORMATS = ["", "%Y", "%d %b", "%d %b", "%H:%M", "%H:%M"]
 OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
@@ -115,10 +112,7 @@ class DateLocator(Locator):
 
     def __call__(self) -> Sequence[float]:
         """Return the ticks of what the axis shows."""
-        axes: Any = self.axis.axes  # type: ignore[union-attr]  # it is set by then
-        most = int(np.clip(axes.bbox.width / axes.figure.dpi / ROOM, FEWEST_TICKS, MOST_TICKS))
-        self.dates.maxticks = dict.fromkeys(self.dates.maxticks, most)
-        return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]
+        return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]  # it is set by then
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the ticks between two times."""

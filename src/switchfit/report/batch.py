@@ -49,13 +49,8 @@ def write_fits(fits: Fits) -> str:
         *formats.wrap_text(str(fits.verdict)),
         f"{format_count(count, 'fit')} in {fits.seconds:.1f} s {each}, {good} converged",
     ]
-    if count < fits.requested:
-        lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
     endings = Counter(fits.status.tolist()).most_common()
     lines += format_table([(str(number), name) for name, number in endings], "><", indent="    ")
-    if good:
-        spent = fits.iterations[fits.success]
-        lines.append(f"iterations: median {np.median(spent):.0f}, most {spent.max()}")
     if good < count:
         lines.append("not converged (all of them in .failures):")
         lines += [f"  run {run}: {message}" for run, message in fits.failures[:3]]

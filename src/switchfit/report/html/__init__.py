@@ -7,7 +7,6 @@ The file needs no network: Jinja2's templates, figures of Bokeh and Matplotlib. 
 from __future__ import annotations
 
 import base64
-import importlib.util
 import io
 from html import escape
 from typing import Any
@@ -19,13 +18,10 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import Provenance, describe_python_problem
 from switchfit.problem.problem import Problem
 from switchfit.report.formats import describe_origin, format_span, format_table, format_time, format_unit, list_dated
-from switchfit.report.sentences import join_words
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.presentation import Displayed, format_html, format_page
 from switchfit.uncertainty.prediction import Prediction
 
-LIBRARIES = ("bokeh", "jinja2")
-"""What the extra ``report`` installs."""
 DOTS = 64
 """Dots per inch of the figures in a notebook."""
 LARGEST_FIGURE = 4
@@ -49,13 +45,12 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     MissingExtraError
         If Bokeh or Jinja2 are not installed.
     """
-    missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
-    if missing:
+    try:
+        from switchfit.report.html.page import build_page
+    except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"an HTML report needs {join_words(missing)}, not installed here: pip install 'switchfit[report]'"
-        )
-    from switchfit.report.html.page import build_page
-
+            f"an HTML report needs {error.name}, not installed here: pip install 'switchfit[report]'"
+        ) from error
     return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem(estimate))
 
 
