@@ -440,7 +440,8 @@ def write_step(step: Issue) -> str:
     """
     if step.kind == "next: define it there":
         return suggest_definition(step.subjects[1])
-    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, names=_name(step.subjects))
+    kind = step.kind.removeprefix("next: ")
+    text = _STEPS.get(kind, kind).format(*step.subjects, names=_name(step.subjects))
     return text.replace("one of them", "it") if len(step.subjects) == 1 else text
 
 
