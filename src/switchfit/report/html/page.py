@@ -133,7 +133,8 @@ def collect_curves(estimate: Estimate, e: int, points: int) -> list[Curves]:
         curve["mode"] = np.insert(trajectory.modes[kept].astype(object), breaks, "").tolist()
         for k, own in enumerate(values.T):
             curve[f"y{k}"] = replace_infinities(np.insert(own[kept], breaks, np.nan))
-            for name, edge in zip(("lo", "hi"), () if band is None else band[kept, first + k].T, strict=False):
+            for name, side in {"lo": -1.0, "hi": 1.0}.items() if band is not None else ():
+                edge = (own + side * band[:, first + k])[kept]
                 curve[f"{name}{k}"] = replace_infinities(np.insert(edge, breaks, np.nan)).astype("f4")
         return curve
 
@@ -160,12 +161,12 @@ def collect_curves(estimate: Estimate, e: int, points: int) -> list[Curves]:
 
 
 def _stack_bands(estimate: Estimate, e: int) -> FloatArray | None:
-    """Return the bands of all outputs and then all states of a run, (L, Q + n, 2); None where they are not known."""
+    """Return half the widths of the bands of all outputs and then all states of a run at its nodes, (L, Q + n)."""
     if not has_bands(estimate):
         return None
-    prediction = predict(estimate, experiment=e)
-    same = len(prediction.times) == len(estimate.trajectories[e].times)  # at a mode without duration, there may be more
-    return np.hstack([prediction.output_band(), prediction.state_band()]) if same else None
+    prediction, times = predict(estimate, experiment=e), estimate.trajectories[e].times
+    errors = np.hstack([prediction.output_errors, prediction.state_errors])
+    return estimate.quantile(0.95) * np.stack([np.interp(times, prediction.times, own) for own in errors.T], axis=1)
 
 
 def _list_samples(comparison: Comparison, drawn: NDArray[np.intp]) -> Columns:
