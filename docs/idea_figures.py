@@ -61,7 +61,7 @@ def draw_fit(estimate: sf.Estimate, ink: str, paper: str) -> Figure:
     for ax, channel in ((upper, "z"), (lower, "x")):
         plot_modes(trajectory, ax, labels=False)
         plot_transitions(times, intervals, ax)
-        plot_comparison(comparison, trajectory, comparison.names.index(channel), ax)
+        plot_comparison(comparison, comparison.names.index(channel), ax)
         ax.set_ylabel(SHOWN[channel], color=ink)
         ax.tick_params(colors=ink)
         ax.spines[:].set_color(ink)

@@ -19,7 +19,6 @@ from models import RAMP
 import switchfit as sf
 from switchfit.io.command_line import write_unknowns
 from switchfit.models import heater_problem
-from switchfit.report.html.curves import list_transitions
 from switchfit.report.plot import plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.uncertainty.residuals import explain_worst
@@ -158,8 +157,6 @@ def test_figures_shade_the_interval_of_the_table():
     assert "95 % confidence, widened" in [text.get_text() for text in figure.legends[0].get_texts()]
     line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT)
     np.testing.assert_allclose(line.get_xdata(), table)
-    columns = list_transitions(fit, 0)
-    np.testing.assert_allclose([[*columns["low"], *columns["high"]]], [table])
 
 
 def test_of_many_runs_those_explained_worst_come_first():

@@ -155,8 +155,9 @@ def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay
     assert found.freedom == 19
     same = fit.validate(sf.Experiment(sf.Measurements(times, y, sigma=0.2), ("on", "off"), (2.0,), 0.0, 5.0))
     assert same.chi_square == pytest.approx(found.chi_square, rel=1e-6)
-    assert "Kept from the fit" in str(found)
-    assert "Estimated from this run\n  tau_1" in str(found)
+    assert "kept from the fit" in str(found)
+    (line,) = (line for line in str(found).splitlines() if line.startswith("  tau_1"))
+    assert line.endswith("estimated from this run")
     held = fit.validate(sf.Measurements(times, y), refit=())
     assert held.theta[0] == fit.theta[0]
     assert (held.refit, held.freedom, held.verdict.level) == (None, 20, "bad")

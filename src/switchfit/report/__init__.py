@@ -4,15 +4,4 @@ Its modules register how each kind of result is written and drawn (`switchfit.ru
 imported together, when a result is first written or drawn. Imports `online` and the rooms before it.
 """
 
-from switchfit.report import (  # noqa: F401
-    batch,
-    frames,
-    html,
-    modes,
-    notebook,
-    plot,
-    sentences,
-    text,
-    uncertainty,
-    validation,
-)
+from switchfit.report import batch, frames, html, modes, plot, sentences, text, uncertainty, validation  # noqa: F401

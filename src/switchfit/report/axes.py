@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import io
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ LETTER, HANDLE = 0.55, 4.8
 
 
 def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | float) -> dict[str, Any]:
-    """Return settings of a legend with as many columns as a width has room for.
+    """Return settings of a legend with as many columns, all as wide as the widest, as a width has room for.
 
     Parameters
     ----------
@@ -39,18 +38,8 @@ def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | floa
     """
     # In points, so that it stays the same where the size is changed outside of a context with other fonts.
     size = FontProperties(size=fontsize).get_size_in_points()
-    columns = min(most, max(len(labels), 1))
-    while columns > 1 and _measure_legend(labels, columns) > 72 * inches / size:
-        columns -= 1
-    return {"fontsize": size, "ncols": columns, "frameon": False}
-
-
-def _measure_legend(labels: list[str], columns: int) -> float:
-    """Return the width of a legend in sizes of its font; matplotlib fills it column by column."""
-    rows, longer = divmod(len(labels), columns)
-    ends = [k * rows + min(k, longer) for k in range(columns + 1)]
-    parts = [labels[begin:end] for begin, end in pairwise(ends)]
-    return sum(HANDLE + LETTER * max(map(len, part), default=0) for part in parts)
+    widest = size * (HANDLE + LETTER * max(map(len, labels), default=0))
+    return {"fontsize": size, "ncols": int(np.clip(72 * inches / widest, 1, most)), "frameon": False}
 
 
 class NotebookFigure(Figure):
@@ -64,7 +53,9 @@ class NotebookFigure(Figure):
         self.savefig(picture, format="png", dpi=DOTS)
         return picture.getvalue()
 
-    def draw_legend(self, handles: Mapping[str, Any], *, most: int = 4, **settings: Any) -> Legend:
+    def draw_legend(
+        self, handles: Mapping[str, Any], *, most: int = 4, fontsize: str | float | None = None, **settings: Any
+    ) -> None:
         """Draw the legend of all axes, with as many columns as the width has room for, also after it changes.
 
         Parameters
@@ -72,29 +63,24 @@ class NotebookFigure(Figure):
         handles : mapping of label to handle
         most : int, optional
             Largest number of columns.
+        fontsize : str or float, optional
         settings
             Others of ``Figure.legend``.
         """
-        fontsize = settings.pop("fontsize", rcParams["legend.fontsize"])
-        look = fit_legend(list(handles), self.get_figwidth(), most, fontsize)
+        look = fit_legend(list(handles), self.get_figwidth(), most, fontsize or rcParams["legend.fontsize"])
         self.legend_settings = {"handles": handles, "most": most, "fontsize": look["fontsize"], **settings}
         self.legend_drawn = self.legend(list(handles.values()), list(handles), **look, **settings)
-        return self.legend_drawn
 
     def set_size_inches(self, w: Any, h: float | None = None, forward: bool = True) -> None:
         """Set the size in inches, and draw the legend in the columns that it has room for."""
         super().set_size_inches(w, h, forward)
-        before = self.legend_drawn
-        if before is not None and before in self.legends:
-            before.remove()
-            self.draw_legend(**self.legend_settings).get_title().set_color(before.get_title().get_color())
+        if self.legend_drawn is not None and self.legend_drawn in self.legends:
+            self.legend_drawn.remove()
+            self.draw_legend(**self.legend_settings)
 
 
-FEWEST_TICKS, MOST_TICKS = 5, 8
-"""Between which numbers of ticks the largest is chosen: with less than 5, matplotlib finds no interval for some
-spans."""
-ROOM = 0.7
-"""How many inches each tick needs."""
+MOST_TICKS = 6
+"""There is room for as many in a narrow figure; with less than 5, matplotlib finds no interval for some spans."""
 FORMATS = ["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%S.%f"]
 ZERO_FORMATS = ["", "%Y", "%d %b", "%d %b", "%H:%M", "%H:%M"]
 OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
@@ -105,47 +91,34 @@ LONGEST = 1000 * 365.25
 """Days from 1970 that an axis may reach."""
 
 
-class Scale:
-    """Times as the days of matplotlib, and back."""
+class DateLocator(Locator):
+    """Ticks of an axis of times at round dates of a zone.
+
+    Parameters
+    ----------
+    origin : Origin
+    time_unit : str
+    """
 
     def __init__(self, origin: Origin, time_unit: str) -> None:
         self.zone: datetime.tzinfo = origin.zone or datetime.UTC
         self.start = float(date2num(origin.instant))
         self.length = SECONDS[normalize_time_unit(time_unit)] / SECONDS["d"]
+        self.dates = AutoDateLocator(tz=self.zone, minticks=2, maxticks=MOST_TICKS)
 
     def to_days(self, times: Sequence[float]) -> FloatArray:
         """Return times as days since 1970."""
         return self.start + np.asarray(times, dtype=np.float64) * self.length
 
-    def to_times(self, days: Sequence[float]) -> FloatArray:
-        """Return days since 1970 as times."""
-        return (np.asarray(days, dtype=np.float64) - self.start) / self.length
-
-
-class DateLocator(Locator):
-    """Ticks at round dates of a zone.
-
-    Parameters
-    ----------
-    scale : Scale
-    """
-
-    def __init__(self, scale: Scale) -> None:
-        self.scale = scale
-        self.dates = AutoDateLocator(tz=scale.zone, minticks=2, maxticks=MOST_TICKS)
-
     def __call__(self) -> Sequence[float]:
         """Return the ticks of what the axis shows."""
-        axes: Any = self.axis.axes  # type: ignore[union-attr]  # it is set by then
-        most = int(np.clip(axes.bbox.width / axes.figure.dpi / ROOM, FEWEST_TICKS, MOST_TICKS))
-        self.dates.maxticks = dict.fromkeys(self.dates.maxticks, most)
-        return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]
+        return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]  # it is set by then
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the ticks between two times."""
-        days = np.clip(self.scale.to_days([vmin, vmax]), -LONGEST, LONGEST)
-        ends = num2date(np.sort(days), tz=self.scale.zone)
-        return self.scale.to_times(self.dates.tick_values(*ends)).tolist()
+        days = np.clip(self.to_days([vmin, vmax]), -LONGEST, LONGEST)
+        ticks = self.dates.tick_values(*num2date(np.sort(days), tz=self.zone))
+        return ((np.asarray(ticks) - self.start) / self.length).tolist()
 
 
 class DateFormatter(Formatter):
@@ -153,23 +126,22 @@ class DateFormatter(Formatter):
 
     Parameters
     ----------
-    scale : Scale
     locator : DateLocator
     """
 
-    def __init__(self, scale: Scale, locator: DateLocator) -> None:
-        self.scale = scale
+    def __init__(self, locator: DateLocator) -> None:
+        self.locator = locator
         self.dates = ConciseDateFormatter(
-            locator.dates, tz=scale.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
+            locator.dates, tz=locator.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
         )
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         """Return the label of one tick, or of a place under the pointer."""
-        return num2date(float(self.scale.to_days([x])[0]), tz=self.scale.zone).strftime("%Y-%m-%d %H:%M:%S")
+        return num2date(float(self.locator.to_days([x])[0]), tz=self.locator.zone).strftime("%Y-%m-%d %H:%M:%S")
 
     def format_ticks(self, values: Sequence[float]) -> list[str]:
         """Return the labels of all ticks."""
-        return self.dates.format_ticks(self.scale.to_days(values).tolist())
+        return self.dates.format_ticks(self.locator.to_days(values).tolist())
 
     def get_offset(self) -> str:
         """Return what all labels leave out, such as the year."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial, singledispatch
 from typing import Any
 
@@ -13,18 +13,9 @@ from numpy.typing import NDArray
 from switchfit.batch.fits import Fits
 from switchfit.batch.simulated import Bootstrap, MonteCarlo
 from switchfit.batch.starts import Multistart
-from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report import style
-from switchfit.report.formats import (
-    Table,
-    format_estimate,
-    format_table,
-    format_time,
-    label_quantity,
-    list_dated,
-    wrap_text,
-)
+from switchfit.report import formats, style
+from switchfit.report.formats import Table, format_estimate, format_table, format_time, label_quantity, list_dated
 from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, SHADE, SMALL, THIN
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 
@@ -54,16 +45,11 @@ def write_fits(fits: Fits) -> str:
     count, good = len(fits), int(fits.success.sum())
     each = f"({1e3 * fits.seconds / max(count, 1):.2f} ms each)"
     lines = [
-        *wrap_text(str(fits.verdict)),
+        *formats.wrap_text(str(fits.verdict)),
         f"{format_count(count, 'fit')} in {fits.seconds:.1f} s {each}, {good} converged",
     ]
-    if count < fits.requested:
-        lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
     endings = Counter(fits.status.tolist()).most_common()
     lines += format_table([(str(number), name) for name, number in endings], "><", indent="    ")
-    if good:
-        spent = fits.iterations[fits.success]
-        lines.append(f"iterations: median {np.median(spent):.0f}, most {spent.max()}")
     if good < count:
         lines.append("not converged (all of them in .failures):")
         lines += [f"  run {run}: {message}" for run, message in fits.failures[:3]]
@@ -122,12 +108,9 @@ def tabulate_minima(study: Multistart) -> tuple[Table, str]:
 
 
 def select_unknowns(fits: Fits, most: int) -> list[int]:
-    """Return the indices of the unknowns that are listed; of more than `most`, transition times are left out first."""
-    places = list(range(len(fits.theta_names)))
-    if len(places) > most:
-        places.sort(key=lambda i: fits.theta_names[i].rsplit(".", 1)[-1].startswith("tau_"))
-        places = sorted(places[: most - 1])
-    return places
+    """Return the indices of the unknowns that are listed, at most so many."""
+    is_time = [name.rsplit(".", 1)[-1].startswith("tau_") for name in fits.theta_names]
+    return formats.select_unknowns(is_time, most)
 
 
 def _count_rest(fits: Fits, shown: Sequence[int]) -> str:
@@ -181,7 +164,7 @@ def _label(fits: Fits, k: int) -> str:
 
 @draw_figure.register(Fits)
 def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-    """Draw unknowns with their 95 % intervals, a row for each fit, the worst on top.
+    """Draw a panel for each unknown, or for the one that is named: its histogram, or a row for each fit of a log.
 
     Parameters
     ----------
@@ -191,51 +174,30 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
     ax : matplotlib.axes.Axes, optional
         For one unknown.
     """
-    order = fits.worst_first[:DRAWN_FITS]
-    title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
-    each = 2.9, 0.9 + 0.2 * max(len(order), 5)
-    shown = select_unknowns(fits, DRAWN_UNKNOWNS if unknown is None and ax is None else len(fits.theta_names))
-    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, each, DRAWN_UNKNOWNS)
-
-
-def _plot_panels(
-    study: Fits,
-    shown: Sequence[int],
-    draw: Callable[[Any, int, Axes], Axes],
-    title: str | None,
-    unknown: str | None,
-    ax: Axes | None,
-    each: tuple[float, float] = (3.4, 2.7),
-    columns: int = 3,
-) -> Axes | Figure:
-    """Draw a panel for each of the unknowns that are shown, or for the one that is named.
-
-    Parameters
-    ----------
-    study : Fits
-    shown : sequence of int
-    draw : callable ``draw(study, k, ax)``
-    title : str or None
-        Of the legend.
-    unknown : str or None
-    ax : matplotlib.axes.Axes or None
-    each : (width, height)
-        Of each panel of several, in inches.
-    columns : int
-        Largest number of panels side by side.
-    """
-    one = style.choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
-    if isinstance(study, MonteCarlo | Bootstrap) and study.success.sum() < 2:
+    shown, width, height, most, title = list(range(len(fits.theta_names))), 3.4, 2.7, 3, ""
+    if isinstance(fits, Bootstrap):
+        draw: Any = draw_bootstrap
+        shown, title = np.flatnonzero(fits.resampled).tolist(), f"Bootstrap: {fits.resample}"
+    elif isinstance(fits, MonteCarlo):
+        failed = int((~fits.success).sum())
+        draw, title = draw_monte_carlo, f"{failed} runs that did not converge are left out" if failed else ""
+    else:
+        order = fits.worst_first[:DRAWN_FITS]
+        draw, title = partial(draw_rows, order=order), formats.count_worst(order, fits, "fits")
+        width, height, most = 2.9, 0.9 + 0.2 * max(len(order), 5), DRAWN_UNKNOWNS
+        shown = select_unknowns(fits, DRAWN_UNKNOWNS) if unknown is None and ax is None else shown
+    if isinstance(fits, MonteCarlo | Bootstrap) and fits.success.sum() < 2:
         draw = _say_too_few
+    one = style.choose_panel([fits.theta_names[k] for k in shown], unknown, ax, "unknown")
     if one is not None:
-        size = 6.4, max(each[1], 4.2)
-        return style.draw_on(ax, lambda ax: style.draw_legend_above(draw(study, shown[one], ax), title=title), size)
-    columns = max(min(len(shown), columns), 1)
+        size = 6.4, max(height, 4.2)
+        return style.draw_on(ax, partial(draw, fits, shown[one]), size, legend=1.0, title=title)
+    columns = max(min(len(shown), most), 1)
     rows = max(-(-len(shown) // columns), 1)
-    figure = style.make_figure(each[0] * columns + 0.5, each[1] * rows + 0.5)
+    figure = style.make_figure(width * columns + 0.5, height * rows + 0.5)
     axes = [figure.add_subplot(rows, columns, number + 1) for number in range(len(shown))]
     for number, panel in enumerate(axes):
-        draw(study, shown[number], panel)
+        draw(fits, shown[number], panel)
         if number % columns:
             panel.set_ylabel("")
             panel.tick_params(labelleft=False)
@@ -243,7 +205,7 @@ def _plot_panels(
     return style.turn_off_formulas(figure)
 
 
-def draw_fits(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> Axes:
+def draw_rows(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> None:
     """Draw one unknown with its 95 % intervals, a row for each of the given fits, the first on top.
 
     Parameters
@@ -266,26 +228,9 @@ def draw_fits(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> Axes:
     ax.set_ylabel("run")
     ax.set_ylim(max(len(order), 1) - 0.5, -0.5)
     _label_axis(fits, k, ax)
-    return ax
 
 
-@draw_figure.register(Bootstrap)
-def plot_bootstrap(study: Bootstrap, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-    """Draw a histogram for each unknown: estimates of the resampled data, the estimate, its 95 % interval.
-
-    Parameters
-    ----------
-    study : Bootstrap
-    unknown : str, optional
-        The only one that is drawn.
-    ax : matplotlib.axes.Axes, optional
-        For one unknown.
-    """
-    shown = np.flatnonzero(study.resampled).tolist()
-    return _plot_panels(study, shown, draw_bootstrap, f"Bootstrap: {study.resample}", unknown, ax)
-
-
-def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
+def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> None:
     """Draw the histogram of one unknown: estimates of the resampled data, the estimate, its 95 % interval.
 
     Parameters
@@ -299,60 +244,9 @@ def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
     ax.axvline(study.estimate[k], color=FIT, linewidth=LINE, label="estimate")
     for side, edge in enumerate(study.intervals()[k]):
         ax.axvline(edge, color=DATA, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
-    return ax
 
 
-def _say_too_few(study: Fits, k: int, ax: Axes) -> Axes:
-    ax.set_title(TOO_FEW, fontsize=SMALL, wrap=True)
-    ax.set_axis_off()
-    return ax
-
-
-def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> tuple[float, float]:
-    """Draw the histogram of the estimates of unknown k, and return the limits of its axis."""
-    values = study.theta[study.success, k]
-    limits, label = _choose_limits(values, centre), f"{len(values)} estimates"
-    ax.hist(values, bins=40, range=limits, density=density, color=SHADE, alpha=0.7, label=label)
-    ax.set_xlim(limits)
-    ax.set_yticks([])
-    ax.set_ylabel("density" if density else "fits")
-    _label_axis(study, k, ax)
-    return limits
-
-
-def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
-    """Return the limits of a histogram of estimates: all but the farthest hundredth, with a margin."""
-    middle = np.percentile(values, [0.5, 99.5])
-    reach = max(float(np.ptp(middle)), 1e-12 * abs(centre), np.finfo(float).tiny)
-    return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
-
-
-def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
-    """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
-    clock = list_dated(fits)[k]
-    style.label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
-    if clock is None:
-        ax.locator_params(axis="x", nbins=4)
-
-
-@draw_figure.register(MonteCarlo)
-def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-    """Draw a histogram for each unknown: estimates, truth, the normal density of the reported standard error.
-
-    Parameters
-    ----------
-    study : MonteCarlo
-    unknown : str, optional
-        The only one that is drawn.
-    ax : matplotlib.axes.Axes, optional
-        For one unknown.
-    """
-    failed = int((~study.success).sum())
-    title = f"{failed} runs that did not converge are left out" if failed else None
-    return _plot_panels(study, range(len(study.theta_names)), draw_monte_carlo, title, unknown, ax)
-
-
-def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
+def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> None:
     """Draw the histogram of one unknown: estimates, truth, the normal density of the reported standard error.
 
     Parameters
@@ -362,15 +256,40 @@ def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
         Which unknown.
     ax : matplotlib.axes.Axes
     """
-    limits = _draw_histogram(study, k, study.truth[k], ax, density=True)
+    _draw_histogram(study, k, study.truth[k], ax, density=True)
     with np.errstate(invalid="ignore"):
         error = float(np.median(study.standard_errors[study.success, k]))
     if np.isfinite(error) and error > 0:
-        x = np.linspace(*limits, 300)
+        x = np.linspace(*ax.get_xlim(), 300)
         normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)
         ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
     ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
-    return ax
+
+
+def _say_too_few(study: Fits, k: int, ax: Axes) -> None:
+    ax.set_title(TOO_FEW, fontsize=SMALL, wrap=True)
+    ax.set_axis_off()
+
+
+def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> None:
+    """Draw the histogram of the estimates of unknown k: all but the farthest hundredth, with a margin."""
+    values = study.theta[study.success, k]
+    low, high = np.percentile(values, [0.5, 99.5])
+    margin = 0.25 * max(float(high - low), 1e-12 * abs(centre), np.finfo(float).tiny)
+    limits, label = (low - margin, high + margin), f"{len(values)} estimates"
+    ax.hist(values, bins=40, range=limits, density=density, color=SHADE, alpha=0.7, label=label)
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    ax.set_ylabel("density" if density else "fits")
+    _label_axis(study, k, ax)
+
+
+def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
+    """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
+    clock = list_dated(fits)[k]
+    style.label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
+    if clock is None:
+        ax.locator_params(axis="x", nbins=4)
 
 
 @draw_figure.register(Multistart)
@@ -385,7 +304,7 @@ def plot_starts(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
     return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
 
 
-def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
+def _draw_waterfall(study: Multistart, ax: Axes) -> None:
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
     costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
     floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding
@@ -407,4 +326,3 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")
     ax.legend(frameon=False, fontsize=SMALL, loc="upper left")
-    return ax

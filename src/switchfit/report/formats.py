@@ -13,7 +13,7 @@ import datetime
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence, Sized
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -357,3 +357,32 @@ def list_jumps(times: FloatArray, run: Timed) -> str:
     if len(shown) > MOST_JUMPS:
         shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
     return f"{format_count(len(times), 'jump')} at {', '.join(shown)}{suffix_time(run)}" if shown else ""
+
+
+def select_unknowns(is_time: Sequence[bool], most: int, marked: Collection[int] = ()) -> list[int]:
+    """Return the indices of the unknowns that are listed, in their order.
+
+    If there are more than `most`, those that are marked come first. Then come the transition times, which are what is
+    asked for, unless they fill more than half of the table, as those of many runs do; then parameters.
+
+    Parameters
+    ----------
+    is_time : sequence of bool
+        Of each unknown, whether it is a transition time.
+    most : int
+    marked : collection of int, optional
+    """
+    few = 2 * sum(is_time) <= most
+    return sorted(sorted(range(len(is_time)), key=lambda i: (i not in marked, is_time[i] != few))[:most])
+
+
+def count_worst(shown: Sized, every: Sized, what: str) -> str:
+    """Return of how many the worst are shown; "" if all are.
+
+    Parameters
+    ----------
+    shown, every : sized
+    what : str
+        The plural of what they are.
+    """
+    return f"the worst {len(shown)} of {len(every)} {what}" if len(shown) < len(every) else ""

@@ -14,37 +14,16 @@ from switchfit.online.log import OnlineLog
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
-from switchfit.report import style
-from switchfit.report.formats import (
-    Clock,
-    Table,
-    Timed,
-    format_estimate,
-    format_rounded,
-    format_table,
-    format_time,
-    join_sections,
-    label_quantity,
-    label_time,
-    suffix_time,
-    wrap_text,
-)
-from switchfit.report.plot import (
-    choose_mode_colours,
-    plot_band,
-    plot_comparison,
-    plot_modes,
-    plot_state,
-    plot_transitions,
-    replace_infinities,
-)
+from switchfit.report import formats, plot, style
+from switchfit.report.formats import Table, Timed, format_estimate, format_table, format_time, label_time, wrap_text
 from switchfit.report.sentences import ALLOWED, capitalise
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
 
 CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of switches"}
-"""Names of criteria."""
+DISCOUNTED = "mBIC discounted"
+"""Names of criteria; the last is that of one for residuals that are not noise."""
 
 LISTED, LISTED_MINIMA = 6, 3
 """Alternatives in a report of a search; minima of each mode in a table of insertion rates, and in its figure."""
@@ -101,14 +80,17 @@ def _is_exchanged(ending: ModeEnding) -> bool:
     return same_lengths and renamed and abs(ending.difference) < ROUNDING
 
 
-def is_discounted(search: ModeSearch) -> bool:
-    """Return whether residuals that are not noise have discounted the criteria."""
-    return any(warning.kind == "discounted" for warning in search.warnings)
+def list_criteria(search: ModeSearch) -> dict[str, str]:
+    """Return the criteria of a `ModeFit` that are shown, by the names of its attributes, with their titles.
 
-
-def name_decider(search: ModeSearch) -> str:
-    """Return the name of `ModeFit.criterion`, by which the number of switches was chosen."""
-    return "mBIC discounted" if is_discounted(search) else name_criterion(search.criterion)
+    Parameters
+    ----------
+    search : ModeSearch
+    """
+    likely = ("bic", "mbic", "aicc") if search.sigma_known is not None else ()
+    discounted = any(warning.kind == "discounted" for warning in search.warnings)
+    own = {"criterion": DISCOUNTED if discounted else name_criterion(search.criterion)}
+    return (own if discounted or search.criterion not in likely else {}) | {name: CRITERIA[name] for name in likely}
 
 
 _ENDINGS = {
@@ -242,7 +224,7 @@ def write_search(search: ModeSearch) -> str:
     best = list_segments(search), list_parameters(search), [ALLOWED] if corrected else []
     alternatives = list_alternatives(search) if len(search.chosen) > 1 else []
     effort = f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"
-    return join_sections(head, *best, tabulate_numbers(search), alternatives, [effort])
+    return formats.join_sections(head, *best, tabulate_numbers(search), alternatives, [effort])
 
 
 def _tabulate_segments(
@@ -259,61 +241,52 @@ def _tabulate_segments(
 
 def list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
-    best, errors, lines = search.chosen[0], _list_time_errors(search), []
+    best, fit, lines = search.chosen[0], search.best, []
+    errors = np.append([] if fit is None else correct_errors(fit), np.nan)  # the last: not estimated
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
-        run = Clock(None if search.best is None else search.best.trajectories[e].origin, search.time_units[e])
+        places = np.full(len(times), -1) if fit is None else fit.transition_places[e][: len(times)]
+        run = formats.Clock(None if fit is None else fit.trajectories[e].origin, search.time_units[e])
         ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
-        if len(best.sequences) > 1:
-            lines.append(f"{search.run_names[e]}:")
-        lines += format_table(*_tabulate_segments(sequence, times, errors[e], ends, run))
+        lines += [f"{search.run_names[e]}:"] if len(best.sequences) > 1 else []
+        lines += format_table(*_tabulate_segments(sequence, times, errors[places], ends, run))
     return lines
-
-
-def _list_time_errors(search: ModeSearch) -> list[FloatArray]:
-    known = search.chosen[0].transition_times
-    if search.best is None:
-        return [np.full(len(times), np.nan) for times in known]
-    errors = np.append(correct_errors(search.best), np.nan)  # the last: not estimated
-    return [errors[own[: len(times)]] for times, own in zip(known, search.best.transition_places, strict=True)]
 
 
 def list_parameters(search: ModeSearch) -> list[str]:
     """Return a line for each estimated parameter and initial state of the best."""
-    best = search.chosen[0]
-    rows = []
+    best, fit, rows = search.chosen[0], search.best, []
     for name, value, acts in zip(search.parameter_names, best.parameters, best.acting, strict=True):
         if not acts:
             rows.append([name, f"{value:.6g}", "a guess: acts in none of the modes"])
-        elif search.best is not None and name in search.best.theta_names:
-            k = search.best.theta_names.index(name)
-            number, error, relative = format_rounded(search.best.theta[k], correct_errors(search.best)[k])
+        elif fit is not None and name in fit.theta_names:
+            k = fit.theta_names.index(name)
+            number, error, relative = formats.format_rounded(fit.theta[k], correct_errors(fit)[k])
             rows.append([name, number, f"{error} {relative}".strip()])
     return format_table(rows, "<><")
 
 
 def tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
-    likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
-    discounted = is_discounted(search)
-    extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
-    rows = []
+    criteria, rows = list_criteria(search), []
     for fit in search.fitted:
         cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
-        if extra:
-            cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
-        rows.append((fit, [*cells, *(f"{getattr(fit, name):.1f}" for name in likely)]))
-    titles = ["", "switches", "J", *extra, *map(name_criterion, likely)]
+        for name, title in criteria.items():
+            digits = ".8g" if name == "criterion" and title != DISCOUNTED else ".1f"
+            cells.append(f"{getattr(fit, name):{digits}}".replace("nan", ""))
+        rows.append((fit, cells))
+    titles = ["", "switches", "J", *criteria.values()]
     return _format_sequences(search, rows, "<" + ">" * (len(titles) - 1), titles, "sequence")
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
-    name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
+    criteria = list_criteria(search)
+    name = "criterion" if "criterion" in criteria else "aicc" if search.criterion == "aicc" else "mbic"
     lowest = getattr(search.chosen[0], name)
-    titles = ["weight", f"{name_criterion(name) if name == 'mbic' else name_decider(search)} above the best"]
     chosen = search.chosen[:LISTED]
     rows = [(fit, [f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"]) for fit in chosen]
     more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
+    titles = ["weight", f"{criteria[name]} above the best"]
     return [*_format_sequences(search, rows, ">>", titles, "alternatives"), *more]
 
 
@@ -343,17 +316,23 @@ def plot_search(search: ModeSearch) -> Figure:
     ----------
     search : ModeSearch
     """
-    runs = range(min(len(search.run_names), DRAWN_RUNS)) if search.best is not None else range(0)
+    runs = range(min(len(search.run_names), DRAWN_RUNS) if search.best is not None else 0)
     figure = style.make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
     axes = figure.subplots(1 + 2 * len(runs), 1, squeeze=False, height_ratios=[1.0, *([1.2, 0.6] * len(runs))])[:, 0]
     plot_numbers(search, axes[0])
-    for place, e in enumerate(runs):
-        _plot_best(search, e, axes[1 + 2 * place])
-        plot_probabilities(search, e, axes[2 + 2 * place])
+    colours = style.assign_colours(search.modes, MODE_COLOURS)
+    for e, above, below in zip(runs, axes[1::2], axes[2::2], strict=True):
+        best: Any = search.best
+        plot.plot_comparison(*plot.list_outputs(best, e)[0], above)
+        plot.plot_modes(best.trajectories[e], above, colours=colours)
+        above.set_title(search.run_names[e] if len(search.run_names) > 1 else "", loc="left", fontsize=SMALL)
+        t = np.linspace(search.starts[e], search.ends[e], POINTS)
+        stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), below)
+        style.label_axis(below, best.trajectories[e])
     return style.turn_off_formulas(figure)
 
 
-def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
+def plot_numbers(search: ModeSearch, ax: Axes) -> None:
     """Draw the criteria over the number of switches, each less its lowest.
 
     Parameters
@@ -362,14 +341,12 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax : matplotlib.axes.Axes
     """
     numbers = [fit.switches for fit in search.fitted]
-    names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
-    names += ["criterion"] if is_discounted(search) or not names else []
-    for k, name in enumerate(names):
+    colours = style.assign_colours([*CRITERIA, "criterion"], LINE_COLOURS)
+    for name, label in list_criteria(search).items():
         values = np.array([getattr(fit, name) for fit in search.fitted])
         if np.isfinite(values).any():
-            label = name_decider(search) if name == "criterion" else name_criterion(name)
             above = values - np.nanmin(np.where(np.isfinite(values), values, np.nan))
-            ax.plot(numbers, above, "o-", color=LINE_COLOURS[k], linewidth=LINE, markersize=4, label=label)
+            ax.plot(numbers, above, "o-", color=colours[name], linewidth=LINE, markersize=4, label=label)
     if search.chosen:
         ax.axvline(search.chosen[0].switches, color=FIT, linewidth=THIN, zorder=0)
     ax.set_yscale("symlog", linthresh=10.0)
@@ -379,40 +356,9 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax.locator_params(axis="x", integer=True)
     if ax.lines:
         ax.legend(fontsize=SMALL)
-    return ax
 
 
-def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
-    """Draw the first channel of an experiment, or its first state where there is no data, with the modes shaded."""
-    best: Any = search.best
-    trajectory = best.trajectories[e]
-    if best.comparisons[e]:
-        plot_comparison(best.comparisons[e][0], trajectory, 0, ax)
-    else:
-        plot_state(trajectory, 0, ax)
-    plot_modes(trajectory, ax, colours=style.assign_colours(search.modes, MODE_COLOURS))
-    if len(search.run_names) > 1:
-        ax.set_title(search.run_names[e], loc="left", fontsize=SMALL)
-
-
-def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
-    """Draw the probability of each mode over time, one upon the other; modes without any are left out.
-
-    Parameters
-    ----------
-    search : ModeSearch
-    e : int
-        Index of the experiment.
-    ax : matplotlib.axes.Axes
-    """
-    t = np.linspace(search.starts[e], search.ends[e], POINTS)
-    stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), ax)
-    if search.best is not None:
-        style.label_axis(ax, search.best.trajectories[e])
-    return ax
-
-
-def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatArray, ax: Axes) -> Axes:
+def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatArray, ax: Axes) -> None:
     """Draw probabilities over time, one upon the other, with a legend; modes without any are left out.
 
     Parameters
@@ -430,7 +376,7 @@ def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatA
     ax.set_xlim(t[0], t[-1])
     ax.set_ylabel("probability")
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
-    return style.draw_legend_above(ax)
+    style.draw_legend_above(ax)
 
 
 # --- insertion rates --------------------------------------------------------------------------------------------------
@@ -447,7 +393,7 @@ def write_insertion(found: Insertion) -> str:
     run, pulses = found.trajectory, found.minima(LISTED_MINIMA)
     text, rows = "No short pulse of any mode lowers J.", []
     if pulses:
-        at = format_time(pulses[0].time, run) + suffix_time(run)
+        at = format_time(pulses[0].time, run) + formats.suffix_time(run)
         speed = f"{-pulses[0].rate:.4g} per {run.time_unit} of its length"
         text = f"A short pulse of {pulses[0].mode} at {at} lowers J fastest: by {speed}."
     for pulse in pulses:
@@ -461,7 +407,7 @@ def write_insertion(found: Insertion) -> str:
         if np.isnan(found.rate[found.active == m, k]).all()
     ]
     why = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
-    return join_sections(wrap_text(text), table, wrap_text(why) if undefined else [])
+    return formats.join_sections(wrap_text(text), table, wrap_text(why) if undefined else [])
 
 
 @draw_figure.register(Insertion)
@@ -476,9 +422,9 @@ def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure
     return style.draw_on(ax, lambda ax: _draw_insertion(found, ax), (7.2, 3.8))
 
 
-def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
+def _draw_insertion(found: Insertion, ax: Axes) -> None:
     run = found.trajectory
-    order = [*choose_mode_colours([run]), *found.modes]
+    order = [*plot.choose_mode_colours([run]), *found.modes]
     colours, shades = (style.assign_colours(order, palette) for palette in (LINE_COLOURS, MODE_COLOURS))  # of one hue
     ax.axhline(0.0, color=REFERENCE, linewidth=THIN, zorder=2)
     for k, mode in enumerate(found.modes):
@@ -488,11 +434,10 @@ def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
             minima = [pulse for pulse in found.minima(LISTED_MINIMA) if pulse.mode == mode]
             times, rates = [pulse.time for pulse in minima], [pulse.rate for pulse in minima]
             ax.plot(times, rates, "o", markersize=4.5, color=colours[mode], zorder=4)
-    plot_modes(run, ax, colours=shades)
-    ax.set_ylabel(label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
+    plot.plot_modes(run, ax, colours=shades)
+    ax.set_ylabel(formats.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
-    return ax
 
 
 # --- what an online estimator said -----------------------------------------------------------------------------------
@@ -506,7 +451,7 @@ def write_log(log: OnlineLog) -> str:
     ----------
     log : OnlineLog
     """
-    unit = suffix_time(log)
+    unit = formats.suffix_time(log)
     now, end = log.now, format_time(log.now.time, log)
     error = now.time_errors[-1] if len(now.time_errors) else np.nan
     since = format_estimate(now.since, float(error), log)[0]
@@ -518,7 +463,7 @@ def write_log(log: OnlineLog) -> str:
     p50, p90, p99, most = (f"{1e3 * took[name]:.3g}" for name in ("p50", "p90", "p99", "max"))
     effort = wrap_text(f"{format_count(len(log.times), 'update')}: {counted}")
     effort.append(f"an update took {p50} ms (median), {p90} (90 %), {p99} (99 %), {most} (the longest)")
-    return join_sections(head, _list_modes(log), _list_parameters(log), _list_alarms(log), effort)
+    return formats.join_sections(head, _list_modes(log), _list_parameters(log), _list_alarms(log), effort)
 
 
 def _list_modes(log: OnlineLog) -> list[str]:
@@ -573,33 +518,22 @@ def plot_log(log: OnlineLog) -> Figure:
     figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))
     figure.get_layout_engine().set(h_pad=ROOM)  # type: ignore[union-attr,call-arg]
     axes = figure.subplots(2 + len(values), 1, sharex=True, squeeze=False)[:, 0]
-    plot_probability(log, axes[0])
-    plot_statistic(log, axes[1])
-    for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
-        _plot_value(log.times, value, error, ax)
-        ax.set_ylabel(label_quantity(name, unit))
-    for ax in axes[:-1]:
-        style.put_ticks(ax, log)
-    style.label_axis(axes[-1], log)
-    return style.turn_off_formulas(figure)
-
-
-def plot_probability(log: OnlineLog, ax: Axes) -> Axes:
-    """Draw the probability of each mode as it was known at each time, and the transition times as they are known now.
-
-    Parameters
-    ----------
-    log : OnlineLog
-    ax : matplotlib.axes.Axes
-    """
-    stack_probabilities(log.times, log.modes, log.probability, ax)
+    stack_probabilities(log.times, log.modes, log.probability, axes[0])
     now = log.now
     reach = QUANTILE * now.time_errors
     ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
-    return plot_transitions(now.transition_times, ends, ax)
+    plot.plot_transitions(now.transition_times, ends, axes[0])
+    plot_statistic(log, axes[1])
+    for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
+        _plot_value(log.times, value, error, ax)
+        ax.set_ylabel(formats.label_quantity(name, unit))
+    for ax in axes:
+        style.label_axis(ax, log)
+        ax.label_outer()
+    return style.turn_off_formulas(figure)
 
 
-def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
+def plot_statistic(log: OnlineLog, ax: Axes) -> None:
     """Draw the statistic with its threshold, and a dot for each alarm, an empty one if it was retracted.
 
     Parameters
@@ -616,17 +550,15 @@ def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
         ax.set_yscale("symlog", linthresh=log.threshold, linscale=2.0)
     ax.set_ylim(0.0, max(1.5 * log.threshold, ax.get_ylim()[1]))
     ax.set_ylabel("statistic")
-    return ax
 
 
-def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> Axes:
+def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> None:
     """Draw a parameter with its 95 % band, which is cut off where it is much wider than at the end."""
     band = np.stack([value - QUANTILE * error, value + QUANTILE * error], axis=1)
     ax.plot(times, value, "-", color=FIT, linewidth=LINE, zorder=3)
     reach = 3.0 * QUANTILE * np.nan_to_num(error[-1], posinf=0.0)
     ax.set_ylim(*ax.get_ylim() + reach * np.array([-1.0, 1.0]))
     ax.set_autoscaley_on(False)
-    plot_band(times, replace_infinities(band), ax, alpha=0.2, label="95 %")
+    plot.plot_band(times, plot.replace_infinities(band), ax, alpha=0.2, label="95 %")
     ax.axhline(value[-1], color=TRANSITION, linestyle=":", linewidth=THIN, zorder=1)
     ax.tick_params(labelsize=SMALL)
-    return ax

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -21,7 +22,7 @@ from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
-from switchfit.report.formats import get_unit, label_quantity
+from switchfit.report.formats import count_worst, format_unit, label_quantity
 from switchfit.report.style import DATA, FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
 from switchfit.strategy.validation import Validation
@@ -84,11 +85,8 @@ def plot_fit(fit: Fit, *, bands: bool = True, level: float = 0.95) -> Figure:
     intervals = {e: find_transition_intervals(fit, e, level) for e in runs}
     drawn = {e: predict(fit, experiment=e) for e in runs} if wanted and has_bands(fit) else {}
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
-    if len(runs) < len(fit.trajectories):
-        notes.append(_count_worst(fit, runs))
-    figure = plot_runs(fit, intervals, drawn, level=level, notes=notes)
-    figure.legends[0].get_title().set_color("black" if fit.status.successful else FIT)
-    return figure
+    notes += filter(None, [count_worst(runs, fit.trajectories, "experiments")])
+    return plot_runs(fit, intervals, drawn, level=level, notes=notes)
 
 
 def plot_runs(
@@ -121,19 +119,25 @@ def plot_runs(
     runs = list(intervals)
     columns = min(max(len(runs), 1), COLUMNS)
     blocks = [runs[first : first + columns] for first in range(0, len(runs), columns)]
-    panels = [max(_count_panels(result, e) for e in block) for block in blocks]
+    panels = [max(len(list_outputs(result, e)) for e in block) for block in blocks]
     heights = [0.6 + 2.5 * number for number in panels]
     figure = style.make_figure(WIDTHS[columns] * columns, 0.7 + sum(heights))
     grid = figure.add_gridspec(len(blocks), columns, height_ratios=heights)
     colours = choose_mode_colours(result.trajectories)
     for place, e in enumerate(runs):
+        trajectory = result.trajectories[e]
         block = figure.add_subfigure(grid[divmod(place, columns)])
-        _draw_experiment(result, e, block, panels[place // columns], colours, label)
-        if e in predictions:
-            _draw_bands(bool(result.comparisons[e]), block.axes, predictions[e], level)
-        times = [begin for _, begin, _ in result.trajectories[e].mode_spans[1:]]
-        for ax in block.axes:  # labels in one of them, so that they come last in the legend
-            plot_transitions(times, intervals[e], ax, level=level if ax is block.axes[-1] else None)
+        axes = _draw_outputs(result, e, block, panels[place // columns], predictions.get(e), level, label)
+        for ax in axes:  # labels of transitions in one of them, so that they come last in the legend
+            plot_modes(trajectory, ax, colours=colours, labels=ax is axes[0])
+            times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
+            plot_transitions(times, intervals[e], ax, level=level if ax is axes[-1] else None)
+            if ax is not axes[-1]:
+                ax.tick_params(labelbottom=False)
+                ax.xaxis.offsetText.set_visible(False)
+                ax.set_xlabel("")
+        if len(result.trajectories) > 1:
+            block.suptitle(result.run_names[e], fontsize="medium", fontweight="bold")
     handles = style.collect_handles(figure.axes)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for e in runs for mode, a, b in result.trajectories[e].mode_spans if b > a}
@@ -145,91 +149,75 @@ def plot_runs(
     return style.turn_off_formulas(figure)
 
 
-def plot_comparison(
-    comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes, *, label: str = "fitted"
-) -> Axes:
+def _draw_outputs(
+    result: Fit | Validation, e: int, block: Any, rows: int, prediction: Prediction | None, level: float, label: str
+) -> list[Axes]:
+    """Draw each channel of an experiment with its residuals below, leaving rows free at the bottom for others only."""
+    outputs, step = list_outputs(result, e), 2 if result.comparisons[e] else 1
+    ratios = ([3.0, 1.2] if step == 2 else [1.0]) * rows
+    grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
+    axes: list[Axes] = [block.add_subplot(grid[0])]
+    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1 : step * len(outputs)]]
+    for k, (comparison, channel) in enumerate(outputs):
+        plot_comparison(comparison, channel, axes[step * k], label=label)
+        if step == 2:
+            plot_residuals(comparison, channel, axes[2 * k + 1])
+        for ax in axes[step * k : step * (k + 1)] if prediction is not None else ():
+            plot_bands(prediction, k, level, ax, about_zero=ax is not axes[step * k])
+    block.align_ylabels(axes)
+    return axes
+
+
+def plot_comparison(comparison: Comparison, channel: int, ax: Axes, *, label: str = "fitted") -> None:
     """Draw one channel over time: samples as dots (a reference signal dashed) and the fitted output as a line.
 
     Parameters
     ----------
     comparison : Comparison
-    trajectory : Trajectory
-        Of the same experiment; its states lend their units to channels of the same name.
     channel : int
         Which channel, from 0.
     ax : matplotlib.axes.Axes
     label : str, optional
         Of the line.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     measured = replace_infinities(comparison.measured[:, channel])
     draw_measured(comparison, comparison.times, measured, ax)
     _mark_outliers(comparison, measured, channel, ax)
     times, curve = break_at_transitions(comparison.curve_times, replace_infinities(comparison.curve[:, channel]))
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
-    ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
-    return _label_time_axis(ax, trajectory)
+    ax.set_ylabel(label_quantity(comparison.names[channel], comparison.units[channel]))
 
 
-def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
+def plot_residuals(comparison: Comparison, channel: int, ax: Axes) -> None:
     """Draw measured less fitted of one channel over time, with a band of one sigma to either side where it is known.
 
     Parameters
     ----------
     comparison : Comparison
-    trajectory : Trajectory
     channel : int
         Which channel, from 0.
     ax : matplotlib.axes.Axes
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     residual = replace_infinities(comparison.residuals[:, channel])
     ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
     if comparison.kind == "measurements":
         ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
     else:
-        ax.plot(*break_at_transitions(comparison.times, residual), "-", color=style.REFERENCE, linewidth=THIN, zorder=3)
+        ax.plot(*break_at_transitions(comparison.times, residual), "-", color=REFERENCE, linewidth=THIN, zorder=3)
     _mark_outliers(comparison, residual, channel, ax)
     if comparison.sigma is not None:
         sigma = replace_infinities(comparison.sigma[:, channel])
         for side, label in ((sigma, "± sigma"), (-sigma, "")):
             ax.plot(comparison.times, side, ":", color=TRANSITION, linewidth=THIN, zorder=2, label=label)
-    unit = get_unit(comparison, channel, trajectory)
+    unit = format_unit(comparison.units[channel])
     ax.set_ylabel(f"residual\n({unit})" if unit else "residual")
     ax.margins(y=0.12)
-    return _label_time_axis(ax, trajectory)
-
-
-def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
-    """Draw one state over time.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-    state : int
-        Which state, from 0.
-    ax : matplotlib.axes.Axes
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-    """
-    times, curve = break_at_transitions(trajectory.times, replace_infinities(trajectory.states[:, state]))
-    ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
-    ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
-    return _label_time_axis(ax, trajectory)
 
 
 def plot_modes(
     trajectory: Trajectory, ax: Axes, *, colours: Mapping[str, str] | None = None, labels: bool = True
-) -> Axes:
-    """Shade the time in which each mode is active, and name the modes above.
+) -> None:
+    """Shade the time in which each mode is active, and name the modes above; label the axis of times.
 
     Parameters
     ----------
@@ -239,10 +227,6 @@ def plot_modes(
         As from `choose_mode_colours`, so that several axes agree; left out, in the order of this trajectory's modes.
     labels : bool, optional
         False leaves the names out. A name that is wider than its mode's time is turned by 90 degrees.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     colours = choose_mode_colours([trajectory]) if colours is None else colours
     spans = trajectory.mode_spans
@@ -254,10 +238,11 @@ def plot_modes(
             rotation = 90 if room < 0.085 * len(mode) else 0
             above: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "ha": "center", "va": "bottom"}
             ax.text((begin + end) / 2, 1.02, mode, fontsize=SMALL, rotation=rotation, **above)
-    return _label_time_axis(ax, trajectory)
+    ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
+    style.label_axis(ax, trajectory)
 
 
-def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes, *, level: float | None = None) -> Axes:
+def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes, *, level: float | None = None) -> None:
     """Draw the transition times as vertical lines, each in a band that is its interval.
 
     Parameters
@@ -268,18 +253,13 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes, *, level:
     ax : matplotlib.axes.Axes
     level : float, between 0 and 1, optional
         Of the intervals; lines and bands have labels for a legend where it is given.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     ends: FloatArray = np.asarray(intervals, dtype=np.float64).reshape(-1, 2)
+    line, band = (None, None) if level is None else ("transition", f"transition, {100 * level:g} % interval")
     for time, (low, high) in zip(np.asarray(times).tolist(), ends.tolist(), strict=True):
-        line, band = (None, None) if level is None else ("transition", f"transition, {100 * level:g} % interval")
         ax.axvline(time, color=TRANSITION, linewidth=THIN, zorder=2, label=line)
         if np.isfinite(high - low) and high > low:
             ax.axvspan(low, high, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1, label=band)
-    return ax
 
 
 def plot_convergence(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
@@ -294,7 +274,7 @@ def plot_convergence(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
     return style.draw_on(ax, lambda ax: _draw_convergence(estimate, ax), (6.4, 3.4))
 
 
-def _draw_convergence(fit: Fit, ax: Axes) -> Axes:
+def _draw_convergence(fit: Fit, ax: Axes) -> None:
     optimality = np.array([record.optimality for record in fit.history], dtype=np.float64)
     shown = np.where(optimality > 0, optimality, np.nan)
     ax.set_yscale("log")
@@ -303,7 +283,6 @@ def _draw_convergence(fit: Fit, ax: Axes) -> Axes:
     ax.locator_params(axis="x", integer=True)
     ax.set_xlabel("iteration")
     ax.set_ylabel("optimality (KKT residual)")
-    return ax
 
 
 def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
@@ -316,14 +295,14 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
         Of the intervals, which allow for correlated residuals, as in the report.
     ax : matplotlib.axes.Axes, optional
     """
-    intervals = [find_transition_intervals(estimate, e, level) for e in range(len(estimate.trajectories))]
-    height = 1.3 + 0.4 * min(len(estimate.trajectories), LONGEST_TIMELINE)
-    return style.draw_on(ax, lambda ax: _draw_timeline(estimate, intervals, level, ax), (8.0, height))
+    runs = choose_runs(estimate, LONGEST_TIMELINE)
+    title = count_worst(runs, estimate.trajectories, "experiments")
+    draw = partial(_draw_timeline, estimate, runs, level)
+    return style.draw_on(ax, draw, (8.0, 1.3 + 0.4 * len(runs)), legend=1.0, title=title)
 
 
-def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: Axes) -> Axes:
-    """Draw the rows of a timeline, the first on top; of many experiments those that are explained worst."""
-    runs = choose_runs(fit, LONGEST_TIMELINE)
+def _draw_timeline(fit: Fit, runs: Sequence[int], level: float, ax: Axes) -> None:
+    """Draw the rows of a timeline, the first on top."""
     colours = choose_mode_colours(fit.trajectories)
     ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
     first, last = float(ends.min()), float(ends.max())
@@ -335,21 +314,15 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
             ax.barh(row, end - begin, 0.7, begin, label="" if fits else mode, **bar)
             if fits:
                 ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
-        for low, high in intervals[e].tolist():
+        for low, high in find_transition_intervals(fit, e, level).tolist():
             if np.isfinite(high - low):
                 look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
                 ax.plot([low, high], [row, row], "|-", label=f"transition time, {100 * level:g} % interval", **look)
-    _label_time_axis(ax, fit.trajectories[runs[0]])
+    style.label_axis(ax, fit.trajectories[runs[0]])
     ax.set_xlim(first, last)
     ax.set_ylim(len(ends) - 0.5, -0.5)
     ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
-    title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
-    return style.draw_legend_above(ax, title=title)
-
-
-def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
-    return f"the worst {len(shown)} of {len(fit.trajectories)} experiments"
 
 
 def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = False) -> dict[str, str]:
@@ -365,65 +338,25 @@ def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = Fal
     return style.assign_colours(names, LINE_COLOURS if lines else MODE_COLOURS)
 
 
-# --- the figure of a fit ----------------------------------------------------------------------------------------------
-
-
 def list_outputs(result: Fit | Validation, e: int) -> list[tuple[Comparison, int]]:
-    """Return the outputs of an experiment, each as one of its data and the channel of that.
+    """Return the outputs of an experiment, each as one of its data and the channel of that; its states without data.
 
     Parameters
     ----------
     result : Fit or Validation
     e : int, from 0
     """
-    return [(comparison, k) for comparison in result.comparisons[e] for k in range(len(comparison.names))]
+    own, none = result.trajectories[e], result.trajectories[e].states[:0]
+    units = own.state_units
+    states = Comparison("states", own.state_names, own.times[:0], none, none, None, own.times, own.states, units=units)
+    return [(data, k) for data in result.comparisons[e] or (states,) for k in range(len(data.names))]
 
 
-def _count_panels(result: Fit | Validation, e: int) -> int:
-    """Return how many channels of an experiment are drawn, or states where there is no data."""
-    return len(list_outputs(result, e)) or len(result.trajectories[e].state_names)
+# --- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _draw_experiment(
-    result: Fit | Validation, e: int, block: Any, rows: int, colours: Mapping[str, str], label: str
-) -> None:
-    """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
-    trajectory, with_data = result.trajectories[e], bool(result.comparisons[e])
-    drawn = _count_panels(result, e) * (1 + with_data)
-    ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
-    grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
-    axes: list[Axes] = [block.add_subplot(grid[0])]
-    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1:drawn]]
-    for (comparison, k), ax, below in zip(list_outputs(result, e), axes[::2], axes[1::2], strict=False):
-        plot_comparison(comparison, trajectory, k, ax, label=label)
-        plot_residuals(comparison, trajectory, k, below)
-    for state, ax in enumerate(() if with_data else axes):
-        plot_state(trajectory, state, ax)
-    for number, ax in enumerate(axes):
-        plot_modes(trajectory, ax, colours=colours, labels=number == 0)
-        if ax is not axes[-1]:
-            ax.tick_params(labelbottom=False)
-            ax.xaxis.offsetText.set_visible(False)
-            ax.set_xlabel("")
-    block.align_ylabels(axes)
-    if len(result.trajectories) > 1:
-        block.suptitle(result.run_names[e], fontsize="medium", fontweight="bold")
-
-
-def _draw_bands(comparisons: bool, axes: Sequence[Axes], prediction: Prediction, level: float) -> None:
-    """Draw bands in the panels of one experiment; its channels come with their residuals, states alone."""
-    if comparisons:
-        for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
-            plot_bands(prediction, k, level, ax)
-            plot_residual_bands(prediction, k, level, below)
-    else:
-        label = label_band("confidence", level, prediction.corrected)
-        for ax, band in zip(axes, np.moveaxis(prediction.state_band(level), 1, 0), strict=True):
-            plot_band(prediction.times, band, ax, alpha=0.3, label=label)
-
-
-def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about: FloatArray | float = 0.0) -> Axes:
-    """Draw both bands of one output: of a new sample, and of the curve.
+def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_zero: bool = False) -> None:
+    """Draw both bands of one output, of a new sample and of the curve; without data, that of a state.
 
     Parameters
     ----------
@@ -432,51 +365,28 @@ def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about:
         Which output.
     level : float, between 0 and 1
     ax : matplotlib.axes.Axes
-    about : (K, 1) array, optional
-        What is subtracted from them.
+    about_zero : bool, optional
+        Draw them about the zero of the residuals, since about the curve they are often too narrow to be seen.
     """
-    order = np.argsort(prediction.times, kind="stable")
-    bands = ("prediction", prediction.prediction_band, 0.12), ("confidence", prediction.output_band, 0.3)
-    for kind, find_band, alpha in bands:
-        band = (find_band(level)[:, k] - about)[order]
-        plot_band(prediction.times[order], band, ax, alpha=alpha, label=label_band(kind, level, prediction.corrected))
-    return ax
+    order, limits = np.argsort(prediction.times, kind="stable"), ax.get_ylim()
+    bands = [
+        ("prediction", prediction.prediction_band(level), 0.12),
+        ("confidence", prediction.output_band(level), 0.3),
+    ]
+    if not prediction.output_names:
+        bands = [("confidence", prediction.state_band(level), 0.3)]
+    for kind, ends, alpha in bands:
+        band = (ends[:, k] - (prediction.outputs[:, [k]] if about_zero else 0.0))[order]
+        widened = ", widened" if prediction.corrected and kind == "confidence" else ""
+        plot_band(prediction.times[order], band, ax, alpha=alpha, label=f"{100 * level:g} % {kind}{widened}")
+        if about_zero and np.isfinite(band).any():
+            reach = 1.1 * np.nanmax(np.abs(band))
+            limits = min(limits[0], -reach), max(limits[1], reach)
+    if about_zero:
+        ax.set_ylim(limits)
 
 
-def plot_residual_bands(prediction: Prediction, k: int, level: float, ax: Axes) -> Axes:
-    """Draw both bands of one output about the residuals' zero, since about its curve they are often too narrow.
-
-    Parameters
-    ----------
-    prediction : Prediction
-    k : int, from 0
-        Which output.
-    level : float, between 0 and 1
-    ax : matplotlib.axes.Axes
-    """
-    limits, fitted = ax.get_ylim(), prediction.outputs[:, [k]]
-    plot_bands(prediction, k, level, ax, about=fitted)
-    size = np.abs(prediction.prediction_band(level)[:, k] - fitted)
-    if np.isfinite(size).any():
-        reach = 1.1 * np.nanmax(size)
-        ax.set_ylim(min(limits[0], -reach), max(limits[1], reach))
-    return ax
-
-
-def label_band(kind: str, level: float, corrected: bool) -> str:
-    """Return the entry of a band in a legend, as short as the longest of the others.
-
-    Parameters
-    ----------
-    kind : {"confidence", "prediction"}
-    level : float, between 0 and 1
-    corrected : bool
-        Whether it allows for correlated residuals.
-    """
-    return f"{100 * level:g} % {kind}" + (", widened" if corrected and kind == "confidence" else "")
-
-
-def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
+def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> None:
     """Draw a band about a fitted curve, broken at the transitions, where it jumps.
 
     Parameters
@@ -488,21 +398,13 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
     alpha : float
     label : str
         For the legend.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     if np.isfinite(band).any():
         times, low, high = break_at_transitions(times, *band.T)
         ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
-    return ax
 
 
-# --- parts ------------------------------------------------------------------------------------------------------------
-
-
-def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes) -> Axes:
+def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes) -> None:
     """Draw samples as dots, or a reference signal as a dashed line.
 
     Parameters
@@ -514,9 +416,8 @@ def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes
     """
     if comparison.kind == "measurements":
         ax.plot(x, y, label="measured", zorder=3, **draw_dots(len(x)))
-    else:
+    elif comparison.kind == "reference":
         ax.plot(x, y, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
-    return ax
 
 
 def draw_dots(count: int) -> dict[str, Any]:
@@ -557,13 +458,7 @@ def break_at_transitions(times: FloatArray, *values: FloatArray) -> list[FloatAr
     return [np.insert(times, inner, times[inner]), *(np.insert(each, inner, np.nan) for each in values)]
 
 
-def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
-    """Label the axis of times, and limit it to the experiment's horizon."""
-    ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
-    return style.label_axis(ax, trajectory)
-
-
-LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
+LENGTHS = {"", "1", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
 NO_POSITIONS = {"v", "vel", "velocity", "speed", "a", "acc", "acceleration", "force", "f", "rate", "d", "dot"}
 """Parts of names that say that a channel is no position."""
@@ -608,17 +503,15 @@ def plot_plane(
     if named is not None and len(named) != 2:
         raise ValueError(f"channels must be two names; got {shorten(channels)}.")
     (comparison, plane), trajectory = _choose_plane(estimate, experiment, named), estimate.trajectories[experiment]
-    return style.draw_on(ax, lambda ax: _draw_plane(comparison, plane, trajectory, ax), (6.4, 5.6))
+    return style.draw_on(ax, partial(_draw_plane, comparison, plane, trajectory), (6.4, 5.6), legend=1.0)
 
 
 def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> tuple[Comparison, list[int]]:
     """Return the data with the two channels that are named, or that are positions by their names, and their places."""
-    trajectory = estimate.trajectories[e]
     for comparison in estimate.comparisons[e]:
-        units = [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
         if channels is not None and set(channels) <= set(comparison.names):
             return comparison, [comparison.names.index(name) for name in channels]
-        found = None if channels is not None else find_plane(comparison.names, units)
+        found = None if channels is not None else find_plane(comparison.names, comparison.units)
         if found is not None:
             return comparison, list(found)
     names = join_names([name for comparison in estimate.comparisons[e] for name in comparison.names])
@@ -628,9 +521,8 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) 
     )
 
 
-def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory, ax: Axes) -> Axes:
-    x, y = comparison.measured[:, both].T
-    draw_measured(comparison, x, y, ax)
+def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory, ax: Axes) -> None:
+    draw_measured(comparison, *comparison.measured[:, both].T, ax)
     colours = choose_mode_colours([trajectory], lines=True)
     segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
     for (mode, begin, end), first, last in segments:
@@ -640,11 +532,9 @@ def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory,
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
         ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
-    labels = [label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)) for k in both]
-    ax.set_xlabel(labels[0])
-    ax.set_ylabel(labels[1])
+    for k, set_label in zip(both, (ax.set_xlabel, ax.set_ylabel), strict=True):
+        set_label(label_quantity(comparison.names[k], comparison.units[k]))
     ax.set_aspect("equal", adjustable="datalim")
-    return style.draw_legend_above(ax)
 
 
 PLOTS: dict[str, Callable[..., Any]]

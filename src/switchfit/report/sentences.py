@@ -70,16 +70,21 @@ def list_figures(issue: Issue, name: str) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-def write_places(names: Sequence[str], values: Sequence[float], digits: int = 8) -> str:
-    """Return values of unknowns, such as "mu = 0.3, tau_1 = 2".
+def list_each(issue: Issue, template: str, *names: str, first: int = 0) -> str:
+    """Return subjects of an issue, each with its figures, such as "mu = 0.3, tau_1 = 2".
 
     Parameters
     ----------
-    names : sequence of str
-    values : sequence of float
-    digits : int, optional
+    issue : Issue
+    template : str
+        With a field for the subject, and one for each figure.
+    names : str
+        Of the figures.
+    first : int, optional
+        Of the subjects.
     """
-    return ", ".join(f"{name} = {value:.{digits}g}" for name, value in zip(names, values, strict=False))
+    each = zip(issue.subjects[first:], *(list_figures(issue, name) for name in names), strict=False)
+    return join_first([template.format(*entries) for entries in each])
 
 
 def join_words(words: Sequence[str]) -> str:
@@ -95,18 +100,14 @@ def capitalise(text: str) -> str:
 # --- constraints, kinks -----------------------------------------------------------------------------------------------
 
 
-def _name_mode(mode: str = "", run: str = "", *, position: float = np.nan) -> str:
-    number = f"{position + 1:.0f} ({mode!r})" if np.isfinite(position) else repr(mode)
-    return f"mode {number}{f' of {run}' if run else ''}"
-
-
 @format_text.register(Constraint)
 def write_constraint(constraint: Constraint) -> str:
     """Return which constraint is active."""
     if constraint.position is None:
         return f"{constraint.unknown} at its {constraint.kind} {constraint.value:g}"
     state = "has collapsed to nothing" if constraint.kind == "collapsed" else "is at its minimum duration"
-    return f"{_name_mode(constraint.mode, constraint.run, position=constraint.position)} {state}"
+    run = f" of {constraint.run}" if constraint.run else ""
+    return f"mode {constraint.position + 1} ({constraint.mode!r}){run} {state}"
 
 
 @format_text.register(Kink)
@@ -206,8 +207,8 @@ def _add_unit(issue: Issue, name: str) -> str:
 _REPAIRS = {
     "log: unsorted times": ("repair='sort' sorts by time", "sorted"),
     "log: clock jump": (
-        "if these are two recordings, split the file there; if lines are out of order, repair='sort' sorts them",
-        "sorted by time",
+        "if these are two recordings, split the file there; else repair='sort' sorts by time",
+        "sorted",
     ),
     "log: repeated time": ("repair='drop-duplicates' keeps the first sample of each", "the first sample is kept"),
     "log: wrapped angle": ("repair='unwrap:{2}' makes it continuous", "unwrapped"),
@@ -248,6 +249,8 @@ def write_issue(issue: Issue) -> str:
     """Return an issue as a sentence or two."""
     if issue.kind in _ISSUES:
         return write_sentence(_ISSUES[issue.kind], issue)
+    if issue.kind in _REASONS:
+        return f"{capitalise(write_sentence(_REASONS[issue.kind], issue))}."
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
@@ -261,25 +264,10 @@ def _write_combination(issue: Issue) -> str:
     return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
 
 
-def _list_correlated(issue: Issue) -> str:
-    each = zip(issue.subjects, list_figures(issue, "correlation"), strict=False)
-    return join_first([f"{label} ({value:.2f})" for label, value in each])
-
-
-def _list_non_normal(issue: Issue) -> str:
-    each = zip(issue.subjects, list_figures(issue, "kurtosis"), list_figures(issue, "outliers"), strict=False)
-    return join_first([f"{name} (kurtosis {size:.1f}, {count:.0f} beyond 4 sigma)" for name, size, count in each])
-
-
 def _list_wrong(issue: Issue) -> str:
     """Return the entries of a gradient that are wrong."""
-    each = zip(issue.subjects, list_figures(issue, "derivatives"), list_figures(issue, "differences"), strict=False)
-    entries = [f"{name} (derivative {stated:.3g}, differences {found:.3g})" for name, stated, found in each]
-    return f"; it is wrong in {', '.join(entries)}" if entries else ""
-
-
-def _write_at(issue: Issue) -> str:
-    return write_places(issue.subjects, list_figures(issue, "at"))
+    entries = list_each(issue, "{} (derivative {:.3g}, differences {:.3g})", "derivatives", "differences")
+    return f"; it is wrong in {entries}" if entries else ""
 
 
 def _write_jump(issue: Issue) -> str:
@@ -326,40 +314,25 @@ EXAMPLES = {
 """What to keep from where an operation is not defined, or has no derivative."""
 
 
+_NOT_NORMAL = "{} (kurtosis {:.1f}, {:.0f} beyond 4 sigma)"
+"""Of a channel."""
 _DELAYED = (
     " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, and the "
     "fit may have ended at one. Fix the delay at its estimate to see."
 )
 """Behind why a line search failed if a delay is estimated."""
 
-_BOUND = (
-    "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known. Move the "
-    "bound if it is not a physical one."
-)
+_BOUND = "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known."
 _ISSUES: dict[str, Sentence] = {
     "trade off": _write_combination,
     **_LOG_ISSUES,
     # Before the numbers are believed
-    "a mode collapsed": "{held mode} has collapsed to nothing: the data want no such mode there. Leave it out of "
-    "mode_sequence, start from another guess, or give min_duration.",
-    "a mode is short": "{held mode} is at its minimum duration: the data would have it shorter. Lower min_duration, "
-    "or leave the mode out.",
     "lower bound": _BOUND,
     "upper bound": _BOUND,
     "idle times": "Where the collapsed mode would stand does not matter, since the same mode is active before and "
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "at kinks": "{first names}: at a kink of the cost, as where a transition meets a sample. There it has no standard "
-    "error, and those of the others take it as known; its profile gives an interval.",
-    "not read": "No function of the model reads {names}: the data say nothing about it, and its value above is the "
-    "first guess. Remove it from parameters, or use it in the model, whose functions may spell its name otherwise.",
-    "acts elsewhere": "{names}: read only by modes, or at transitions, that do not occur in mode_sequence. The data "
-    "say nothing about it, and its value above is the first guess. Fix it, or fit a log in which it acts too.",
-    "without effect": "The cost does not depend on {names}, to second order: the data say nothing about it, and its "
-    "value above is the first guess. Fix it, or let it act on what is measured.",
-    "not determined": "The data hardly determine {first names} (smallest eigenvalue {eigenvalue:.2g} of the "
-    "Hessian scaled to unit curvature). Fix one of the unknowns, or add data that tell them apart.",
     "no errors: not finite": "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "
     "Measurements alone, with sigma or without.",
@@ -467,7 +440,8 @@ def write_step(step: Issue) -> str:
     """
     if step.kind == "next: define it there":
         return suggest_definition(step.subjects[1])
-    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, names=_name(step.subjects))
+    kind = step.kind.removeprefix("next: ")
+    text = _STEPS.get(kind, kind).format(*step.subjects, names=_name(step.subjects))
     return text.replace("one of them", "it") if len(step.subjects) == 1 else text
 
 
@@ -630,7 +604,6 @@ def _write_prediction(issue: Issue) -> str:
 
 
 _REASONS: dict[str, Sentence] = {
-    "converged": "converged",
     "looked": _write_looks,
     "fits": _write_fit,
     "predicts": _write_prediction,
@@ -688,7 +661,6 @@ _STEPS = {
     "more starts": "strategy='thorough'",
     "more time": "time_budget with more seconds",
     "look at the residuals": "look at estimate.plot_residuals()",
-    "check sigma": "check sigma",
     "corrected errors": "take the corrected standard errors",
     "robust loss": "give the Measurements a robust loss",
     "leave the mode out": "leave the mode out of mode_sequence",
@@ -702,7 +674,6 @@ _STEPS = {
     "fix alone": "fix {names}, or measure something else",
     "more data": "add data",
     "smaller rtol": "give the Problem a smaller rtol",
-    "raise max_iterations": "raise max_iterations",
     "continue": "continue with start=estimate.theta",
     "start elsewhere": "start elsewhere, or check the model there",
     "start nearer": "start nearer to a point that meets it",
@@ -721,26 +692,25 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     **{name: partial(_add_unit, name=name) for name in ("time", "step", "typical")},
     "names": _join,
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
-    "held mode": lambda issue: capitalise(_name_mode(*issue.subjects[:2], position=get_figure(issue, "position"))),
-    "correlated": _list_correlated,
-    "non-normal": _list_non_normal,
+    "correlated": lambda issue: list_each(issue, "{} ({:.2f})", "correlation"),
+    "non-normal": lambda issue: list_each(issue, _NOT_NORMAL, "kurtosis", "outliers"),
     "wrong entries": _list_wrong,
     "jump": _write_jump,
-    "places": _write_at,
+    "places": lambda issue: list_each(issue, "{} = {:.8g}", "at"),
     "kind": lambda issue: issue.kind,
     "orders": lambda issue: ", ".join(f"{order:.2f}" for order in list_figures(issue, "orders")),
     "undefined": lambda issue: capitalise(write_undefined(issue)),
     "definition": lambda issue: capitalise(suggest_definition(issue.subjects[1])),
     "delay": lambda issue: _DELAYED if get_figure(issue, "delayed") == 1.0 else "",
     "first names": lambda issue: _name(issue.subjects),
-    "mode": lambda issue: _name_mode(*issue.subjects[:2]),
+    "mode": lambda issue: " of ".join((f"mode {issue.subjects[0]!r}", *filter(None, issue.subjects[1:2]))),
     "explanation of the worst": _explain_worst,
     "agreement": _count_starts,
     "fits": _count_fits,
     "least": _name_least,
     "per cent": lambda issue: 100 * get_figure(issue, "share"),
     "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
-    "where it failed": lambda issue: write_places(issue.subjects[2:], list_figures(issue, "at"), digits=6),
+    "where it failed": lambda issue: list_each(issue, "{} = {:.6g}", "at", first=2),
     "statuses": lambda issue: ", ".join(issue.subjects[:LISTED_NAMES]),
 }
 """What a field of a sentence stands for that is neither a subject nor a figure."""

@@ -49,16 +49,27 @@ def make_figure(width: float, height: float) -> NotebookFigure:
     return NotebookFigure(figsize=(width, height), layout="constrained")
 
 
-def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, float] = (6.4, 4.2)) -> Axes | Figure:
+def draw_on(
+    ax: Axes | None,
+    draw: Callable[[Axes], None],
+    size: tuple[float, float] = (6.4, 4.2),
+    *,
+    legend: float = 0.0,
+    title: str = "",
+) -> Axes | Figure:
     """Draw in the given axes and return them, or in a new figure and return that.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes or None
     draw : callable
-        ``draw(ax)`` draws one axes and returns it.
+        ``draw(ax)`` draws one axes.
     size : (width, height)
         Of the new figure in inches.
+    legend : float, optional
+        Height of the lower edge of a legend, in heights of the axes; names of modes reach to 1.08. 0 draws none.
+    title : str, optional
+        Of the legend.
 
     Raises
     ------
@@ -67,13 +78,14 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, fl
     """
     from matplotlib.axes import Axes
 
-    if ax is None:
-        figure = make_figure(*size)
-        draw(figure.subplots())
-        return turn_off_formulas(figure)
-    if not isinstance(ax, Axes):
+    figure = make_figure(*size) if ax is None else None
+    panel = ax if figure is None else figure.subplots()
+    if not isinstance(panel, Axes):
         raise TypeError(f"ax must be a matplotlib Axes; got {type(ax).__name__}.")
-    return turn_off_formulas(draw(ax))
+    draw(panel)
+    if legend:
+        draw_legend_above(panel, title=title, height=legend)
+    return turn_off_formulas(figure or panel)
 
 
 def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:
@@ -118,15 +130,14 @@ def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
     return handles
 
 
-def draw_legend_above(ax: Axes, *, title: str | None = None, height: float = 1.0) -> Axes:
+def draw_legend_above(ax: Axes, *, title: str = "", height: float = 1.0) -> None:
     """Draw the legend of an axes above it, with as many columns as it has room for.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
-    title : str, optional
-    height : float, optional
-        Of its lower edge, in heights of the axes; names of modes reach to 1.08.
+    title, height : optional
+        As of `draw_on`.
     """
     from switchfit.report.axes import fit_legend
 
@@ -134,12 +145,11 @@ def draw_legend_above(ax: Axes, *, title: str | None = None, height: float = 1.0
         look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
         look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, height)}
         ax.legend(handles.values(), handles.keys(), title=title, borderaxespad=0.2, **look)
-    return ax
 
 
 def draw_level(
     ax: Axes, text: str, y: float, side: Literal["left", "right"], *, colour: str = REFERENCE, line: str = "--"
-) -> Axes:
+) -> None:
     """Draw a horizontal line with its name above one of its ends.
 
     Parameters
@@ -155,40 +165,27 @@ def draw_level(
     ax.axhline(y, color=colour, linestyle=line, linewidth=THIN)
     look: dict[str, Any] = {"ha": side, "va": "bottom", "fontsize": SMALL, "color": colour}
     ax.annotate(text, (0.01 if side == "left" else 0.995, y), xycoords=("axes fraction", "data"), **look)
-    return ax
 
 
-def label_axis(ax: Axes, run: Timed) -> Axes:
+def label_axis(ax: Axes, run: Timed, name: str = "time") -> None:
     """Label an axis of times; where they are dates, put its ticks at dates. What is drawn remains in numbers.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
     run : Timed
+    name : str, optional
     """
-    ax.set_xlabel(label_time(run))
-    return put_ticks(ax, run)
-
-
-def put_ticks(ax: Axes, run: Timed) -> Axes:
-    """Put the ticks of the horizontal axis at dates, where times are dates.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-    run : Timed
-    """
+    ax.set_xlabel(label_time(run, name))
     if run.origin is not None:
-        from switchfit.report.axes import DateFormatter, DateLocator, Scale
+        from switchfit.report.axes import DateFormatter, DateLocator
 
-        scale = Scale(run.origin, run.time_unit)
-        locator = DateLocator(scale)
+        locator = DateLocator(run.origin, run.time_unit)
         ax.xaxis.set_major_locator(locator)
-        ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
-    return ax
+        ax.xaxis.set_major_formatter(DateFormatter(locator))
 
 
-def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axes:
+def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> None:
     """Label a horizontal axis of values of an unknown, with ticks at dates if it is a time of a run with dates.
 
     Parameters
@@ -197,11 +194,10 @@ def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axe
     name, unit : str
     run : Timed or None
     """
-    ax.set_xlabel(label_quantity(name, unit) if run is None else label_time(run, name))
     if run is not None:
-        return put_ticks(ax, run)
-    ax.ticklabel_format(axis="x", useOffset=False)
-    return ax
+        return label_axis(ax, run, name)
+    ax.set_xlabel(label_quantity(name, unit))
+    return ax.ticklabel_format(axis="x", useOffset=False)
 
 
 def assign_colours(names: Iterable[str], palette: Sequence[str]) -> dict[str, str]:

@@ -11,22 +11,8 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit, Step, disagreement
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
-from switchfit.report.formats import (
-    Table,
-    Timed,
-    add_dates,
-    describe_origin,
-    format_rounded,
-    format_span,
-    format_table,
-    format_time,
-    format_unit,
-    get_unit,
-    join_sections,
-    list_dated,
-    list_jumps,
-    wrap_text,
-)
+from switchfit.report import formats
+from switchfit.report.formats import Table, Timed, format_rounded, format_table, format_time, format_unit, wrap_text
 from switchfit.report.frames import list_holds
 from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
@@ -71,7 +57,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
         The failures of its certificate count in the verdict if it is known.
     full : bool
         All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
-        screen, without the warnings that the verdict covers.
+        screen.
     files : mapping of str to str, optional
         Names of the files with all "runs" and all "unknowns", for the lines that count what was left out.
 
@@ -93,10 +79,10 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
         "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
         f"Correlations above {SMALL_CORRELATION:g}": correlations,
         "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
-        "Warnings": _format_warnings(estimate, limits["others"], full=full),
+        "Warnings": _list_sentences(list_warnings(estimate), limits["others"], "warning"),
     }
     written = [[title, *lines] for title, lines in sections.items() if lines]
-    shown = join_sections(wrap_text(str(estimate.verdict)), *written)
+    shown = formats.join_sections(wrap_text(str(estimate.verdict)), *written)
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
 
 
@@ -116,12 +102,12 @@ def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
     """
     rows: list[Row] = []
     names = ["experiment"] if len(fit.trajectories) == 1 else fit.run_names
-    origins = list(map(describe_origin, fit.trajectories))
+    origins = list(map(formats.describe_origin, fit.trajectories))
     for e, (name, trajectory) in enumerate(zip(names[:most], fit.trajectories, strict=False)):
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
-        jumps = list_jumps(trajectory.jump_times, trajectory)
-        parts = [sequence, format_span(trajectory.times[0], trajectory.times[-1], trajectory), jumps]
-        rows.append((name, ", ".join(filter(None, parts))))
+        span = formats.format_span(trajectory.times[0], trajectory.times[-1], trajectory)
+        jumps = formats.list_jumps(trajectory.jump_times, trajectory)
+        rows.append((name, ", ".join(filter(None, (sequence, span, jumps)))))
         data = [_format_data(comparison) for comparison in fit.comparisons[e]]
         rows += [("", text) for text in data or ["no data: a cost of the trajectory"]]
         if origins[e] and origins[e] not in origins[e - 1 : e]:
@@ -161,7 +147,7 @@ def list_course(fit: Fit) -> list[Row]:
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
         rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
-    return [*rows, ("status", add_dates(fit.message, fit))]
+    return [*rows, ("status", formats.add_dates(fit.message, fit))]
 
 
 _ENDED = {
@@ -223,13 +209,13 @@ def tabulate_channels(fit: Fit) -> Table:
     fit : Fit
     """
     rows, shares = [], []
-    for label, e, comparison, k in list_channels(fit.comparisons, fit.run_names):
+    for label, _, comparison, k in list_channels(fit.comparisons, fit.run_names):
         residual, sigma = comparison.residuals[:, k], comparison.sigma
         count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
         scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
         share = explain_channel(comparison, k)
         explained = "" if np.isnan(share) else format_share(share)
-        unit = get_unit(comparison, k, fit.trajectories[e])
+        unit = format_unit(comparison.units[k])
         rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
         shares.append(share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
@@ -267,32 +253,28 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     ends : bool, optional
         Whether to add the ends of the 95 % intervals, corrected like the standard errors.
     """
-    naive, errors = fit.standard_errors, correct_errors(fit)
+    naive, errors, wide = fit.standard_errors, correct_errors(fit), correct_intervals(fit)
     known = bool(np.isfinite(errors).any())
     corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
-    dated = list_dated(fit)
-    wide = correct_intervals(fit)
-    rows = []
+    dated, rows = formats.list_dated(fit), []
     for i in shown:
-        name = fit.theta_names[i]
+        name, run = fit.theta_names[i], dated[i]
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
         plain = format_rounded(fit.theta[i], np.nan if name in fit.idle else naive[i])[1]
-        prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
-        run = dated[i]
         counted = "" if run is None else f"t = {value}"
         if run is not None:
             value, relative = format_time(fit.theta[i], run, errors[i]), ""
         low, high = (format_end(end, wide[i], run) for end in wide[i])
         sides = np.sort(np.abs(wide[i] - fit.theta[i]))
         sided = i in joins and sides[0] > 0 and (np.isnan(errors[i]) or sides[1] > ONE_SIDED * sides[0])
-        shown_ends = f"95 % in [{low}, {high}]" if high and (sided or name in fit.log_scaled) and not ends else ""
-        notes = [counted, joins.get(i, ""), prior, shown_ends, _mark_unknown(fit, name)]
-        note = ", ".join(note for note in notes if note)
-        guess = format_time(fit.initial_theta[i], run)
-        errors_shown = (error, relative, plain if corrected else "") if known else ("", "", "")
+        within = f"95 % in [{low}, {high}]" if high and (sided or name in fit.log_scaled) and not ends else ""
+        prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
+        note = ", ".join(filter(None, (counted, joins.get(i), prior, within, _mark_unknown(fit, name))))
+        shown_errors = (error, relative, plain if corrected else "") if known else ("", "", "")
         interval = (low, high) if ends and known else ("", "")
-        rows.append([name, value, *errors_shown, *interval, format_unit(fit.theta_units[i]), guess, note])
+        guess = format_time(fit.initial_theta[i], run)
+        rows.append([name, value, *shown_errors, *interval, format_unit(fit.theta_units[i]), guess, note])
     titles = ["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]
     table = Table(rows, "<><><>><><", titles)
     if not known or corrected:
@@ -325,24 +307,15 @@ def format_end(end: float, ends: FloatArray, run: Timed | None) -> str:
 
 
 def select_unknowns(fit: Fit, most: int) -> list[int]:
-    """Return the indices of the unknowns that are listed, in the order of theta.
-
-    If there are more than `most`, those at a bound, at a kink or of a collapsed mode come first. Then come the
-    transition times, which are what is asked for, unless they fill more than half of the table, as those of many runs
-    do; then parameters.
+    """Return the indices of the unknowns that are listed; those at a bound, a kink or of a collapsed mode first.
 
     Parameters
     ----------
     fit : Fit
     most : int
     """
-    order = list(range(len(fit.theta)))
-    if len(order) <= most:
-        return order
-    marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names]
-    few = 2 * np.count_nonzero(fit.is_time) <= most
-    order.sort(key=lambda i: (not marked[i], bool(fit.is_time[i]) != few))
-    return sorted(order[:most])
+    marked = [i for i, name in enumerate(fit.theta_names) if _mark_unknown(fit, name)]
+    return formats.select_unknowns(fit.is_time.tolist(), most, marked)
 
 
 def _compare_covariances(fit: Fit) -> str:
@@ -425,12 +398,16 @@ _COVERED = {
 """Other kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
 
 
-def _format_warnings(estimate: Estimate, most: int, *, full: bool) -> list[str]:
-    """Return the warnings as lines; on one screen without those that the verdict covers."""
-    reasons = set() if full else {reason.kind for reason in estimate.verdict.reasons}
+def list_warnings(estimate: Estimate) -> list[str]:
+    """Return the warnings that the verdict does not cover, as sentences.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    reasons = {reason.kind for reason in estimate.verdict.reasons}
     covered = reasons.union(*(_COVERED.get(kind, set()) for kind in reasons))
-    issues = [add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
-    return _list_sentences(issues, most, "warning")
+    return [formats.add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------

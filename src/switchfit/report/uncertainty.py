@@ -9,18 +9,8 @@ import numpy as np
 
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report import style
-from switchfit.report.formats import (
-    Table,
-    Timed,
-    add_dates,
-    describe_origin,
-    format_estimate,
-    format_table,
-    format_time,
-    list_dated,
-    wrap_text,
-)
+from switchfit.report import formats, style
+from switchfit.report.formats import Table, Timed, format_table, format_time, wrap_text
 from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime import special
@@ -59,7 +49,7 @@ def tabulate_certificate(certificate: Certificate, fit: Fit | None = None) -> Ta
         Where it is given, active constraints of times have their dates.
     """
     held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
-    held = held if fit is None else add_dates(held, fit)
+    held = held if fit is None else formats.add_dates(held, fit)
     failures = "; ".join(map(str, certificate.failures))
     error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
     rows = [
@@ -152,20 +142,19 @@ def write_identifiability(found: Identifiability) -> str:
     """
     count, many = len(found.theta_names) - len(found.held), found.undetermined - len(found.without)
     others = ", ".join(name for name in found.without if name not in (*found.unread, *found.absent))
-    where, condition = _PLACES[found.where], f"condition number of the scaled Hessian {found.condition_number:.3g}"
+    where = _PLACES[found.where]
+    every = f"the data determine all {count} unknowns; condition number of the scaled Hessian"
+    not_all = f"the data do not determine {format_count(many, 'combination')} of the {count} unknowns."
     collapsed = f"{', '.join(found.idle)}, because a mode has collapsed: leave it out of mode_sequence."
-    cases = (
-        (others, f"{where} the cost does not depend on {others}, to second order."),
-        (found.unread or found.absent, f"{capitalise(describe_unread(found.unread, found.absent))}."),
-        (found.idle, f"{where} the cost does not depend on {collapsed}"),
-        (not count, f"{where} constraints, kinks and collapsed modes hold all unknowns."),
-        (count and not found.undetermined, f"{where} the data determine all {count} unknowns; {condition}."),
-        (
-            count and many > 0,
-            f"{where} the data do not determine {format_count(many, 'combination')} of the {count} unknowns.",
-        ),
-    )
-    lines = [line for applies, sentence in cases if applies for line in wrap_text(sentence, others="")]
+    cases = {
+        f"{where} the cost does not depend on {others}, to second order.": others,
+        f"{capitalise(describe_unread(found.unread, found.absent))}.": found.unread or found.absent,
+        f"{where} the cost does not depend on {collapsed}": found.idle,
+        f"{where} constraints, kinks and collapsed modes hold all unknowns.": not count,
+        f"{where} {every} {found.condition_number:.3g}.": count and not found.undetermined,
+        f"{where} {not_all}": count and many > 0,
+    }
+    lines = [line for sentence, applies in cases.items() if applies for line in wrap_text(sentence, others="")]
     for direction in found.directions if count else ():
         lines += wrap_text(write_direction(found, direction), "  - ", "    ")
     return "\n".join(lines)
@@ -259,7 +248,7 @@ def write_profile(profile: Profile) -> str:
     profile : Profile
     """
     run, unit, percent = _find_run(profile), unit_suffix(profile.unit), f"{100 * profile.level:.3g} %"
-    value, error = format_estimate(profile.value, profile.standard_error, run)
+    value, error = formats.format_estimate(profile.value, profile.standard_error, run)
     low, high = profile.interval()
     law = "chi-square with 1 degree of freedom"
     law = law if profile.fit.sigma_known else f"F with 1 and {profile.fit.freedom} degrees of freedom"
@@ -274,13 +263,13 @@ def write_profile(profile: Profile) -> str:
         f"  quadratic             {f'[{other}]{end_unit}' if np.isfinite(quadratic).all() else 'none'}",
         f"  points, fits          {len(profile.values)}, {profile.fits}",
     ]
-    lines += [f"  times                 {describe_origin(run)}"] if run is not None else []
+    lines += [f"  times                 {formats.describe_origin(run)}"] if run is not None else []
     return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
 
 
 def _find_run(profile: Profile) -> Timed | None:
     """Return the run of a profile of a time that is a date; None for any other."""
-    return list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
+    return formats.list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
 
 
 _ENDS = {
@@ -340,20 +329,16 @@ def plot_profile(profile: Profile, *, ax: Axes | None = None) -> Axes | Figure:
     profile : Profile
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, lambda ax: draw_profile(profile, ax))
+    return style.draw_on(ax, partial(draw_profile, profile))
 
 
-def draw_profile(profile: Profile, ax: Axes) -> Axes:
+def draw_profile(profile: Profile, ax: Axes) -> None:
     """Draw the likelihood ratio against the value, with the thresholds, the interval, and the quadratic approximation.
 
     Parameters
     ----------
     profile : Profile
     ax : matplotlib.axes.Axes
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
@@ -389,7 +374,6 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
     ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
-    return ax
 
 
 @draw_figure.register(ResidualDiagnostics)
@@ -409,15 +393,12 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
     if not shown:
         figure.suptitle("No residuals: the cost has no Measurements")
         return figure
-    if len(shown) < len(diagnostics.channels):
-        figure.suptitle(f"the worst {len(shown)} of {len(diagnostics.channels)} channels", fontsize="medium")
+    figure.suptitle(formats.count_worst(shown, diagnostics.channels, "channels"), fontsize="medium")
     axes = figure.subplots(len(shown), 3, squeeze=False, width_ratios=[2.0, 1.2, 1.0])
     for row, (label, channel) in zip(axes, shown, strict=True):
-        draw_in_time(channel, row[0])
-        draw_autocorrelation(channel, row[1])
-        draw_quantiles(channel, row[2])
-        row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
-        style.label_axis(row[0], channel)
+        for ax, draw in zip(row, (draw_in_time, draw_autocorrelation, draw_quantiles), strict=True):
+            draw(channel, ax)
+        row[0].set_ylabel(f"{label}\nresidual / {'sigma' if channel.sigma_known else 'rms'}")
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
@@ -425,37 +406,29 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
     return style.turn_off_formulas(figure)
 
 
-def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:
+def draw_in_time(channel: ChannelResiduals, ax: Axes) -> None:
     """Draw standardised residuals over time with lines at two standard deviations.
 
     Parameters
     ----------
     channel : ChannelResiduals
     ax : matplotlib.axes.Axes
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     ax.axhline(0.0, color=FIT, linewidth=THIN)
     for side in (-2.0, 2.0):
         ax.axhline(side, color=TRANSITION, linewidth=THIN, linestyle=":")
     size = 3.5 if len(channel.values) <= 300 else 1.5
     ax.plot(channel.times, channel.values, "o", color=TRANSITION, markersize=size, markeredgewidth=0, alpha=0.8)
-    return ax
+    style.label_axis(ax, channel)
 
 
-def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> Axes:
+def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> None:
     """Draw the autocorrelation against lag, with the limits within which that of white noise lies in 95 %.
 
     Parameters
     ----------
     channel : ChannelResiduals
     ax : matplotlib.axes.Axes
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     limit = 1.96 / np.sqrt(max(len(channel.values), 1))
     ax.axhspan(-limit, limit, color=SHADE, alpha=0.15, linewidth=0)
@@ -465,23 +438,17 @@ def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> Axes:
     ax.plot(lags, channel.autocorrelation, "o", color=FIT, markersize=4)
     reach = max(1.3 * float(np.max(np.abs(channel.autocorrelation), initial=0.0)), 2 * limit)
     ax.set_ylim(-min(reach, 1.05), min(reach, 1.05))
-    return ax
 
 
-def draw_quantiles(channel: ChannelResiduals, ax: Axes) -> Axes:
+def draw_quantiles(channel: ChannelResiduals, ax: Axes) -> None:
     """Draw sorted standardised residuals against the quantiles of the normal distribution: a straight line if normal.
 
     Parameters
     ----------
     channel : ChannelResiduals
     ax : matplotlib.axes.Axes
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     n = len(channel.values)
     expected = special.ndtri((np.arange(1, n + 1) - 0.5) / n)
     ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=FIT, linewidth=THIN)
     ax.plot(expected, np.sort(channel.values), "o", color=TRANSITION, markersize=3, markeredgewidth=0)
-    return ax

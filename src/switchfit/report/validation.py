@@ -10,20 +10,8 @@ from switchfit.experiment_design import Design
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report import plot, style
-from switchfit.report.formats import (
-    Table,
-    format_estimate,
-    format_table,
-    format_time,
-    get_unit,
-    join_sections,
-    label_quantity,
-    list_dated,
-    suffix_time,
-    wrap_text,
-)
-from switchfit.report.plot import plot_modes
+from switchfit.report import formats, plot, style
+from switchfit.report.formats import Table, format_table, join_sections, label_quantity, wrap_text
 from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.uncertainty import format_probability
@@ -35,6 +23,8 @@ from switchfit.uncertainty.residuals import explain_channel, list_channels
 
 RULED_OUT = 10.0
 """Difference in BIC from which the evidence against a model is very strong."""
+ABOVE_NAMES = 1.08
+"""Where legends are in the heights of axes whose modes are named above."""
 
 
 # --- forecasts --------------------------------------------------------------------------------------------------------
@@ -58,8 +48,7 @@ def plot_prediction(
     names = [c.names[k] for c, k in plot.list_outputs(prediction.fit, prediction.experiment)]
     one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
-        named = partial(style.draw_legend_above, height=1.08)
-        return style.draw_on(ax, lambda ax: named(draw_prediction(prediction, one, level, ax)), (8.0, 3.5))
+        return style.draw_on(ax, partial(draw_prediction, prediction, one, level), (8.0, 3.5), legend=ABOVE_NAMES)
     figure = style.make_figure(8.0, 0.9 + 2.6 * len(names))
     axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for number, panel in enumerate(axes):
@@ -69,7 +58,7 @@ def plot_prediction(
     return style.turn_off_formulas(figure)
 
 
-def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes, *, labels: bool = True) -> Axes:
+def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes, *, labels: bool = True) -> None:
     """Draw one output over time with its bands, what was measured, the modes, and where the data end.
 
     Parameters
@@ -86,7 +75,8 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     comparison, k = plot.list_outputs(fit, e)[number]
     trajectory = fit.trajectories[e]
     order, end = np.argsort(prediction.times, kind="stable"), trajectory.mode_spans[-1][2]
-    times, y = prediction.times[order], prediction.outputs[order, number]
+    times = prediction.times[order]
+    y = (prediction.outputs if prediction.output_names else prediction.states)[order, number]
     plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
     plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
@@ -96,9 +86,9 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
         colour = plot.choose_mode_colours([trajectory])[trajectory.mode_spans[-1][0]]
         ax.axvspan(end, last, color=colour, linewidth=0, zorder=0)
         ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
+    style.label_axis(ax, prediction)
     ax.set_xlim(first, last)
-    ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
-    return style.label_axis(ax, prediction)
+    ax.set_ylabel(label_quantity(comparison.names[k], comparison.units[k]))
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -112,20 +102,15 @@ def write_validation(found: Validation) -> str:
     ----------
     found : Validation
     """
-    sections = [wrap_text(str(found.verdict))]
-    errors, names = found.corrected_standard_errors, found.theta_names
-    rows = {}
-    known = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
-    for (name, value, error, unit), run in zip(known, list_dated(found.problem), strict=True):
-        shown, spread = format_estimate(float(value), float(error), run)
-        rows[name] = [name, shown, spread if spread != "held" else "", unit]
+    errors, names, rows = found.corrected_standard_errors, found.theta_names, []
     refit = () if found.refit is None else found.refit.theta_names
-    estimated = [name for name in names if name in refit and name not in found.kept]
-    given = [name for name in names if name not in (*found.kept, *estimated)]
-    titles = {"Kept from the fit": found.kept, "Estimated from this run": estimated, "As given": given}
-    sections += [
-        [title, *format_table([rows[name] for name in listed], "<>><")] for title, listed in titles.items() if listed
-    ]
+    known = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
+    for (name, value, error, unit), run in zip(known, formats.list_dated(found.problem), strict=True):
+        shown, spread = formats.format_estimate(float(value), float(error), run)
+        origin = "estimated from this run" if name in refit else "as given"
+        origin = "kept from the fit" if name in found.kept else origin
+        rows.append([name, shown, spread if spread != "held" else "", unit, origin])
+    sections = [wrap_text(str(found.verdict)), format_table(rows, "<>><<")]
     if not np.array_equal(errors, found.standard_errors, equal_nan=True):
         sections.append([ALLOWED])
     sections.append(["Channels", *format_table(*tabulate_predicted(found))])
@@ -181,8 +166,7 @@ def plot_validation(
     names = [f"{prefixes[e]}{c.names[k]}" for e in runs for c, k in plot.list_outputs(found, e)]
     one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
-        named = partial(style.draw_legend_above, height=1.08)
-        return style.draw_on(ax, lambda ax: named(draw_validation(found, *panels[one], level, ax)), (8.0, 3.9))
+        return style.draw_on(ax, partial(draw_validation, found, *panels[one], level), (8.0, 3.9), legend=ABOVE_NAMES)
     intervals = {e: _find_intervals(found, e, level) for e in runs[: plot.LARGEST_FIGURE]}
     figure = plot.plot_runs(found, intervals, dict(enumerate(found.predictions)), level=level, label="predicted")
     for e, block in enumerate(figure.subfigs):
@@ -191,7 +175,7 @@ def plot_validation(
     return figure
 
 
-def draw_validation(found: Validation, e: int, output: int, level: float, ax: Axes) -> Axes:
+def draw_validation(found: Validation, e: int, output: int, level: float, ax: Axes) -> None:
     """Draw measured against predicted for one channel with bands.
 
     Parameters
@@ -203,19 +187,18 @@ def draw_validation(found: Validation, e: int, output: int, level: float, ax: Ax
     ax : matplotlib.axes.Axes
     """
     trajectory, (comparison, k) = found.trajectories[e], plot.list_outputs(found, e)[output]
-    plot.plot_comparison(comparison, trajectory, k, ax, label="predicted")
+    plot.plot_comparison(comparison, k, ax, label="predicted")
     if found.predictions:
         plot.plot_bands(found.predictions[e], output, level, ax)
     plot.plot_modes(trajectory, ax, colours=plot.choose_mode_colours(found.trajectories))
     times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
     plot.plot_transitions(times, _find_intervals(found, e, level), ax, level=level)
-    return _write_percent(comparison, k, ax)
+    _write_percent(comparison, k, ax)
 
 
-def _write_percent(comparison: Comparison, k: int, ax: Axes) -> Axes:
+def _write_percent(comparison: Comparison, k: int, ax: Axes) -> None:
     percent = convert_to_percent(explain_channel(comparison, k))
     ax.annotate(f"fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
-    return ax
 
 
 def _find_intervals(found: Validation, e: int, level: float) -> FloatArray:
@@ -293,10 +276,11 @@ def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Fig
     found : ModelComparison
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, lambda ax: _draw_differences(found, ax), (6.4, 1.3 + 0.42 * len(found.names)))
+    size = 6.4, 1.3 + 0.42 * len(found.names)
+    return style.draw_on(ax, partial(_draw_differences, found), size, legend=1.0)
 
 
-def _draw_differences(found: ModelComparison, ax: Axes) -> Axes:
+def _draw_differences(found: ModelComparison, ax: Axes) -> None:
     order, places = _list_best_first(found), np.arange(len(found.names))
     ax.barh(places - 0.2, found.delta_bic[order], height=0.36, color=FIT, label="BIC")
     ax.barh(places + 0.2, found.delta_aicc[order], height=0.36, color=SHADE, label="AICc")
@@ -307,7 +291,6 @@ def _draw_differences(found: ModelComparison, ax: Axes) -> Axes:
     ax.axvline(RULED_OUT, color=TRANSITION, linewidth=THIN, linestyle=":", label=f"{RULED_OUT:g}: as good as ruled out")
     ax.set_ylim(len(places) - 0.5, -0.5)
     ax.set_yticks(places, [found.names[k] for k in order])
-    return style.draw_legend_above(ax)
 
 
 def _list_best_first(found: ModelComparison) -> list[int]:
@@ -346,7 +329,7 @@ def write_design(design: Design) -> str:
     for name, values in design.inputs.items():
         texts.append(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")
     for sensor, times in design.sample_times.items():
-        listed = ", ".join(format_time(time, path) for time in times.tolist()) + suffix_time(path)
+        listed = ", ".join(formats.format_time(time, path) for time in times.tolist()) + formats.suffix_time(path)
         texts.append(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")
     return join_sections(wrap_text(head), format_table(rows, "<>>><", titles), *map(wrap_text, texts))
 
@@ -390,7 +373,7 @@ def plot_design(design: Design) -> Figure:
         axes[-1].plot(when[~taken], shares[~taken], "o", markersize=3, color=colours[name], fillstyle="none")
     axes[-1].set_ylabel("share of information")
     for ax in axes:
-        plot_modes(path, ax, labels=ax is axes[0])
+        plot.plot_modes(path, ax, labels=ax is axes[0])
         ax.label_outer()
         if len(ax.get_legend_handles_labels()[0]) > 1:
             ax.legend(loc="best", frameon=False, fontsize=SMALL)

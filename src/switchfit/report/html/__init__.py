@@ -1,21 +1,32 @@
-"""The report of a fit as one HTML file that needs no network: Jinja2's templates, figures of Bokeh and Matplotlib.
+"""Results as HTML: in a notebook, their text with a small figure below; the report of a fit as one file.
 
-Both libraries come with the extra ``report``. They, and the modules of this package, are imported when a page is made,
-not with switchfit: `page` puts the file together and draws what sliders move, `curves` prepares its
-numbers. What does not move are the figures of Matplotlib.
+The file needs no network: Jinja2's templates, figures of Bokeh and Matplotlib. Bokeh and Jinja2 come with the extra
+``report``. They, and `page`, which puts the file together, are imported when a page is made, not with switchfit.
 """
 
 from __future__ import annotations
 
-import importlib.util
+import base64
+import io
+from html import escape
+from typing import Any
 
+import numpy as np
+
+from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
-from switchfit.report.sentences import join_words
+from switchfit.problem.problem import Problem
+from switchfit.report.formats import describe_origin, format_span, format_table, format_time, format_unit, list_dated
 from switchfit.runtime.errors import MissingExtraError
-from switchfit.runtime.presentation import format_page
+from switchfit.runtime.presentation import Displayed, format_html, format_page
+from switchfit.uncertainty.prediction import Prediction
 
-LIBRARIES = ("bokeh", "jinja2")
-"""What the extra ``report`` installs."""
+DOTS = 64
+"""Dots per inch of the figures in a notebook."""
+LARGEST_FIGURE = 4
+"""Experiments or outputs up to which a result shows its figure; with more of them it is no small one."""
+MOST_ROWS = 20
+"""Experiments or unknowns of a problem in a table."""
 
 
 @format_page.register(Estimate)
@@ -33,11 +44,58 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     MissingExtraError
         If Bokeh or Jinja2 are not installed.
     """
-    missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
-    if missing:
+    try:
+        from switchfit.report.html.page import build_page
+    except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"an HTML report needs {join_words(missing)}, not installed here: pip install 'switchfit[report]'"
-        )
-    from switchfit.report.html.page import build_page
-
+            f"an HTML report needs {error.name}, not installed here: pip install 'switchfit[report]'"
+        ) from error
     return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem(estimate))
+
+
+@format_html.register(Prediction)
+@format_html.register(Displayed)
+def show_result(result: Any) -> str:
+    """Return the text of a result, and its figure if it has a small one.
+
+    Parameters
+    ----------
+    result : object
+        With a method ``plot()``.
+    """
+    is_forecast = isinstance(result, Prediction)
+    size = len(result.output_names if is_forecast else getattr(result, "trajectories", ()))
+    is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
+    image = ""
+    if not is_empty and size <= LARGEST_FIGURE:
+        picture = io.BytesIO()
+        result.plot().savefig(picture, format="png", dpi=DOTS)
+        source = f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"
+        image = f'<img alt="the figure of the result" style="background: white" src="{source}">'
+    return f"<div><pre>{escape(str(result))}</pre>{image}</div>"
+
+
+@format_html.register(Problem)
+def show_problem(problem: Problem) -> str:
+    """Return the experiments, and the unknowns with their first guesses and bounds.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    runs, rows = [], []
+    for name, experiment in zip(problem.run_names, problem.experiments, strict=True):
+        ends = experiment.ends_of_modes(experiment.initial_times)
+        samples = sum(getattr(item, "count", 0) for item in experiment.data)
+        horizon = f"{format_span(ends[0], ends[-1], experiment)} {describe_origin(experiment)}".rstrip()
+        runs.append([name, " -> ".join(experiment.mode_sequence), horizon, f"{samples}" if samples else ""])
+    own = problem.unknowns
+    columns = zip(own.names, own.initial, own.lower, own.upper, own.units, own.priors.texts(), strict=True)
+    for run, (name, value, lower, upper, unit, prior) in zip(list_dated(problem), columns, strict=True):
+        bounds = [format_time(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
+        rows.append([name, format_time(value, run), *bounds, "" if run else format_unit(unit), prior])
+    lines = format_table(runs, "<<<>", ["experiment", "modes", "horizon", "samples"], most=MOST_ROWS)
+    titles = ["unknown", "first guess", "lower", "upper", "", "prior"]
+    lines += ["", *format_table(rows, "<>>><<", titles, most=MOST_ROWS)]
+    text = escape("\n".join(lines))
+    return f"<div><pre>{text}</pre></div>"
