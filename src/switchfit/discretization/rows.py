@@ -363,7 +363,8 @@ def adjoint(
     each stage, s arrays (n,).
     """
     a, b, s = tableau.a, tableau.b.tolist(), len(tableau.b)
-    w, mu, times = ([None] * s for _ in range(3))
+    unknown: list[list[Array]] = [[None] * s for _ in range(3)]
+    w, mu, times = unknown
     parameters: Array = 0.0
     if factors is not None:
         # mu_l = D_1 f_l' w_l + h b_l D_1 ell_l put into w_j = h b_j psi + h sum_l a_lj mu_l leaves a system in w alone,

@@ -377,8 +377,9 @@ class JaxEngine:
         J, late, values, derivatives = jax.tree.map(np.asarray, found)
         which = [k for k, sensor in enumerate(self._structure.measurements) if sensor.delay is not None]
         of_rows = (each[rows] for each in (layout.start, layout.end, *values))
-        along = Tangents(*(each[rows] for each in derivatives)) if tangents else None
-        simulation = Simulation(float(J), self._mesh.times, layout.first_cell, *of_rows, tangents=along)
+        simulation = Simulation(float(J), self._mesh.times, layout.first_cell, *of_rows)
+        if tangents:
+            simulation = replace(simulation, tangents=Tangents(*(each[rows] for each in derivatives)))
         seen = dict(zip(which, late, strict=True))
         simulation = finish_simulation(simulation, self._structure, self._arguments, seen)
         if not tangents:

@@ -239,13 +239,14 @@ def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
     operation = OPERATIONS.get(op)
     if operation is None:
         return op == "const" and isinstance(args[0], bool)
+    takes: list[bool] = [operation.takes_truth] * len(args)
+    gives: bool = operation.gives_truth
     if op == "select":
-        takes, gives = (True, args[1].truth, args[1].truth), args[1].truth
-    else:
-        takes, gives = (operation.takes_truth,) * len(args), operation.gives_truth
+        gives = args[1].truth
+        takes = [True, gives, gives]
     if any(a.truth is not each for a, each in zip(args, takes, strict=True)):
         raise TypeError(f"{op} takes other types: truth values for doubles, or the other way round")
-    return bool(gives)
+    return gives
 
 
 class Graph:
