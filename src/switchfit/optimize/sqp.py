@@ -260,7 +260,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: step.Direction) -> St
     # The derivatives are rounded relative to their largest terms: those seen so far, and |H| |theta|.
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
-        floor = max(floor, float(np.max(abs(state.point.plus.hessian).dot(state.scale))))
+        floor = max(floor, float(np.max(state.point.plus.hessian.absolute().dot(state.scale))))
     below_rounding = step.is_below_rounding(oracle, state, direction)
     if below_rounding and state.point.optimality <= 1e5 * algebra.EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
