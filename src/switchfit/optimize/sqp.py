@@ -87,7 +87,7 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     """Backtrack on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
     problem, point = oracle.problem, state.point
     _, hessian = point.derivatives(point.reported_sides)
-    bending = float(ray @ (hessian.dot(ray)))
+    bending = float(ray @ hessian.dot(ray))
     sized = state.scale > 0.0
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
