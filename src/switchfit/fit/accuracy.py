@@ -220,7 +220,7 @@ class Follower:
         In curved valleys, and across samples, a Hessian that is right misjudges steps as well.
         """
         step = after - theta
-        slope, curvature = found.gradient.dot(step), step.dot(found.hessian @ step)
+        slope, curvature = found.gradient.dot(step), step.dot(found.hessian.dot(step))
         # J(theta + s) = J + g's + s'H s / 2 + ...: `bend` is the s'H s that would have been right, to lowest order.
         bend = 2.0 * (there.cost - found.cost - slope)
         # A step along which the model falls has s'H s <= -2 g's: another one does not come from this Hessian.
@@ -229,7 +229,7 @@ class Follower:
             return False
         # Halved cells change a Hessian of a smooth f by next to nothing, one of a thin layer by its own size.
         finer = self._build([mesh.divide(2) for mesh in self.evaluator.meshes])(theta)
-        return bool(abs(step.dot(finer.hessian @ step) - curvature) > abs(curvature) / WRONG)
+        return bool(abs(step.dot(finer.hessian.dot(step)) - curvature) > abs(curvature) / WRONG)
 
     def _evaluate(self, theta: FloatArray, evaluate: Callable[[Evaluator], Evaluation[Any]]) -> Evaluation[Any]:
         # A trial that was evaluated on a mesh of its own stays on it: both sides of a kink, and J and its derivatives,

@@ -103,7 +103,8 @@ class SymmetricMatrix:
         """Whether all entries are."""
         return all(map(algebra.is_finite, self.parts))
 
-    def __abs__(self) -> Self:
+    def absolute(self) -> Self:
+        """Return the matrix of the absolute values of the entries."""
         return self.with_parts(*map(np.abs, self.parts))
 
     def scale(self, scaling: FloatArray) -> Self:
@@ -134,7 +135,7 @@ def diagonal_scaling(matrix: Dense | Arrow, floor: FloatArray | float = 0.0) -> 
     floor : array, shape (d,), or 0
         Diagonal entries too small to matter, below which D² does not go.
     """
-    size = abs(matrix)
+    size = matrix.absolute()
     scaling: FloatArray = algebra.jacobi_scaling(np.maximum(size.diagonal(), floor), size.largest_in_rows())
     # |H_ij| <= sqrt(H_ii H_jj) for a semi-definite H: Jacobi's scaling passes at once. Only an indefinite one goes on.
     for _ in range(algebra.EQUILIBRATIONS):

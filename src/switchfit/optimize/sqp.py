@@ -87,7 +87,7 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     """Backtrack on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
     problem, point = oracle.problem, state.point
     _, hessian = point.derivatives(point.reported_sides)
-    bending = float(ray @ (hessian.dot(ray)))
+    bending = float(ray @ hessian.dot(ray))
     sized = state.scale > 0.0
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
@@ -260,7 +260,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: step.Direction) -> St
     # The derivatives are rounded relative to their largest terms: those seen so far, and |H| |theta|.
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
-        floor = max(floor, float(np.max(abs(state.point.plus.hessian).dot(state.scale))))
+        floor = max(floor, float(np.max(state.point.plus.hessian.absolute().dot(state.scale))))
     below_rounding = step.is_below_rounding(oracle, state, direction)
     if below_rounding and state.point.optimality <= 1e5 * algebra.EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
