@@ -12,15 +12,7 @@ import scipy.integrate
 import switchfit as sf
 from benchmarks import vehicle_coverage
 from switchfit.fit.evaluator import Evaluator
-from switchfit.models import (
-    bicycle,
-    differential_drive,
-    lugre,
-    magic_formula,
-    rolling_body,
-    skid_steer,
-    sliding_block,
-)
+from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer, sliding_block
 from switchfit.models.magic_formula import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
