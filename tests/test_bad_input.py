@@ -170,10 +170,7 @@ def test_wrong_types(build, said):
         ),
         # Data
         (lambda: samples([0.0, 0.0], [1.0, 2.0]), ["must increase strictly; got 0.0 followed by 0.0"]),
-        (
-            lambda: samples([0.0, 1.0], [1.0]),
-            ["values of shape (K,) or (K, q); got (2,) and (1,)"],
-        ),
+        (lambda: samples([0.0, 1.0], [1.0]), ["values of shape (K,) or (K, q); got (2,) and (1,)"]),
         (lambda: samples([], []), ["Measurements needs 1 sample(s) or more; got 0"]),
         (lambda: samples([], np.empty((0, 0))), ["Measurements needs 1 sample(s) or more; got 0"]),
         (lambda: samples([], np.empty((0, 2)), sigma=np.empty((0, 2))), ["sigma must be", "shape (2,)"]),

@@ -128,11 +128,6 @@ def two_cubics(times):
     return np.stack([CUBIC(times), OTHER(times)], axis=1)
 
 
-def test_interpolation_reproduces_cubics():
-    signal = sf.ReferenceSignal.from_samples(IRREGULAR, two_cubics(IRREGULAR)).signal
-    np.testing.assert_allclose(signal(DENSE), two_cubics(DENSE), rtol=0, atol=1e-13)
-
-
 def test_missing_values_are_bridged_by_their_own_channel():
     """Gaps at different times, inside and at both ends; a cubic comes back whole."""
     values = two_cubics(IRREGULAR)

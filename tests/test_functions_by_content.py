@@ -212,8 +212,7 @@ def test_other_functions_are_other():
 
 
 @pytest.mark.parametrize(
-    "read",
-    [lambda p: p.pop("a"), lambda p: p.setdefault("a", 2.0), lambda p: p.popitem()[1], lambda p: p.copy()["a"]],
+    "read", [lambda p: p.pop("a"), lambda p: p.setdefault("a", 2.0), lambda p: p.popitem()[1], lambda p: p.copy()["a"]]
 )
 def test_a_function_may_read_its_parameters_by_any_method_of_a_dict(read):
     found = sf.evaluate(problem_of(lambda t, x, p: -read(p) * x))

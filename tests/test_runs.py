@@ -172,10 +172,10 @@ def pose(*runs, **guess):
 THREE = [sf.Parameter(1.0), 2.0, 3.0]
 UNEQUAL = {"k": [0.8, 0.5], "k_2": [0.7, 0.6]}
 WRONG = {
-    "parameter_map has 'k' -> 'k_3', but the problem has k, c": lambda: pose(run(), run(parameter_map={"k": "k_3"})),
+    "parameter_map has 'k' -> 'k_3', but the problem has k, b": lambda: pose(run(), run(parameter_map={"k": "k_3"})),
     "reads 'b', which is not there: p has k": lambda: pose(run(parameter_map={"k": "k_2"}), **UNEQUAL),
     "mode 'swing': .* raised IndexError": lambda: pose(run(parameter_map={"k": "b"})),
-    "must be a number or an sf.Parameter; got 'v'": lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
+    "must be a number or an sf.Parameter: .*; got 'v'": lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
     r"got the shapes \[\(2,\), \(\)\]": lambda: run(initial_state=[sf.Parameter([1.0, 2.0]), 0.0]),
     "must be an array of numbers, one for each state; got Parameter": lambda: run(initial_state=sf.Parameter([1.0])),
     "as many entries in the system and all experiments; got {2, 3}": lambda: pose(run(), run(initial_state=THREE)),

@@ -12,16 +12,7 @@ import scipy.integrate
 import switchfit as sf
 from benchmarks import vehicle_coverage
 from switchfit.fit.evaluator import Evaluator
-from switchfit.models import (
-    BUILT_IN,
-    bicycle,
-    differential_drive,
-    lugre,
-    magic_formula,
-    rolling_body,
-    skid_steer,
-    sliding_block,
-)
+from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer, sliding_block
 from switchfit.models.magic_formula import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
@@ -100,12 +91,6 @@ def test_sliding_block_decelerates_along_its_first_velocity():
     at_rest = jax.jacfwd(lambda t, x, p: system.modes["slide"](t, x, p), argnums=1)
     np.testing.assert_array_equal(evaluate(at_rest, [1.0, 2.0, 0.0, 0.0], BLOCK), np.eye(4, k=2))
     np.testing.assert_array_equal(evaluate(system.modes["stick"], [1.0, 2.0, 0.1, 0.0], BLOCK), np.zeros(4))
-
-
-def test_every_built_in_model_can_be_made():
-    for name, factory in BUILT_IN.items():
-        assert factory.__name__ == name
-        assert factory().state_names
 
 
 # --- a body that slides and rolls -------------------------------------------------------------------------------------

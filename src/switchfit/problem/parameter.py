@@ -319,6 +319,6 @@ def as_parameter(
         parameter = value if isinstance(value, Parameter) else Parameter(value, fixed=fixed)
     except (TypeError, ValueError) as error:
         raise type(error)(f"{what} must be {form}: {error}") from error
-    for _, date in list_dates(parameter):
+    for _, date in list_dates(parameter if parameter is value else parameter.value):
         raise ValueError(f"{what} must be a number; got the date {date!r}. Only transition times and tf may be dates.")
     return parameter

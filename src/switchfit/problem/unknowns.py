@@ -324,17 +324,18 @@ def _build_ordering(
         run = "" if len(experiments) == 1 else labels[e]
         knots = experiment.ends_of_modes(experiment.initial_times)
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
-        lengths, known = np.diff(knots), np.diff(np.where(ends < 0, knots, 0.0))
+        known = np.where(ends < 0, knots, 0.0)
         for i, mode in enumerate(experiment.mode_sequence):
             dwell, unit = get_min_duration(durations, mode), unit_suffix(experiment.time_unit)
-            if lengths[i] < dwell * (1 - 1e-12):
+            length = knots[i + 1] - knots[i]
+            if length < dwell * (1 - 1e-12):
                 raise ValueError(
                     f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run and f' of {run}'} "
-                    f"only {lengths[i]:.6g}{unit}."
+                    f"only {length:.6g}{unit}."
                 )
             if ends[i] >= 0 or ends[i + 1] >= 0:
                 rows.append(unit_rows[ends[i + 1]] - unit_rows[ends[i]])
-                bounds.append(dwell - known[i])
+                bounds.append(dwell - (known[i + 1] - known[i]))
                 kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
                 constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))
     return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(constraints)
