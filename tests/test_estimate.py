@@ -402,6 +402,7 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     exact = scipy.optimize.least_squares(lambda k: (followed(times, k[0]) - values) / SIGMA, [7.0], xtol=1e-14)
     assert found.theta[0] == pytest.approx(exact.x[0], rel=1e-5)
     assert [record.iteration for record in found.history] == list(range(len(found.history)))  # over all meshes
+    assert found.iterations == found.history[-1].iteration > found.earlier_iterations > 0
     assert np.all(np.diff([record.evaluations for record in found.history]) > 0)
 
 

@@ -50,13 +50,17 @@ class Evaluator:
         Points at which the meshes are refined; the problem's initial guess if left out.
     meshes : sequence of Mesh, optional
         Meshes to use instead of refined ones.
+    finer : float
+        Multiplies the number of cells of refined meshes.
     """
 
-    def __init__(self, problem: Problem, *thetas: FloatArray, meshes: Sequence[Mesh] | None = None) -> None:
+    def __init__(
+        self, problem: Problem, *thetas: FloatArray, meshes: Sequence[Mesh] | None = None, finer: float = 1.0
+    ) -> None:
         self.problem = problem
         if meshes is None:
             points = thetas or (problem.initial_theta,)
-            meshes = [refine_mesh_of_run(run, *points) for run in self.runs]
+            meshes = [refine_mesh_of_run(run, *points, finer=finer) for run in self.runs]
         self.meshes = list(meshes)
         padded = self._pad_meshes()
         self._set_arguments([run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)])

@@ -470,23 +470,22 @@ class Profile(Tabular, Displayed):
 
     def _find_crossing(self, a: Point, b: Point, threshold: float) -> float:
         """Return where |zeta| equals the threshold, between two neighboring points on different sides of it."""
-        found = {a.value: a, b.value: b}
-        inner = min((a, b), key=lambda q: abs(q.value - self.value))
+        found = [a, b]
 
         def excess(value: float) -> float:
-            point = found.get(value) or self._add(value, min(found.values(), key=lambda q: abs(q.value - value)))
-            if point is None:  # use the nearest point that could be fitted
-                point = min(found.values(), key=lambda q: abs(q.value - value))
-            found[value] = point
+            near = min(found, key=lambda q: abs(q.value - value))
+            # If no fit succeeds, use the nearest point that could be fitted.
+            point = near if near.value == value else self._add(value, near) or near
+            found.append(point)
             return abs(self._compute_zeta(point)) - threshold
 
         from scipy.optimize import brentq
 
         # zeta is nearly linear in the unknown: a root finder by secants needs a few fits.
-        precision = 1e-7 * max(abs(b.value - a.value), abs(inner.value - self.value))
+        precision = 1e-7 * max(abs(b.value - a.value), min(abs(q.value - self.value) for q in (a, b)))
         root = float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))
         # No fit came near the threshold: zeta jumps over it where the minimum in the other unknowns ends.
-        if min(abs(abs(self._compute_zeta(q)) - threshold) for q in found.values()) > 1e-3 * threshold:
+        if min(abs(abs(self._compute_zeta(q)) - threshold) for q in found) > 1e-3 * threshold:
             self.jumps.append(root)
         return root
 
