@@ -455,9 +455,11 @@ def add_sample_jumps(
     starts, total = pick(ends, slice(1, None)), Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
     for k, (sensor, samples) in enumerate(zip(model.structure.measurements, model.arguments.samples, strict=True)):
 
-        def add_late(Dp_x: Array, x: Array, *given: Any, k: int = k) -> tuple[Adjoints, Quadratures]:
+        def add_late(Dp_x: Array, x: Array, sample: Samples, *row: Any, k: int = k) -> tuple[Adjoints, Quadratures]:
+            segment, piece, start = row
+
             def cost(x: Array, p: Array) -> Array:
-                there, x_s = step_to_late_sample(model, k, *given, x, p)
+                there, x_s = step_to_late_sample(model, k, sample, segment, piece, start, x, p)
                 return model.sample_cost(k, there, x_s, p)
 
             return add_point_cost(cost, x, Dp_x, p)

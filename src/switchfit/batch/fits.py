@@ -358,10 +358,12 @@ class Fits(Tabular, Displayed):
             raise ValueError(
                 f"{file} holds the kind of fits {name!r}, not {cls.__name__}: sf.Fits.load reads every kind."
             )
-        kind = kinds[name]
+        kind: type[Any] = kinds[name]
         try:
             nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
-            return kind(**arrays, **vars(from_json(_split_fields(kind)[1], content.get("fits"), "fits")), **nested)
+            others = vars(from_json(_split_fields(kind)[1], content.get("fits"), "fits"))
+            found: Self = kind(**arrays, **others, **nested)
+            return found
         except (TypeError, ValueError, OverflowError, RecursionError, MemoryError) as error:
             raise ValueError(f"{file} is damaged: {error}.") from error
 

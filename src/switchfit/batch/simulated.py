@@ -276,7 +276,7 @@ def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     return dict(zip(places, (comparison.fitted for run in comparisons for comparison in run), strict=True))
 
 
-def _find_spreads(problem: Problem, truth: FloatArray, noise: Noise, clean: Values) -> Values:
+def _find_spreads(problem: Problem, truth: FloatArray, noise: Any, clean: Values) -> Values:
     """Return the standard deviations of the noise of all data, (K, q) each."""
     found = {}
     for (e, k), values in clean.items():

@@ -87,8 +87,12 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = l
     is_kept = only is not None and (out / RESULTS).exists()
     results: dict[str, Any] = json.loads((out / RESULTS).read_bytes()) if is_kept else {}
     for number, name in enumerate(names, start=1):
-        part, place, began = PARTS[name], f"[{number}/{len(names)}] {PARTS[name].title}", time.perf_counter()
-        found = part.compute(quick, lambda text, place=place: say(f"{place}: {text}"))
+        part, began = PARTS[name], time.perf_counter()
+
+        def report(text: str, place: str = f"[{number}/{len(names)}] {part.title}") -> None:
+            say(f"{place}: {text}")
+
+        found = part.compute(quick, report)
         results[name] = {"quick": quick, "seconds": round(time.perf_counter() - began, 1), "found": found}
         for title, figure in part.draw(found).items():
             for kind in ("pdf", "png"):
