@@ -382,15 +382,11 @@ class Fitter:
         return replace(base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs)
 
     @property
-    def _is_native(self) -> bool:
-        return None not in self._simulators
-
-    @property
     def shares_programs(self) -> bool:
         """Whether another sequence compiles nothing: always in machine code, and with JAX one program for each number
         of switches if no functions act at transitions.
         """
-        return self._is_native or not any(
+        return None not in self._simulators or not any(
             structure.reset_library or structure.guard_library or structure.transition_cost_library or structure.known
             for structure in self.problem.structures
         )
@@ -447,7 +443,7 @@ class Fitter:
             even = None if len(run.jump_times) else space_evenly(s.sequence, s.t0, s.tf, self.library)
             guesses.append(even or spread(s, self.library) or s)
         problem = self._build_problem(guesses)
-        if not self._is_native or problem.system.guards or problem.constraint_names:
+        if None in self._simulators or problem.system.guards or problem.constraint_names:
             return Evaluator(problem, meshes=self.meshes)
         found = object.__new__(Evaluator)
         found.problem, found.meshes, found.arguments = problem, self.evaluator.meshes, self.evaluator.arguments

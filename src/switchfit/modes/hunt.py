@@ -223,9 +223,7 @@ class Improver:
             if proposal.sequences not in taken and len(taken) < most and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
                 given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
-                schedules = [
-                    Schedule(sequence, np.asarray(times, dtype=float), *span) for sequence, times, span in given
-                ]
+                schedules = [Schedule(sequence, times, *span) for sequence, times, span in given]
                 self.polish(schedules, proposal.parameters, "fits of proposals")
 
     def _is_hopeless(self, proposal: Proposal) -> bool:
@@ -253,7 +251,7 @@ class Improver:
 
     def _try(self, best: Fitted, move: Callable[[Fitted], None]) -> bool:
         """Try the moves of a kind; return whether the best is better."""
-        before = self.pool.compute(best)
+        before = self.pool.lowest
         move(best)
         return self.pool.lowest < before - LOWER * max(abs(before), 1.0)
 
