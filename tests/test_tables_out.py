@@ -24,7 +24,6 @@ from switchfit.io.command_line import write_runs, write_unknowns
 from switchfit.models import heater_problem
 from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.runtime.errors import MissingExtraError
-from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.residuals import correct_intervals
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -429,15 +428,6 @@ def test_runs_have_how_well_they_fit(estimate):
     flags = [row["flags"] for row in rows]
     assert flags[3] == "residuals of room3 T correlated; chi2 of room3 T too large"
     assert all("room3" not in flags[e] for e in (0, 1, 2, 4))
-
-
-def test_the_report_names_the_files_where_it_leaves_rows_out(estimate):
-    files = {"runs": "out/runs.csv", "unknowns": "out/unknowns.csv"}
-    text = format_text(estimate, files=files)
-    assert "and 2 more experiments, all in out/runs.csv" in text
-    assert "more unknowns, all in" not in text  # ten of them are listed
-    assert "all in" not in format_text(estimate, full=True, files=files)
-    assert "all in" not in estimate.report()
 
 
 def test_the_command_writes_them_where_they_are_many(folder):  # noqa: F811

@@ -176,7 +176,7 @@ def describe_steps(problem: Problem, *, full: bool = False) -> str:
     rows = []
     for name, structure, mesh in zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True):
         run = "" if len(problem.experiments) == 1 else f"{name}: "
-        rows.append("; ".join([f"  {run}{mesh.cells:,} {_describe_method(structure)}", *mesh.stiffness]))
+        rows.append("; ".join([f"  {run}{mesh.cells:,} {_describe_method(structure)}", *map(str, mesh.stiffness)]))
     if not full and len(rows) > MOST_EXPERIMENTS:
         total = sum(mesh.cells for mesh in evaluator.meshes)
         rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
@@ -307,7 +307,9 @@ def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
     name : str
     trajectory : Trajectory
     """
-    modes = [{"mode": mode, "begin": begin, "end": end} for mode, begin, end in trajectory.mode_spans]
+    modes: list[dict[str, Any]] = [
+        dict(zip(("mode", "begin", "end"), span, strict=True)) for span in trajectory.mode_spans
+    ]
     found = {"name": name, "time_unit": trajectory.time_unit, "modes": modes, "jumps": trajectory.jump_times}
     if trajectory.origin is None:
         return found

@@ -239,11 +239,11 @@ def read_source(path: Path, given: Options) -> Log:
     path : Path
     given : Options
     """
-    options = _check_options(given)
+    options, origin = _check_options(given), _check_origin(given.origin)
     log = _read_format(path, options)
     wanted = any(name in FRAME and name not in log for name in options.columns or ())
-    if wanted or options.origin is not None or options.range_error is not None or log.has_positions:
-        log = _add_local_frame(log, options.origin, options.range_error)
+    if wanted or origin is not None or options.range_error is not None or log.has_positions:
+        log = _add_local_frame(log, origin, options.range_error)
     log = log if options.columns is None else log[list(options.columns)]
     log = _inspect_log(log, options.repair)
     return log if options.time_unit is None else _convert_times(log, options.time_unit)
@@ -266,7 +266,7 @@ def _check_options(given: Options) -> Options:
     for name in repair:
         if name not in REPAIRS and not (name.startswith("unwrap:") and len(name) > len("unwrap:")):
             raise InputError(f"repair must be among {', '.join(REPAIRS)} and unwrap:CHANNEL; got {shorten(name)}.")
-    return given._replace(columns=columns, origin=_check_origin(given.origin), range_error=error, repair=repair)
+    return given._replace(columns=columns, range_error=error, repair=repair)
 
 
 def _convert_times(log: Log, unit: str) -> Log:

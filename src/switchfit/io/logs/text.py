@@ -39,8 +39,10 @@ _GERMAN = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")
 _ONE_DIGIT = re.compile(r"(?<=[- ])(\d)(?!\d)")
 """A month, a day or an hour that ISO 8601 has with two digits."""
 
-Line, Row = tuple[int, str], tuple[int, list[str]]
-"""Number of a line, and its text or its cells."""
+Line = tuple[int, str]
+"""Number of a line, and its text."""
+Row = tuple[int, list[str]]
+"""Number of a line, and its cells."""
 
 
 # --- the header -------------------------------------------------------------------------------------------------------
@@ -336,19 +338,19 @@ def _read_table(path: Path, drop_broken: bool) -> _Table:
     ]
     try:
         head, notes = split_lines(kept[:SNIFFED], delimiter), split_lines(comments[-1:], delimiter)
-        *header, first = read_header([cells for _, cells in head], notes[0][1] if notes else [])
-        width, body = len(header[0]), kept[first:]
+        names, units, places, first = read_header([cells for _, cells in head], notes[0][1] if notes else [])
+        width, body = len(names), kept[first:]
         numbers = None if drop_broken else _parse_block([line for _, line in body], delimiter, width)
         if numbers is not None:
-            return _Table(str(path), *header, np.array([k for k, _ in body]), list(numbers.T.copy()))
+            return _Table(str(path), names, units, places, np.array([k for k, _ in body]), list(numbers.T.copy()))
         rows, broken = _check_widths(split_lines(kept, delimiter)[first:], width, drop_broken)
     except ValueError as error:
         raise InputError(f"{path}, {error}") from error
     if not rows:
         raise InputError(f"{path} has a header but no rows; there is nothing to read.")
     comma = delimiter != "," and _use_decimal_commas(path, rows)  # between commas, 1,234 is rather a thousand
-    columns = list(zip(*(cells for _, cells in rows), strict=True))
-    return _Table(str(path), *header, np.array([line for line, _ in rows]), columns, comma, broken)
+    columns: list[Any] = list(zip(*(cells for _, cells in rows), strict=True))
+    return _Table(str(path), names, units, places, np.array([line for line, _ in rows]), columns, comma, broken)
 
 
 def _parse_block(lines: list[str], delimiter: str, width: int) -> FloatArray | None:
@@ -457,7 +459,7 @@ def _read_times(table: _Table, column: int, options: Options) -> Log:
         times, unit = np.array(_read_cells(table, column, cells, _read_clock, np.nan, what)), "s"
     elif is_date(sample):
         what = "is not a date that can be read; write dates as 2024-05-01T12:34:56.789, or times as numbers."
-        if is_clock:
+        if is_clock and day is not None:
             pairs = zip(table.columns[day], cells, strict=True)
             cells = [cell if is_missing(cell) else f"{date} {cell}" for date, cell in pairs]
         dates = _read_cells(table, column, cells, _read_date, (None, None), what)

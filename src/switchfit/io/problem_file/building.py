@@ -153,9 +153,10 @@ def _list_files(folder: Path, contents: Contents) -> list[Path]:
         if name.endswith(".py"):
             finder = ModuleFinder([str((folder / name).parent)])
             finder.run_script(str(folder / name))
-            files += [Path(module.__file__) for module in finder.modules.values() if getattr(module, "__file__", None)]
+            found = (getattr(module, "__file__", None) for module in finder.modules.values())
+            files += [Path(file) for file in found if file is not None]
         else:
-            for path in (folder / found for found in find_logs(folder, name) or [name]):
+            for path in (folder / log for log in find_logs(folder, name) or [name]):
                 files += sorted(path.rglob("*")) if path.is_dir() else [path]
     return list(dict.fromkeys(files))
 
@@ -359,8 +360,8 @@ def build_parameter(table: tables.ParameterTable) -> Parameter:
     """
     given = table.model_dump(exclude_none=True)
     if (prior := given.pop("prior", None)) is not None:
-        kind = {("mean", "sd"): Normal, ("median", "log_sd"): LogNormal}.get(tuple(prior))
-        if kind is None:
+        kinds: dict[tuple[str, ...], Any] = {("mean", "sd"): Normal, ("median", "log_sd"): LogNormal}
+        if (kind := kinds.get(tuple(prior))) is None:
             raise ValueError(f"prior needs mean and sd (normal), or median and log_sd (log-normal); got {prior}.")
         given["prior"] = kind(**prior)
     return Parameter(**given)
