@@ -1,8 +1,7 @@
-"""A headless Chromium for tests of pages, by its DevTools protocol; Bokeh brings the websockets of Tornado."""
+"""A headless Chromium for tests of pages, by its DevTools protocol; Dask brings the websockets of Tornado."""
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import shutil
@@ -68,15 +67,6 @@ class Browser:
         elif event["method"] == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def open(self, path: Path):
-        """Load a file, and wait until its figures are drawn."""
-        size = {"width": 1240, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
-        self.call("Emulation.setDeviceMetricsOverride", **size)
-        self.errors, self.requests = [], []
-        self.call("Page.navigate", url=path.resolve().as_uri())
-        self.wait("document.documentElement?.dataset.ready === 'true'")
-        self.evaluate("new Promise((done) => setTimeout(done, 300))")
-
     def wait(self, condition, seconds=60):
         """Wait until an expression is true."""
         end = time.monotonic() + seconds
@@ -89,10 +79,6 @@ class Browser:
         done = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in done, done
         return done["result"].get("value")
-
-    def print(self):
-        """Return the page printed, as PDF."""
-        return base64.b64decode(self.call("Page.printToPDF", preferCSSPageSize=True)["data"])
 
     def close(self):
         self.socket.close()

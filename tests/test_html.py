@@ -1,12 +1,10 @@
-"""The report as one HTML file: what it says, that it needs nothing else, and what it does in a browser."""
+"""The report as one HTML file: what it says, and that it needs nothing else."""
 
 import base64
-import gzip
 import hashlib
 import html.parser
 import importlib.metadata
 import io
-import json
 import re
 import sys
 import warnings
@@ -33,19 +31,18 @@ from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
-pytest.importorskip("bokeh", reason="needs the extra report: pip install 'switchfit[report]'")
-pages = importlib.import_module("switchfit.report.html.page")
+pytest.importorskip("jinja2", reason="needs the extra report: pip install 'switchfit[report]'")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 TOSS = EXAMPLES / "toss" / "problem.toml"
-LARGEST = 5_000_000
+LARGEST = 3_000_000
 """Bytes of a page."""
 VOID = {"meta", "link", "input", "br", "img", "hr"}
-HOSTILE = '<script>window.hacked = true</script>"><img src=x onerror="window.hacked = true">'
+HOSTILE = '"><script>run()</script>'
 
 
 class Reader(html.parser.HTMLParser):
-    """Reads a page strictly: elements in their order with their attributes, tables as text, scripts apart."""
+    """Reads a page strictly: elements in their order with their attributes, tables as text."""
 
     def __init__(self, text):
         super().__init__()
@@ -70,8 +67,6 @@ class Reader(html.parser.HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, text):
-        if self.open and self.open[-1] == "script":
-            return
         self.text.append(text)
         if {"td", "th"} & set(self.open):
             self.tables[-1][-1][-1] += text
@@ -82,16 +77,6 @@ class Reader(html.parser.HTMLParser):
 
     def count(self, tag):
         return sum(own == tag for own, _ in self.elements)
-
-
-def payload_of(text):
-    return json.loads(re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.DOTALL)[1])
-
-
-def array_of(sources, source, column):
-    """A column of a source, from what Bokeh makes of it."""
-    entry = dict(sources[source]["entries"])[column]
-    return np.frombuffer(gzip.decompress(base64.b64decode(entry["array"]["data"])), dtype=entry["dtype"]).astype(float)
 
 
 @pytest.fixture(scope="module")
@@ -209,29 +194,17 @@ def test_the_page_says_what_the_text_says_with_the_verdict_first(toss, toss_page
     assert (np.abs(ends - correct_intervals(toss)) < 0.04 * correct_errors(toss)[:, None]).all()
 
 
-def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
-    payload = payload_of(toss_page)
-    assert "match_aspect" in json.dumps(payload["templates"]["run-0"]), "the path in the plane"
-    (run,) = payload["runs"]
-    sources = run["sources"]
-    comparison = toss.comparisons[0][0]
-    np.testing.assert_array_equal(array_of(sources, "samples-0", "m0"), comparison.measured[:, 0])
-    np.testing.assert_allclose(array_of(sources, "samples-0", "y1"), comparison.residuals[:, 1], atol=1e-15)
-    times, curve = array_of(sources, "curve-0", "t"), array_of(sources, "curve-0", "y0")
-    np.testing.assert_array_equal(np.isnan(times), np.isnan(curve))
-    there = ~np.isnan(times)
-    np.testing.assert_allclose(curve[there], np.interp(times[there], comparison.curve_times, comparison.curve[:, 0]))
-    assert np.isnan(times).sum() == 1, "broken at the transition"
-    low, high = correct_intervals(toss)[toss.theta_names.index("tau_1")]
-    assert (*array_of(sources, "transitions", "low"), *array_of(sources, "transitions", "high")) == (low, high)
-    low, high = (array_of(sources, "curve-0", name)[there] for name in ("lo0", "hi0"))
-    band = sf.predict(toss)
-    half = toss.quantile(0.95) * np.interp(times[there], band.times, band.output_errors[:, 0])
-    np.testing.assert_allclose((high - low) / 2, half, rtol=1e-3)
-    first, last = toss.trajectory.times[[0, -1]]
-    margins = first - run["ranges"]["times"]["start"], run["ranges"]["times"]["end"] - last
-    assert margins[0] == pytest.approx(margins[1])
-    assert 0.0 < margins[0] < 0.1 * (last - first)
+def list_pictures(text):
+    """The pictures of a page."""
+    images = [attributes["src"].partition(",") for tag, attributes in Reader(text).elements if tag == "img"]
+    assert {kind for kind, _, _ in images} == {"data:image/svg+xml;base64"}
+    return [base64.b64decode(content).decode() for _, _, content in images]
+
+
+def test_the_pictures_are_those_of_the_fit(toss_page):
+    said = ("95 % confidence", "transition", "Autocorrelation", "optimality (KKT residual)")
+    for picture, part in zip(list_pictures(toss_page), said, strict=True):
+        assert f">{part}" in picture, part
 
 
 def test_the_inputs_are_there_to_run_it_again(toss_page):
@@ -270,11 +243,6 @@ def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_ther
         np.testing.assert_allclose(far, factors[i] * near, rtol=1e-9)
 
 
-def test_the_page_says_how_late_samples_are():
-    fit, text = fit_and_page("delay, outliers")
-    assert f"x is late by {fit.parameters['late']:.6g} s" in Reader(text).words
-
-
 def test_positions_in_a_plane_are_told_by_names_and_units():
     for names, units, plane in (
         (("x", "y"), ("m", "m"), (0, 1)),
@@ -288,7 +256,7 @@ def test_positions_in_a_plane_are_told_by_names_and_units():
     ):
         assert find_plane(names, units) == plane, names
     # Without samples of both there is nothing to draw in it.
-    assert "match_aspect" not in fit_and_page("no data")[1].partition('id="payload"')[2]
+    assert len(list_pictures(fit_and_page("no data")[1])) == 1, "the states over time"
 
 
 # --- one file ---------------------------------------------------------------------------------------------------------
@@ -299,6 +267,7 @@ def check_alone(text):
     assert len(text.encode()) < LARGEST
     reader = Reader(text)
     assert text.startswith("<!DOCTYPE html>\n")
+    assert reader.count("script") == 0
     for tag, attributes in reader.elements:
         for name in ("src", "href", "action", "data", "poster", "srcset"):
             value = attributes.get(name, "#")
@@ -315,9 +284,7 @@ def check_alone(text):
 def test_names_do_no_harm():
     fit, text = fit_and_page("hostile names")
     reader = check_alone(text)
-    assert reader.count("script") == 3
-    drawn = [attributes["id"] for tag, attributes in reader.elements if tag == "img"]
-    assert drawn == ["residuals-drawing", "convergence-drawing"]
+    assert not any("<script" in picture for picture in list_pictures(text))
     shown = Reader(fit.problem._repr_html_())
     assert shown.count("script") == 0
     assert HOSTILE in reader.words
@@ -329,12 +296,7 @@ def test_many_runs_stay_small_and_the_worst_come_first():
     fit = sf.estimate(sf.Problem(RAMP, ramps(45), {"v": 0.9}), strategy="local")
     text = format_page(fit)
     reader = check_alone(text)
-    payload = payload_of(text)
-    assert len(payload["runs"]) == pages.MOST_RUNS
-    assert f"The {pages.MOST_RUNS} of 45 runs that are explained worst" in reader.words
-    assert re.findall(r'<option value="\d+">\s*(\S+):', text)[0] == fit.run_names[-1]
-    assert len([name for name in payload["templates"] if name.startswith("run-")]) == 1, "all runs share a drawing"
-    assert len(text) < 2_500_000
+    assert "Shown are the 10 of 45 runs that are explained worst" in reader.words
     (table,) = (table for table in reader.tables if table[0][1] == "value")
     assert [row[0] for row in table[1:]] == list(fit.theta_names)
     shown = Reader(fit._repr_html_())
@@ -344,12 +306,12 @@ def test_many_runs_stay_small_and_the_worst_come_first():
 
 def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "switchfit.report.html.page")
-    monkeypatch.setitem(sys.modules, "bokeh", None)
-    with pytest.raises(ImportError, match=r"needs bokeh, not installed here: pip install 'switchfit\[report\]'"):
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    with pytest.raises(ImportError, match=r"needs jinja2, not installed here: pip install 'switchfit\[report\]'"):
         heater.save_report(tmp_path / "report.html")
     done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])
     assert done.exit_code == 0
-    assert "no report.html: an HTML report needs bokeh" in done.stderr
+    assert "no report.html: an HTML report needs jinja2" in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "fit.png", "report.txt"]
 
 
@@ -370,56 +332,6 @@ def test_a_notebook_shows_the_text_and_a_figure(toss):
     assert ["k", "0.5", "0.01", "5", "1/h"] in lines
 
 
-# --- in a browser -----------------------------------------------------------------------------------------------------
-
-
-def check_quiet(browser):
-    """No error, no warning, nothing asked of the network."""
-    assert browser.errors == []
-    assert [url for url in browser.requests if not url.startswith(("file:", "data:", "blob:"))] == []
-
-
-def write(folder, text):
-    path = folder / "report.html"
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-CHOOSE = """(value) => {
-  const chooser = document.getElementById("run");
-  chooser.value = value;
-  chooser.dispatchEvent(new Event("change"));
-}"""
-
-
-@pytest.mark.slow
-def test_runs_are_chosen_channels_switched_off_and_all_of_it_printed(browser, tmp_path):
-    browser.open(write(tmp_path, format_page(sf.estimate(sf.Problem(RAMP, ramps(4), {"v": 0.9})))))
-    shown = "[...document.querySelectorAll('#fit .run.shown')].map((r) => r.dataset.run).join()"
-    drawn = "[...document.querySelectorAll('#fit .run.shown .figure')].every((f) => f.offsetHeight > 300)"
-    height = "document.getElementById('run-0').getBoundingClientRect().height"
-    assert browser.evaluate(shown) == "0"
-    for value, runs in (("2", "2"), ("all", "0,1,2,3")):
-        browser.evaluate(f"({CHOOSE})('{value}')")
-        browser.wait(drawn)
-        assert browser.evaluate(shown) == runs
-    before = browser.evaluate(height)
-    browser.evaluate("document.querySelector('[data-channel=\"0-0\"]').click()")
-    browser.wait(f"{height} < {before - 200}", 10)
-    browser.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = false; })")
-    assert browser.print().startswith(b"%PDF")
-    assert browser.evaluate("[...document.querySelectorAll('details')].every((d) => d.open)")
-    check_quiet(browser)
-
-
-@pytest.mark.parametrize(
-    "kind", ["hostile names", *(pytest.param(kind, marks=pytest.mark.slow) for kind in list(KINDS)[1:])]
-)
-def test_every_kind_of_problem_is_shown_without_an_error(browser, tmp_path, kind):
-    _, text = fit_and_page(kind)
-    check_alone(text)
-    browser.open(write(tmp_path, text))
-    browser.evaluate("document.querySelectorAll('[data-channel]').forEach((box) => { if (!box.checked) box.click(); })")
-    browser.evaluate("new Promise((done) => setTimeout(done, 200))")
-    assert browser.evaluate("window.hacked") is None
-    check_quiet(browser)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_problem_has_a_page(kind):
+    check_alone(fit_and_page(kind)[1])

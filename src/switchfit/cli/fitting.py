@@ -104,7 +104,7 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     import switchfit as sf
 
     importing = threading.Thread(target=_import_figures, daemon=True)
-    if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
+    if prepare_figures:  # matplotlib, which must not look for a display, loads while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         importing.start()
     with terminal.stop_on_interrupt(
@@ -224,7 +224,7 @@ def _import_figures() -> None:
         import matplotlib.backends.backend_agg
         import matplotlib.figure  # noqa: F401
 
-        import switchfit.report.html.page  # noqa: F401  # with Bokeh and Jinja2
+        import switchfit.report.html.page  # noqa: F401  # with Jinja2
 
 
 def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None:

@@ -1,345 +1,28 @@
-"""The page: what the templates show, and the JSON that the page's script turns into figures.
-
-Import this only where Bokeh and Jinja2 are installed.
-
-The figures of runs are drawn without numbers, which the page's script puts into the sources by their names. Colours
-that have to change with the reader's light or dark background carry the tag "ink", "muted" or "edge"; the script sets
-them, and those of axes.
-"""
+"""The page: what its template shows. Import this only where Jinja2 is installed."""
 
 from __future__ import annotations
 
 import base64
-import gzip
 import io
-import itertools
-import json
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 import numpy as np
-from bokeh import models
-from bokeh.core.serialization import Serializer
-from bokeh.embed import json_item
-from bokeh.layouts import column
-from bokeh.plotting import figure
-from bokeh.resources import Resources
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import Provenance
-from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray
-from switchfit.problem.parameter import unit_suffix
-from switchfit.report import formats, text
-from switchfit.report.formats import Timed, format_unit, label_quantity, label_time
-from switchfit.report.plot import choose_mode_colours, find_plane, has_bands, list_outputs, replace_infinities
-from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
+from switchfit.report import text
+from switchfit.report.plot import choose_runs, find_plane
+from switchfit.report.sentences import list_reasons, write_reason, write_step
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.prediction import predict
-from switchfit.uncertainty.residuals import explain_worst, find_transition_intervals, rank_runs
 
-FIT, DATA = "#d0392b", "#5b6470"
-"""Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
-HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT = 270, 130, 420
-LEFT = 78
-"""Pixels to the left of all axes, so that figures below one another share their times."""
-UNBROKEN = {"break-inside": "avoid"}
-"""A channel is printed on one page."""
-WIDE: dict[str, Any] = {"sizing_mode": "stretch_width"}
-TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
-UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
-DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
-DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
-"""Of shades below the curves, of what was measured, and of what it is compared with."""
-DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
-"""Of up to so many samples."""
-LABELS = {"measurements": "measured", "reference": "reference"}
-
-
-MOST_RUNS = 12
-"""Experiments whose figures are in a page, those that are explained worst."""
-MOST_CHANNELS = 6
-"""Channels of a run that are shown at first; the others are switched on."""
 MOST_DIAGNOSED = 2
 """Channels whose residuals have figures."""
-MARGIN = 0.01
-"""Part of the horizon that is shown before and after it."""
 MOST_CORRELATED = 60
 """Unknowns in the heat map, the first ones; the largest correlations of all are listed beside it."""
-MOST_POINTS, FEWEST_POINTS = 800, 80
-"""Points of one curve: with more of them a figure looks the same."""
-MOST_SAMPLES = 2000
-"""Samples of one channel that are drawn."""
-BUDGET = 300_000
-"""Numbers that the curves of all runs may have together: 1.6 MB in the page."""
-
-
-Columns = Mapping[str, Any]
-"""Numbers by the names that they have in the page."""
-
-
-# --- the numbers of the figures ---------------------------------------------------------------------------------------
-
-
-class Curves(NamedTuple):
-    """One of the data of a run, or its states: a curve of Q channels, and what was measured of it.
-
-    Attributes
-    ----------
-    names, units : sequence of str, one a channel
-    kind : {"measurements", "reference", "states"}
-    curve : mapping of name to (L,)
-        Times t, with NaN where a transition breaks the curve, and mode. Of channel k the values y{k}, and the 95 %
-        confidence band from lo{k} to hi{k}, in float32, if there is one.
-    samples : mapping of name to (K,)
-        Empty for states. Times t; of channel k what is measured, m{k}, its residuals y{k}, sigma s{k} and n{k} = -s{k},
-        outliers o{k}.
-    left_out : int
-        Samples that are not drawn.
-    """
-
-    names: Sequence[str]
-    units: Sequence[str]
-    kind: str
-    curve: Columns
-    samples: Columns
-    left_out: int
-
-
-def collect_curves(estimate: Estimate, e: int, points: int) -> list[Curves]:
-    """Return the curves of one run: an entry for each of its data, then the states that are not measured by name.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    e : int
-        Which run, from 0.
-    points : int
-        Of one curve.
-    """
-    trajectory, comparisons = estimate.trajectories[e], estimate.comparisons[e]
-    band = _stack_bands(estimate, e)
-    kept, breaks = _thin(trajectory.pieces, points)
-
-    def list_curve(values: FloatArray, first: int, late: float = 0.0) -> dict[str, Any]:
-        """Thin values at the nodes (L, Q), whose bands begin at a column, and break them at transitions."""
-        curve: dict[str, Any] = {"t": np.insert(trajectory.times[kept], breaks, np.nan) + late}
-        curve["mode"] = np.insert(trajectory.modes[kept].astype(object), breaks, "").tolist()
-        for k, own in enumerate(values.T):
-            curve[f"y{k}"] = replace_infinities(np.insert(own[kept], breaks, np.nan))
-            for name, side in {"lo": -1.0, "hi": 1.0}.items() if band is not None else ():
-                edge = (own + side * band[:, first + k])[kept]
-                curve[f"{name}{k}"] = replace_infinities(np.insert(edge, breaks, np.nan)).astype("f4")
-        return curve
-
-    found, first = [], 0
-    for comparison in comparisons:
-        count, units = len(comparison.times), list(map(format_unit, comparison.units))
-        curve = list_curve(comparison.curve, first, float(comparison.curve_times[0] - trajectory.times[0]))
-        first += len(comparison.names)
-        if find_plane(comparison.names, units) is not None:
-            before_breaks = np.append(False, np.isnan(curve["t"][:-1]))
-            curve["size"] = np.where(before_breaks, 13.0, 0.0).astype("f4")
-        drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
-        if comparison.kind == "reference" and count == len(trajectory.times):
-            drawn = kept
-        left_out = count - len(drawn) if comparison.kind == "measurements" else 0
-        samples = _list_samples(comparison, drawn)
-        found.append(Curves(comparison.names, units, comparison.kind, curve, samples, left_out))
-    measured = {name for comparison in comparisons for name in comparison.names}
-    for k, (name, unit) in enumerate(zip(trajectory.state_names, trajectory.state_units, strict=True)):
-        if name not in measured:
-            curve = list_curve(trajectory.states[:, [k]], first + k)
-            found.append(Curves([name], [format_unit(unit)], "states", curve, {}, 0))
-    return found
-
-
-def _stack_bands(estimate: Estimate, e: int) -> FloatArray | None:
-    """Return half the widths of the bands of all outputs and then all states of a run at its nodes, (L, Q + n)."""
-    if not has_bands(estimate):
-        return None
-    prediction, times = predict(estimate, experiment=e), estimate.trajectories[e].times
-    errors = np.hstack([prediction.output_errors, prediction.state_errors])
-    return estimate.quantile(0.95) * np.stack([np.interp(times, prediction.times, own) for own in errors.T], axis=1)
-
-
-def _list_samples(comparison: Comparison, drawn: NDArray[np.intp]) -> Columns:
-    """Return the columns of the samples that are drawn."""
-    columns: dict[str, Any] = {"t": comparison.times[drawn]}
-    for k in range(len(comparison.names)):
-        measured = replace_infinities(comparison.measured[drawn, k])
-        columns |= {f"m{k}": measured, f"y{k}": measured - replace_infinities(comparison.fitted[drawn, k])}
-        if comparison.sigma is not None:
-            sigma = replace_infinities(comparison.sigma[drawn, k])
-            columns |= {f"s{k}": sigma, f"n{k}": -sigma}
-        if comparison.downweighted is not None:
-            columns[f"o{k}"] = np.where(comparison.downweighted[drawn, k], measured, np.nan)
-    return columns
-
-
-def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return which nodes are kept, the ends of all segments among them, and before which of these a curve breaks."""
-    stride = max(-(-int(segments[-1]) // points), 1)
-    parts = [
-        np.unique(np.concatenate([np.arange(start, end, stride), [end - 1]]))
-        for start, end in itertools.pairwise(segments.tolist())
-    ]
-    return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
-
-
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
-def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> Any:
-    """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
-
-    Parameters
-    ----------
-    curves : sequence of Curves
-        Of one of the runs that share the drawing.
-    columns : mapping of name to columns
-        Of the same run, by the names of their sources.
-    run : Timed
-    """
-    sources = {name: models.ColumnDataSource({key: [] for key in own}, name=name) for name, own in columns.items()}
-    times = models.Range1d(name="times")
-    blocks: list[Any] = []
-    for c, own in enumerate(curves):
-        curve, samples = sources[f"curve-{c}"], sources[f"samples-{c}"] if own.samples else None
-        for k, name in enumerate(own.names):
-            panel = _make_time_figure(HEIGHT, times, label_quantity(name, own.units[k]), sources, run)
-            line = _draw_curve(panel, own, k, curve)
-            parts = [panel]
-            if samples is not None:
-                _draw_samples(panel, own, k, samples, run)
-                below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual", sources, run)
-                below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
-                _draw_residuals(below, own, k, samples)
-                panel.xaxis.visible = False
-                parts.append(below)
-            parts[-1].xaxis.axis_label.text = label_time(run)
-            _add_hover(panel, line, [("fitted", f"@y{k}{{%.6g}}"), ("mode", "@mode")], run)
-            _put_legend_above(panel)
-            blocks.append(column(*parts, name=f"channel-{c}-{k}", spacing=0, styles=UNBROKEN, **WIDE))
-        if samples is not None and (plane := find_plane(own.names, own.units)) is not None:
-            blocks.append(_draw_path(own, plane, curve, samples))
-    return column(*blocks, spacing=6, **WIDE)
-
-
-def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
-    """Return an empty figure with the labels of its axes."""
-    frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": LEFT, "min_border_right": 10}
-    plot = figure(height=height, tools=TOOLS, active_drag="box_zoom", toolbar_location="right", **frame, **settings)
-    plot.toolbar.logo = None
-    plot.toolbar.autohide = True
-    plot.background_fill_color = plot.outline_line_color = None
-    plot.xaxis.axis_label, plot.yaxis.axis_label = models.PlainText(text=x), models.PlainText(text=y)
-    return plot
-
-
-def _make_time_figure(
-    height: int, times: models.Range1d, label: str, sources: Mapping[str, models.ColumnDataSource], run: Timed
-) -> Any:
-    """Return a figure over time with the modes shaded, and the transition times in their intervals."""
-    plot = _make_figure(height, "", label, x_range=times)
-    plot.xgrid.visible = False
-    plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
-    clock = formats.describe_clock(run)
-    if clock is not None:
-        find = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
-        label = "return switchfitDates.label(tick, ticks, start, length, zone)"
-        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=find)
-        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=label)
-    plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
-    own = sources["transitions"]
-    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
-    _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
-    return plot
-
-
-def _put_legend_above(plot: Any) -> None:
-    """Move the legend out of the way of the data; a click on an entry hides what it stands for."""
-    plot.legend.click_policy = "hide"
-    plot.legend.orientation = "horizontal"
-    plot.add_layout(plot.legend[0], "above")
-
-
-def _tag(renderer: Any, tag: str) -> Any:
-    """Let the page's script colour a glyph."""
-    renderer.glyph.tags = [tag]
-    return renderer
-
-
-def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed) -> None:
-    """Show the time of a run and (label, column) under the pointer.
-
-    Bokeh escapes what is in columns, but neither labels nor units.
-    """
-    formatters: dict[str, Any] = {text.partition("{")[0]: "printf" for _, text in tips if "%" in text}
-    clock, unit = formats.describe_clock(run), run.time_unit
-    plain = unit if unit.isalnum() and unit != "1" else ""
-    shown = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
-    code = "return switchfitDates.show(value, 0.001, start, length, zone)"
-    formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
-    plot.add_tools(models.HoverTool(renderers=[renderer], tooltips=shown, formatters=formatters, visible=False))
-
-
-def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
-    """Draw what is fitted, and its band; return the curve."""
-    if "lo0" in curves.curve:
-        band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
-        plot.varea(x="t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
-    return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
-
-
-def _draw_measured(
-    plot: Any, curves: Curves, x: str, y: str, source: models.ColumnDataSource, *, scale: float = 1.0, **legend: Any
-) -> Any:
-    """Draw what is measured as dots, or a reference signal as a dashed line."""
-    if curves.kind == "reference":
-        return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
-    size = next(size for most, size in DOT_SIZES.items() if len(curves.samples["t"]) <= most)
-    return _tag(plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend), "ink")
-
-
-def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
-    drawn = _draw_measured(plot, curves, "t", f"m{k}", source, legend_label=LABELS[curves.kind])
-    if "o0" in curves.samples:
-        label = "weighed down"
-        plot.scatter("t", f"o{k}", source=source, size=11, fill_color=None, line_color=FIT, legend_label=label)
-    tips = [(LABELS[curves.kind], f"@m{k}{{%.6g}}"), ("residual", f"@y{k}{{%.6g}}")]
-    _add_hover(plot, drawn, tips, run)
-
-
-def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
-    plot.hspan(y=0.0, line_color=FIT, line_width=1)
-    for side in ("s", "n") if "s0" in curves.samples else ():
-        _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
-    _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
-
-
-def _draw_path(
-    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource
-) -> Any:
-    """Draw two positions against one another, with the transitions on the fitted path."""
-    x, y = plane
-    labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
-    plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
-    _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
-    plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
-    mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
-    _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
-    _put_legend_above(plot)
-    return plot
-
-
-# --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def build_page(estimate: Estimate, origin: Provenance) -> str:
@@ -355,91 +38,27 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    functions: list[Any] = [formats.format_span, certify, join_words, list_reasons, unit_suffix]
-    functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
+    functions: list[Any] = [certify, list_reasons, write_reason, write_step]
+    functions += [tabulate_certificate, tabulate_diagnostics, write_direction]
     environment.globals |= {function.__name__: function for function in functions}
-    runs, payload = _prepare_figures(estimate)
-    drawings: dict[str, str] = {}
+    pictures = {"fit": _write_svg(estimate.plot())}
+    for e in choose_runs(estimate):
+        if any(find_plane(data.names, data.units) is not None for data in estimate.comparisons[e]):
+            pictures[f"Path of {estimate.run_names[e]}"] = _write_svg(estimate.plot_plane(experiment=e))
     if estimate.residuals.channels:
-        drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
+        pictures["residuals"] = _write_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
     if any(record.optimality > 0 for record in estimate.history):
-        drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
-    library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
+        pictures["convergence"] = _write_svg(estimate.plot_convergence())
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
-    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
-    content |= {"drawings": drawings, "library": library}
+    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "text": text, "pictures": pictures}
     content |= {"correlated": [estimate.theta_names[i] for i in known]}
     content |= {"correlation": estimate.correlation[np.ix_(known, known)]}
-    return environment.get_template("report.html").render(
-        content, payload=_write_json(payload | {"drawings": drawings})
-    )
+    return environment.get_template("report.html").render(content)
 
 
-def _compress_svg(figure: Figure) -> str:
-    """Return a figure as SVG, compressed and in base64: a tenth of its size."""
-    figure.set_layout_engine(None)  # which draws everything twice more
-    height = figure.get_figheight()
-    figure.subplots_adjust(left=0.11, right=0.98, bottom=0.55 / height, top=1 - 0.4 / height)
+def _write_svg(figure: Figure) -> str:
+    """Return a figure as SVG in the form in which a page has it."""
     drawn = io.BytesIO()
     with rc_context({"svg.fonttype": "none"}):
         figure.savefig(drawn, format="svg", transparent=True)
-    return base64.b64encode(gzip.compress(drawn.getvalue())).decode()
-
-
-def _write_json(value: Any) -> str:
-    """Return JSON that can stand inside a script element."""
-    written = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the runs that are shown, the one that is explained worst first, and the JSON of their figures."""
-    order = rank_runs(estimate)[:MOST_RUNS]
-    channels = sum(len(list_outputs(estimate, e)) + len(estimate.trajectories[e].state_names) for e in order)
-    points = int(np.clip(BUDGET / (4 * channels), FEWEST_POINTS, MOST_POINTS))
-    curves = {e: collect_curves(estimate, e, points) for e in order}
-    colours = choose_mode_colours(estimate.trajectories, lines=True)
-    templates: dict[str, Any] = {}
-    layouts: dict[Any, str] = {}
-    figures: list[dict[str, Any]] = []
-    for e in order:
-        run, own = estimate.trajectories[e], curves[e]
-        modes, left, right = zip(*run.mode_spans, strict=True)
-        spans = {"left": np.array(left), "right": np.array(right), "colour": [colours[mode] for mode in modes]}
-        low, high = find_transition_intervals(estimate, e).T
-        transitions = {"x": np.array([begin for _, begin, _ in run.mode_spans[1:]]), "low": low, "high": high}
-        sources = {"modes": spans, "transitions": transitions}
-        for c, part in enumerate(own):
-            sources |= {f"curve-{c}": part.curve} | ({f"samples-{c}": part.samples} if part.samples else {})
-        # What two runs have to share to be shown by the same drawing, which takes Bokeh a tenth of a second, while its
-        # numbers take a thousandth.
-        drawn = ((*c.names, *c.units, c.kind, *c.curve, *c.samples) for c in own)
-        template = layouts.setdefault((run.time_unit, run.origin, *drawn), f"run-{len(layouts)}")
-        if template not in templates:
-            templates[template] = json_item(draw_run(own, sources, run=run))
-        first, last = float(run.times[0]), float(run.times[-1])
-        margin = MARGIN * (last - first)
-        written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
-        ranges = {"times": {"start": first - margin, "end": last + margin}}
-        figures.append({"template": template, "sources": written, "ranges": ranges})
-    described = [_describe_run(estimate, e, curves[e], colours) for e in order]
-    return described, {"templates": templates, "runs": figures}
-
-
-def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
-    """Return what the template shows of a run; at first it shows some of the channels that are measured."""
-    channels: list[tuple[str, str, bool]] = []
-    for c, own in enumerate(curves):
-        shown = own.kind != "states" or not fit.comparisons[e]
-        for k, name in enumerate(own.names):
-            first = shown and len(channels) < MOST_CHANNELS
-            channels.append((f"{c}-{k}", name if shown else f"{name}, not measured", first))
-    worst = explain_worst(fit, e)
-    return {
-        "name": fit.run_names[e] if len(fit.trajectories) > 1 else "",
-        "explained": format_share(worst) if np.isfinite(worst) else "",
-        "trajectory": fit.trajectories[e],
-        "colours": colours,
-        "channels": channels,
-        "curves": curves,
-    }
+    return f"data:image/svg+xml;base64,{base64.b64encode(drawn.getvalue()).decode()}"
