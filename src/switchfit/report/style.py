@@ -85,8 +85,7 @@ def draw_on(
     draw(panel)
     if legend:
         draw_legend_above(panel, title=title, height=legend)
-    drawn: Axes | Figure = turn_off_formulas(figure or panel)
-    return drawn
+    return turn_off_formulas(panel) if figure is None else turn_off_formulas(figure)
 
 
 def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:
