@@ -5,10 +5,10 @@ import gzip
 import hashlib
 import html.parser
 import importlib.metadata
+import importlib.util
 import io
 import json
 import re
-import sys
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -25,6 +25,7 @@ import switchfit as sf
 from switchfit import cli
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
+from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, find_range, list_places
 from switchfit.report.plot import find_plane
 from switchfit.report.text import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
@@ -222,12 +223,6 @@ def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
     there = ~np.isnan(times)
     np.testing.assert_allclose(curve[there], np.interp(times[there], comparison.curve_times, comparison.curve[:, 0]))
     assert np.isnan(times).sum() == 1, "broken at the transition"
-    low, high = correct_intervals(toss)[toss.theta_names.index("tau_1")]
-    assert (*array_of(sources, "transitions", "low"), *array_of(sources, "transitions", "high")) == (low, high)
-    low, high = (array_of(sources, "curve-0", name)[there] for name in ("lo0", "hi0"))
-    band = sf.predict(toss)
-    half = toss.quantile(0.95) * np.interp(times[there], band.times, band.output_errors[:, 0])
-    np.testing.assert_allclose((high - low) / 2, half, rtol=1e-3)
     first, last = toss.trajectory.times[[0, -1]]
     margins = first - run["ranges"]["times"]["start"], run["ranges"]["times"]["end"] - last
     assert margins[0] == pytest.approx(margins[1])
@@ -245,14 +240,16 @@ def test_the_inputs_are_there_to_run_it_again(toss_page):
 
 
 @pytest.mark.usefixtures("quick_certificates")
-def test_without_a_problem_file_the_data_are_hashed_and_without_a_model_there_are_no_bands(heater, tmp_path):
+def test_without_a_problem_file_the_data_are_hashed_and_without_a_model_nothing_moves(heater, tmp_path):
     log = heater.problem.experiments[0].data[0]
     raw = np.column_stack([log.times, log.values]).astype("<f8").tobytes()
     assert hashlib.sha256(raw).hexdigest() in Reader(format_page(heater)).words
     with pytest.raises(TypeError, match="provenance must be the provenance of a problem file"):
         heater.save_report(tmp_path / "report.html", provenance="problem.toml")
     heater.save(tmp_path / "fit.json")
-    assert "loaded without its model" in Reader(format_page(sf.Estimate.load(tmp_path / "fit.json"))).words
+    text = format_page(sf.Estimate.load(tmp_path / "fit.json"))
+    assert payload_of(text)["sliders"] == []
+    assert "loaded without its model" in Reader(text).words
 
 
 def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_there(toss, heater):
@@ -270,9 +267,66 @@ def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_ther
         np.testing.assert_allclose(far, factors[i] * near, rtol=1e-9)
 
 
-def test_the_page_says_how_late_samples_are():
+# --- sliders ----------------------------------------------------------------------------------------------------------
+
+
+def test_costs_along_an_unknown_are_exact(toss, toss_page):
+    payload = payload_of(toss_page)
+    assert {slider["name"] for slider in payload["sliders"]} == set(toss.theta_names)
+    evaluator = toss.evaluator_at_solution()
+    for slider in payload["sliders"]:
+        assert slider["values"][0] < slider["theta"] < slider["values"][-1]
+        assert slider["theta"] in slider["values"]
+        for k in (0, 7, -1):
+            theta = toss.theta.copy()
+            theta[slider["place"]] = slider["values"][k]
+            assert slider["costs"][k] == pytest.approx(evaluator.cost(theta), rel=1e-9)
+
+
+def test_costs_of_joint_fits_count_all_runs_and_the_priors():
+    known = sf.Parameter(0.9, prior=sf.Normal(1.0, 0.01))
+    fit = sf.estimate(sf.Problem(RAMP, ramps(3), {"v": known}))
+    for place in range(len(fit.theta)):
+        theta = fit.theta.copy()
+        theta[place] += 0.01
+        expected = fit.evaluator_at_solution().cost(theta)
+        assert evaluate_moved(fit, place, theta[place]) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mu", "vx0"])
+def test_curves_follow_an_unknown_to_first_order(toss, name):
+    """Off by the square of the step, and a residual by as much the other way."""
+    place = toss.theta_names.index(name)
+    (own, *_) = collect_curves(toss, 0, [place], 800)
+    curve, log, step = own.curve, own.samples, 1e-2
+    theta = toss.theta.copy()
+    theta[place] += step
+    path = sf.simulate(toss.problem, theta)
+    there = ~np.isnan(curve["t"])
+    exact = np.interp(curve["t"][there], path.times, path.states[:, 0])
+    assert np.abs(exact - (curve["y0"] + step * curve[f"d{place}_0"])[there]).max() < 0.02 * step
+    samples = np.interp(log["t"], path.times, path.states[:, 0])
+    assert np.abs(samples - (log["m0"] - log["y0"]) + step * log[f"d{place}_0"]).max() < 0.02 * step
+    assert np.abs(log[f"d{place}_0"]).max() > 0.01
+
+
+def test_a_delay_has_no_slider_and_the_page_says_how_late_its_samples_are():
     fit, text = fit_and_page("delay, outliers")
+    assert {slider["name"] for slider in payload_of(text)["sliders"]} == set(fit.theta_names) - {"late"}
     assert f"x is late by {fit.parameters['late']:.6g} s" in Reader(text).words
+
+
+def test_sliders_stop_at_bounds_and_at_what_can_be_seen(toss):
+    runs = {0: collect_curves(toss, 0, list_places(toss, 0), 200)}
+    sliders = build_sliders(toss, runs, list_places(toss, 0))
+    assert sliders[0]["values"][-1] < toss.trajectory.times[-1]
+    tight = replace(toss, lower=toss.theta - 1e-6, upper=toss.theta + 1e-6)
+    assert find_range(tight, runs, 1) == (tight.lower[1], tight.upper[1])
+    for slider in sliders:
+        reach, place = slider["values"][-1] - slider["theta"], slider["place"]
+        curves = [(own.curve[f"d{place}_{k}"], own.curve[f"y{k}"]) for own in runs[0] for k in range(len(own.names))]
+        moved = [reach * np.nanmax(np.abs(slope)) / (np.nanmax(y) - np.nanmin(y)) for slope, y in curves]
+        assert max(moved) <= VISIBLE * (1 + 1e-6)
 
 
 def test_positions_in_a_plane_are_told_by_names_and_units():
@@ -343,8 +397,8 @@ def test_many_runs_stay_small_and_the_worst_come_first():
 
 
 def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
-    monkeypatch.delitem(sys.modules, "switchfit.report.html.page")
-    monkeypatch.setitem(sys.modules, "bokeh", None)
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "bokeh" else real(name, *more))
     with pytest.raises(ImportError, match=r"needs bokeh, not installed here: pip install 'switchfit\[report\]'"):
         heater.save_report(tmp_path / "report.html")
     done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])
@@ -385,6 +439,21 @@ def write(folder, text):
     return path
 
 
+COLUMN = """(name, source, column) => {
+  const element = document.getElementById(name);
+  for (const doc of Bokeh.documents) {
+    const found = doc.get_model_by_name(source);
+    if (found) return Array.from(found.data[column]).map((v) => (Number.isNaN(v) ? null : v));
+  }
+}"""
+
+MOVE = """(k, position) => {
+  const slider = document.getElementById(`slider-${k}`);
+  slider.value = position;
+  slider.dispatchEvent(new Event("input"));
+}"""
+
+
 CHOOSE = """(value) => {
   const chooser = document.getElementById("run");
   chooser.value = value;
@@ -392,13 +461,50 @@ CHOOSE = """(value) => {
 }"""
 
 
+def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
+    browser.open(write(tmp_path, toss_page))
+    sliders = payload_of(toss_page)["sliders"]
+    places = {slider["name"]: k for k, slider in enumerate(sliders)}
+
+    def read(source, column):
+        found = browser.evaluate(f"({COLUMN})('run-0', '{source}', '{column}')")
+        return np.array([np.nan if value is None else value for value in found])
+
+    def cost():
+        return browser.evaluate("document.getElementById('cost').textContent")
+
+    before = read("curve-0", "y0"), read("samples-0", "y0")
+    assert cost() == f"J = {toss.cost:.7e} (at the estimate)".replace("e-0", "e-")
+    assert browser.evaluate("document.querySelectorAll('.slider.shown').length") == len(toss.theta)
+
+    slider = sliders[places["mu"]]
+    browser.evaluate(f"({MOVE})({places['mu']}, 400)")
+    change, slope = slider["values"][-1] - slider["theta"], f"d{slider['place']}_0"
+    for source, old in zip(("curve-0", "samples-0"), before, strict=True):
+        np.testing.assert_allclose(read(source, "y0"), old + change * read(source, slope), rtol=1e-9, atol=1e-15)
+    assert float(cost().split()[2].rstrip(",")) == pytest.approx(slider["costs"][-1], rel=1e-6)
+    assert "(evaluated)" in cost()
+
+    browser.evaluate(f"({MOVE})({places['tau_1']}, 0)")
+    assert "(by the quadratic approximation)" in cost()
+    first = sliders[places["tau_1"]]["values"][0]
+    assert read("transitions", "x")[0] == pytest.approx(first)
+    assert read("modes", "right")[0] == read("modes", "left")[1] == pytest.approx(first)
+
+    browser.evaluate("document.getElementById('reset').click()")
+    np.testing.assert_array_equal(read("curve-0", "y0"), before[0])
+    assert "(at the estimate)" in cost()
+    check_quiet(browser)
+
+
 @pytest.mark.slow
 def test_runs_are_chosen_channels_switched_off_and_all_of_it_printed(browser, tmp_path):
     browser.open(write(tmp_path, format_page(sf.estimate(sf.Problem(RAMP, ramps(4), {"v": 0.9})))))
     shown = "[...document.querySelectorAll('#fit .run.shown')].map((r) => r.dataset.run).join()"
     drawn = "[...document.querySelectorAll('#fit .run.shown .figure')].every((f) => f.offsetHeight > 300)"
+    names = "[...document.querySelectorAll('.slider.shown label')].map((l) => l.textContent).join()"
     height = "document.getElementById('run-0').getBoundingClientRect().height"
-    assert browser.evaluate(shown) == "0"
+    assert (browser.evaluate(shown), browser.evaluate(names)) == ("0", "run4.tau_1,v")
     for value, runs in (("2", "2"), ("all", "0,1,2,3")):
         browser.evaluate(f"({CHOOSE})('{value}')")
         browser.wait(drawn)
@@ -419,6 +525,8 @@ def test_every_kind_of_problem_is_shown_without_an_error(browser, tmp_path, kind
     _, text = fit_and_page(kind)
     check_alone(text)
     browser.open(write(tmp_path, text))
+    for k in range(len(payload_of(text)["sliders"])):
+        browser.evaluate(f"({MOVE})({k}, 300)")
     browser.evaluate("document.querySelectorAll('[data-channel]').forEach((box) => { if (!box.checked) box.click(); })")
     browser.evaluate("new Promise((done) => setTimeout(done, 200))")
     assert browser.evaluate("window.hacked") is None

@@ -386,10 +386,6 @@ def test_figure_page_and_file_have_the_jumps(fit, tmp_path):
         assert there[-1] - there[0] == pytest.approx(AMOUNT / fit.parameters["V"])
     fit.save(tmp_path / "fit.json")
     np.testing.assert_array_equal(sf.Estimate.load(tmp_path / "fit.json").trajectory.jump_times, DOSES)
-    page = pytest.importorskip("switchfit.report.html.page", reason="needs the extra report")
-    times = page.collect_curves(fit, 0, 2000)[0].curve["t"]
-    breaks = np.flatnonzero(np.isnan(times))
-    np.testing.assert_array_equal([times[breaks - 1], times[breaks + 1]], [DOSES, DOSES])
 
 
 def test_prediction_and_profile_know_the_jumps(fit):

@@ -162,8 +162,9 @@ def _draw_outputs(
         plot_comparison(comparison, channel, axes[step * k], label=label)
         if step == 2:
             plot_residuals(comparison, channel, axes[2 * k + 1])
-        for ax in axes[step * k : step * (k + 1)] if prediction is not None else ():
-            plot_bands(prediction, k, level, ax, about_zero=ax is not axes[step * k])
+        if prediction is not None:
+            for ax in axes[step * k : step * (k + 1)]:
+                plot_bands(prediction, k, level, ax, about_zero=ax is not axes[step * k])
     block.align_ylabels(axes)
     return axes
 
@@ -522,7 +523,8 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) 
 
 
 def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory, ax: Axes) -> None:
-    draw_measured(comparison, *comparison.measured[:, both].T, ax)
+    x, y = comparison.measured[:, both].T
+    draw_measured(comparison, x, y, ax)
     colours = choose_mode_colours([trajectory], lines=True)
     segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
     for (mode, begin, end), first, last in segments:
@@ -532,8 +534,8 @@ def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory,
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
         ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
-    for k, set_label in zip(both, (ax.set_xlabel, ax.set_ylabel), strict=True):
-        set_label(label_quantity(comparison.names[k], comparison.units[k]))
+    labels = [label_quantity(comparison.names[k], comparison.units[k]) for k in both]
+    ax.set(xlabel=labels[0], ylabel=labels[1])
     ax.set_aspect("equal", adjustable="datalim")
 
 

@@ -79,13 +79,13 @@ def draw_on(
     from matplotlib.axes import Axes
 
     figure = make_figure(*size) if ax is None else None
-    panel = ax if figure is None else figure.subplots()
+    panel: Any = ax if figure is None else figure.subplots()
     if not isinstance(panel, Axes):
         raise TypeError(f"ax must be a matplotlib Axes; got {type(ax).__name__}.")
     draw(panel)
     if legend:
         draw_legend_above(panel, title=title, height=legend)
-    return turn_off_formulas(figure or panel)
+    return turn_off_formulas(panel) if figure is None else turn_off_formulas(figure)
 
 
 def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:

@@ -1,7 +1,7 @@
 """Results as HTML: in a notebook, their text with a small figure below; the report of a fit as one file.
 
-The file needs no network: Jinja2's templates, figures of Bokeh and Matplotlib. Bokeh and Jinja2 come with the extra
-``report``. They, and `page`, which puts the file together, are imported when a page is made, not with switchfit.
+The file needs no network and has no scripts: templates of Jinja2 with figures of Matplotlib. Jinja2 comes with the
+extra ``report``. It, and `page`, which puts the file together, are imported when a page is made, not with switchfit.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     Raises
     ------
     MissingExtraError
-        If Bokeh or Jinja2 are not installed.
+        If Jinja2 is not installed.
     """
     try:
         from switchfit.report.html.page import build_page

@@ -2,6 +2,8 @@
 
 Import this only where Bokeh and Jinja2 are installed.
 
+Figures of a page, drawn with Bokeh. Import this only where Bokeh is installed.
+
 The figures of runs are drawn without numbers, which the page's script puts into the sources by their names. Colours
 that have to change with the reader's light or dark background carry the tag "ink", "muted" or "edge"; the script sets
 them, and those of axes.
@@ -12,10 +14,9 @@ from __future__ import annotations
 import base64
 import gzip
 import io
-import itertools
 import json
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -27,25 +28,34 @@ from bokeh.plotting import figure
 from bokeh.resources import Resources
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from switchfit.estimation.estimator import Estimate, Provenance
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.saved import Provenance
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report import formats, text
-from switchfit.report.formats import Timed, format_unit, label_quantity, label_time
-from switchfit.report.plot import choose_mode_colours, find_plane, has_bands, list_outputs, replace_infinities
+from switchfit.report import text
+from switchfit.report.formats import Timed, add_dates, describe_clock, format_span, label_quantity, label_time
+from switchfit.report.html.curves import (
+    Columns,
+    Curves,
+    build_sliders,
+    choose_points,
+    collect_curves,
+    drop_nan,
+    list_places,
+    list_spans,
+    list_transitions,
+)
+from switchfit.report.plot import choose_mode_colours, find_plane
 from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.prediction import predict
-from switchfit.uncertainty.residuals import explain_worst, find_transition_intervals, rank_runs
+from switchfit.uncertainty.residuals import explain_worst, rank_runs
+from switchfit.uncertainty.verdict import find_issues
 
 FIT, DATA = "#d0392b", "#5b6470"
 """Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
-HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT = 270, 130, 420
+HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SLICE_HEIGHT = 270, 130, 420, 230
 LEFT = 78
 """Pixels to the left of all axes, so that figures below one another share their times."""
 UNBROKEN = {"break-inside": "avoid"}
@@ -61,140 +71,6 @@ DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
 LABELS = {"measurements": "measured", "reference": "reference"}
 
 
-MOST_RUNS = 12
-"""Experiments whose figures are in a page, those that are explained worst."""
-MOST_CHANNELS = 6
-"""Channels of a run that are shown at first; the others are switched on."""
-MOST_DIAGNOSED = 2
-"""Channels whose residuals have figures."""
-MARGIN = 0.01
-"""Part of the horizon that is shown before and after it."""
-MOST_CORRELATED = 60
-"""Unknowns in the heat map, the first ones; the largest correlations of all are listed beside it."""
-MOST_POINTS, FEWEST_POINTS = 800, 80
-"""Points of one curve: with more of them a figure looks the same."""
-MOST_SAMPLES = 2000
-"""Samples of one channel that are drawn."""
-BUDGET = 300_000
-"""Numbers that the curves of all runs may have together: 1.6 MB in the page."""
-
-
-Columns = Mapping[str, Any]
-"""Numbers by the names that they have in the page."""
-
-
-# --- the numbers of the figures ---------------------------------------------------------------------------------------
-
-
-class Curves(NamedTuple):
-    """One of the data of a run, or its states: a curve of Q channels, and what was measured of it.
-
-    Attributes
-    ----------
-    names, units : sequence of str, one a channel
-    kind : {"measurements", "reference", "states"}
-    curve : mapping of name to (L,)
-        Times t, with NaN where a transition breaks the curve, and mode. Of channel k the values y{k}, and the 95 %
-        confidence band from lo{k} to hi{k}, in float32, if there is one.
-    samples : mapping of name to (K,)
-        Empty for states. Times t; of channel k what is measured, m{k}, its residuals y{k}, sigma s{k} and n{k} = -s{k},
-        outliers o{k}.
-    left_out : int
-        Samples that are not drawn.
-    """
-
-    names: Sequence[str]
-    units: Sequence[str]
-    kind: str
-    curve: Columns
-    samples: Columns
-    left_out: int
-
-
-def collect_curves(estimate: Estimate, e: int, points: int) -> list[Curves]:
-    """Return the curves of one run: an entry for each of its data, then the states that are not measured by name.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    e : int
-        Which run, from 0.
-    points : int
-        Of one curve.
-    """
-    trajectory, comparisons = estimate.trajectories[e], estimate.comparisons[e]
-    band = _stack_bands(estimate, e)
-    kept, breaks = _thin(trajectory.pieces, points)
-
-    def list_curve(values: FloatArray, first: int, late: float = 0.0) -> dict[str, Any]:
-        """Thin values at the nodes (L, Q), whose bands begin at a column, and break them at transitions."""
-        curve: dict[str, Any] = {"t": np.insert(trajectory.times[kept], breaks, np.nan) + late}
-        curve["mode"] = np.insert(trajectory.modes[kept].astype(object), breaks, "").tolist()
-        for k, own in enumerate(values.T):
-            curve[f"y{k}"] = replace_infinities(np.insert(own[kept], breaks, np.nan))
-            for name, side in {"lo": -1.0, "hi": 1.0}.items() if band is not None else ():
-                edge = (own + side * band[:, first + k])[kept]
-                curve[f"{name}{k}"] = replace_infinities(np.insert(edge, breaks, np.nan)).astype("f4")
-        return curve
-
-    found, first = [], 0
-    for comparison in comparisons:
-        count, units = len(comparison.times), list(map(format_unit, comparison.units))
-        curve = list_curve(comparison.curve, first, float(comparison.curve_times[0] - trajectory.times[0]))
-        first += len(comparison.names)
-        if find_plane(comparison.names, units) is not None:
-            before_breaks = np.append(False, np.isnan(curve["t"][:-1]))
-            curve["size"] = np.where(before_breaks, 13.0, 0.0).astype("f4")
-        drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
-        if comparison.kind == "reference" and count == len(trajectory.times):
-            drawn = kept
-        left_out = count - len(drawn) if comparison.kind == "measurements" else 0
-        samples = _list_samples(comparison, drawn)
-        found.append(Curves(comparison.names, units, comparison.kind, curve, samples, left_out))
-    measured = {name for comparison in comparisons for name in comparison.names}
-    for k, (name, unit) in enumerate(zip(trajectory.state_names, trajectory.state_units, strict=True)):
-        if name not in measured:
-            curve = list_curve(trajectory.states[:, [k]], first + k)
-            found.append(Curves([name], [format_unit(unit)], "states", curve, {}, 0))
-    return found
-
-
-def _stack_bands(estimate: Estimate, e: int) -> FloatArray | None:
-    """Return half the widths of the bands of all outputs and then all states of a run at its nodes, (L, Q + n)."""
-    if not has_bands(estimate):
-        return None
-    prediction, times = predict(estimate, experiment=e), estimate.trajectories[e].times
-    errors = np.hstack([prediction.output_errors, prediction.state_errors])
-    return estimate.quantile(0.95) * np.stack([np.interp(times, prediction.times, own) for own in errors.T], axis=1)
-
-
-def _list_samples(comparison: Comparison, drawn: NDArray[np.intp]) -> Columns:
-    """Return the columns of the samples that are drawn."""
-    columns: dict[str, Any] = {"t": comparison.times[drawn]}
-    for k in range(len(comparison.names)):
-        measured = replace_infinities(comparison.measured[drawn, k])
-        columns |= {f"m{k}": measured, f"y{k}": measured - replace_infinities(comparison.fitted[drawn, k])}
-        if comparison.sigma is not None:
-            sigma = replace_infinities(comparison.sigma[drawn, k])
-            columns |= {f"s{k}": sigma, f"n{k}": -sigma}
-        if comparison.downweighted is not None:
-            columns[f"o{k}"] = np.where(comparison.downweighted[drawn, k], measured, np.nan)
-    return columns
-
-
-def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return which nodes are kept, the ends of all segments among them, and before which of these a curve breaks."""
-    stride = max(-(-int(segments[-1]) // points), 1)
-    parts = [
-        np.unique(np.concatenate([np.arange(start, end, stride), [end - 1]]))
-        for start, end in itertools.pairwise(segments.tolist())
-    ]
-    return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
-
-
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
 def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> Any:
     """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
 
@@ -206,11 +82,11 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
         Of the same run, by the names of their sources.
     run : Timed
     """
-    sources = {name: models.ColumnDataSource({key: [] for key in own}, name=name) for name, own in columns.items()}
+    sources = {name: make_source(name, own) for name, own in columns.items()}
     times = models.Range1d(name="times")
     blocks: list[Any] = []
     for c, own in enumerate(curves):
-        curve, samples = sources[f"curve-{c}"], sources[f"samples-{c}"] if own.samples else None
+        curve, samples = sources[f"curve-{c}"], sources.get(f"samples-{c}")
         for k, name in enumerate(own.names):
             panel = _make_time_figure(HEIGHT, times, label_quantity(name, own.units[k]), sources, run)
             line = _draw_curve(panel, own, k, curve)
@@ -231,6 +107,17 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
     return column(*blocks, spacing=6, **WIDE)
 
 
+def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
+    """Return a source with the columns, and those of the fit that the page's script keeps, but none of their numbers.
+
+    Parameters
+    ----------
+    name : str
+    columns : iterable of str
+    """
+    return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
+
+
 def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
     """Return an empty figure with the labels of its axes."""
     frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": LEFT, "min_border_right": 10}
@@ -249,7 +136,7 @@ def _make_time_figure(
     plot = _make_figure(height, "", label, x_range=times)
     plot.xgrid.visible = False
     plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
-    clock = formats.describe_clock(run)
+    clock = describe_clock(run)
     if clock is not None:
         find = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
         label = "return switchfitDates.label(tick, ticks, start, length, zone)"
@@ -258,7 +145,10 @@ def _make_time_figure(
     plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
     own = sources["transitions"]
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
-    _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
+    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
+    if height > RESIDUAL_HEIGHT:
+        tips = [("transition", "@name"), ("modes", "@modes"), ("time", "@value"), ("95 %", "@interval")]
+        _add_hover(plot, line, tips)
     return plot
 
 
@@ -275,25 +165,29 @@ def _tag(renderer: Any, tag: str) -> Any:
     return renderer
 
 
-def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed) -> None:
-    """Show the time of a run and (label, column) under the pointer.
+def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
+    """Show (label, column) under the pointer, and the time of a run before them.
 
     Bokeh escapes what is in columns, but neither labels nor units.
     """
     formatters: dict[str, Any] = {text.partition("{")[0]: "printf" for _, text in tips if "%" in text}
-    clock, unit = formats.describe_clock(run), run.time_unit
-    plain = unit if unit.isalnum() and unit != "1" else ""
-    shown = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
-    code = "return switchfitDates.show(value, 0.001, start, length, zone)"
-    formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
-    plot.add_tools(models.HoverTool(renderers=[renderer], tooltips=shown, formatters=formatters, visible=False))
+    if run is not None:
+        clock, unit = describe_clock(run), run.time_unit
+        plain = unit if unit.isalnum() and unit != "1" else ""
+        tips = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
+        code = "return switchfitDates.show(value, 0.001, start, length, zone)"
+        formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
+    tool = models.HoverTool(renderers=[renderer], tooltips=list(tips), formatters=formatters, visible=False)
+    plot.add_tools(tool)
 
 
 def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
-    """Draw what is fitted, and its band; return the curve."""
+    """Draw what is fitted: its band, the fit itself that is shown once something has been moved; return what moves."""
     if "lo0" in curves.curve:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
-        plot.varea(x="t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
+        plot.varea(x="fit_t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
+    still = _tag(plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED), "muted")
+    still.name, still.visible = "still", False
     return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
 
 
@@ -338,7 +232,33 @@ def _draw_path(
     return plot
 
 
-# --- the page ---------------------------------------------------------------------------------------------------------
+def draw_slice() -> Any:
+    """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
+    plot = _make_figure(SLICE_HEIGHT, "", "rise of J")
+    plot.xaxis.axis_label.name = "slice-label"
+    source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
+    plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")
+    _tag(plot.line("x", "quadratic", source=source, legend_label="quadratic", **DASHED), "muted")
+    _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
+    plot.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
+    plot.xaxis.ticker.desired_num_ticks = 4  # labels of dates are long
+    plot.xaxis.formatter = models.CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
+    _put_legend_above(plot)
+    return plot
+
+
+MOST_RUNS = 12
+"""Experiments whose figures are in a page, those that are explained worst."""
+MOST_CHANNELS = 6
+"""Channels of a run that are shown at first; the others are switched on."""
+MOST_DIAGNOSED = 2
+"""Channels whose residuals have figures."""
+MARGIN = 0.01
+"""Part of the horizon that is shown before and after it."""
+MOST_SLIDERS = 24
+"""Sliders of one run."""
+MOST_CORRELATED = 60
+"""Unknowns in the heat map, the first ones; the largest correlations of all are listed beside it."""
 
 
 def build_page(estimate: Estimate, origin: Provenance) -> str:
@@ -354,11 +274,11 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    functions: list[Any] = [formats.format_span, certify, join_words, list_reasons, unit_suffix]
+    functions: list[Any] = [add_dates, certify, find_issues, format_span, join_words, list_reasons, unit_suffix]
     functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
     environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
-    drawings: dict[str, str] = {}
+    payload["drawings"] = drawings = {}
     if estimate.residuals.channels:
         drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
     if any(record.optimality > 0 for record in estimate.history):
@@ -366,12 +286,11 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
     content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
-    content |= {"drawings": drawings, "library": library}
+    cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
+    content |= {"sliders": payload["sliders"], "sliders_cut": cut, "drawings": drawings, "library": library}
     content |= {"correlated": [estimate.theta_names[i] for i in known]}
     content |= {"correlation": estimate.correlation[np.ix_(known, known)]}
-    return environment.get_template("report.html").render(
-        content, payload=_write_json(payload | {"drawings": drawings})
-    )
+    return environment.get_template("report.html").render(content, payload=_write_json(payload))
 
 
 def _compress_svg(figure: Figure) -> str:
@@ -391,28 +310,27 @@ def _write_json(value: Any) -> str:
     return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
 def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the runs that are shown, the one that is explained worst first, and the JSON of their figures."""
     order = rank_runs(estimate)[:MOST_RUNS]
-    channels = sum(len(list_outputs(estimate, e)) + len(estimate.trajectories[e].state_names) for e in order)
-    points = int(np.clip(BUDGET / (4 * channels), FEWEST_POINTS, MOST_POINTS))
-    curves = {e: collect_curves(estimate, e, points) for e in order}
+    places = {e: list_places(estimate, e)[:MOST_SLIDERS] for e in order}
+    points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
+    curves = {e: collect_curves(estimate, e, places[e], points) for e in order}
     colours = choose_mode_colours(estimate.trajectories, lines=True)
     templates: dict[str, Any] = {}
     layouts: dict[Any, str] = {}
     figures: list[dict[str, Any]] = []
     for e in order:
         run, own = estimate.trajectories[e], curves[e]
-        modes, left, right = zip(*run.mode_spans, strict=True)
-        spans = {"left": np.array(left), "right": np.array(right), "colour": [colours[mode] for mode in modes]}
-        low, high = find_transition_intervals(estimate, e).T
-        transitions = {"x": np.array([begin for _, begin, _ in run.mode_spans[1:]]), "low": low, "high": high}
-        sources = {"modes": spans, "transitions": transitions}
+        sources = {"modes": list_spans(estimate, e, colours), "transitions": list_transitions(estimate, e)}
         for c, part in enumerate(own):
             sources |= {f"curve-{c}": part.curve} | ({f"samples-{c}": part.samples} if part.samples else {})
         # What two runs have to share to be shown by the same drawing, which takes Bokeh a tenth of a second, while its
-        # numbers take a thousandth.
-        drawn = ((*c.names, *c.units, c.kind, *c.curve, *c.samples) for c in own)
+        # numbers take a thousandth; tangents are not drawn.
+        drawn = ((c.names, c.units, c.kind, *(key for key in (*c.curve, *c.samples) if key[0] != "d")) for c in own)
         template = layouts.setdefault((run.time_unit, run.origin, *drawn), f"run-{len(layouts)}")
         if template not in templates:
             templates[template] = json_item(draw_run(own, sources, run=run))
@@ -421,8 +339,18 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
         ranges = {"times": {"start": first - margin, "end": last + margin}}
         figures.append({"template": template, "sources": written, "ranges": ranges})
-    described = [_describe_run(estimate, e, curves[e], colours) for e in order]
-    return described, {"templates": templates, "runs": figures}
+    sliders: list[dict[str, Any]] = []
+    if estimate.problem is not None and np.isfinite(estimate.cost):
+        movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
+        sliders = build_sliders(estimate, curves, list(movable))
+        templates |= {"slice": json_item(draw_slice())} if sliders else {}
+    moved = [slider["place"] for slider in sliders]
+    for slider in sliders:
+        slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
+    derivatives = {"gradient": estimate.gradient[moved], "hessian": estimate.hessian[np.ix_(moved, moved)]}
+    costs = {name: drop_nan(value) for name, value in {"cost": estimate.cost, **derivatives}.items()}
+    payload = {"templates": templates, "runs": figures, "sliders": sliders, **costs}
+    return [_describe_run(estimate, e, curves[e], colours) for e in order], payload
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:

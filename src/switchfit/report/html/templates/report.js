@@ -81,20 +81,24 @@ window.switchfitDates = switchfitDates;
 
 (() => {
   const payload = JSON.parse(document.getElementById("payload").textContent);
+  const sliders = payload.sliders;
+  const known = (value) => (value === null ? NaN : value); // JSON has no NaN
   const documents = new Map(); // name of a figure -> Bokeh document
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const coarse = window.matchMedia("(pointer: coarse)").matches;
+  const moved = sliders.map(() => 0);
+  let last = 0;
 
   // --- figures -------------------------------------------------------------------------------------------------------
 
-  function paint(root) {
+  function paint(root, name) {
     const style = getComputedStyle(document.documentElement);
-    const [page, ink, muted, faint] = ["page", "ink", "muted", "faint"].map((name) =>
+    const [page, ink, muted, faint, panel] = ["page", "ink", "muted", "faint", "panel"].map((name) =>
       style.getPropertyValue(`--${name}`).trim());
     const tagged = { ink, muted, faint, edge: page };
     for (const model of root.references()) {
       if (model.type === "Figure") {
-        model.border_fill_color = page;
+        model.border_fill_color = name === "slice" ? panel : page;
         if (coarse) model.toolbar.active_drag = null; // a finger scrolls the page
       } else if (model.type.endsWith("Axis")) {
         model.setv({
@@ -129,9 +133,12 @@ window.switchfitDates = switchfitDates;
     const copy = Object.fromEntries(Object.entries(part).map(([key, value]) => [key, fill(value, figure)]));
     const name = part.type === "object" && part.attributes && part.attributes.name;
     if (name && figure.sources[name]) {
-      copy.attributes.data = { type: "map", entries: figure.sources[name].entries };
+      const { entries } = figure.sources[name];
+      const fit = entries.filter(([key]) => /^(t|y\d+|x|left|right)$/.test(key)).map(([key, values]) => [`fit_${key}`, values]);
+      copy.attributes.data = { type: "map", entries: [...entries, ...fit] };
     }
     if (name && figure.ranges[name]) Object.assign(copy.attributes, figure.ranges[name]);
+    if (name === "slice-label") copy.attributes.text = sliceLabel(); // there is no room for one that comes later
     return copy;
   }
 
@@ -140,7 +147,7 @@ window.switchfitDates = switchfitDates;
     documents.set(name, null);
     const views = await Bokeh.embed.embed_item(fill(payload.templates[figure.template], figure), name);
     const root = [...views.roots][0].model;
-    paint(root);
+    paint(root, name);
     documents.set(name, root.document);
     document.getElementById(name).closest(".run")?.querySelectorAll("[data-channel]").forEach(switchChannel);
   }
@@ -155,7 +162,7 @@ window.switchfitDates = switchfitDates;
   }
 
   function repaint() {
-    for (const doc of documents.values()) if (doc) doc.roots().forEach(paint);
+    for (const [name, doc] of documents) if (doc) doc.roots().forEach((root) => paint(root, name));
   }
   dark.addEventListener("change", repaint);
 
@@ -166,7 +173,11 @@ window.switchfitDates = switchfitDates;
       element.classList.toggle("shown", choice === "all" || element.dataset.run === choice);
     }
     const chosen = choice === "all" ? Object.keys(payload.runs) : [choice];
+    document.querySelectorAll(".slider").forEach((element, k) => {
+      element.classList.toggle("shown", chosen.some((run) => sliders[k].runs.includes(Number(run))));
+    });
     for (const run of chosen) await embed(`run-${run}`, payload.runs[run]);
+    move();
   }
 
   function switchChannel(box) {
@@ -176,6 +187,140 @@ window.switchfitDates = switchfitDates;
   for (const box of document.querySelectorAll("[data-channel]")) {
     box.addEventListener("change", () => switchChannel(box));
   }
+
+  // --- sliders -------------------------------------------------------------------------------------------------------
+
+  const ends = (k) => [sliders[k].values[0], sliders[k].values[sliders[k].values.length - 1]];
+  const number = (value, digits) => (value !== 0 && (Math.abs(value) < 1e-3 || Math.abs(value) >= 1e7)
+    ? value.toExponential(digits - 1) : value.toPrecision(digits));
+  const digits = (value, step) => value.toFixed(Math.min(Math.max(1 - Math.floor(Math.log10(Math.abs(step) || 1)), 0), 12));
+
+  function interpolate(k, value) {
+    const { values, costs } = sliders[k];
+    let i = 1;
+    while (i < values.length - 1 && values[i] < value) i += 1;
+    if (costs[i] === null || costs[i - 1] === null) return null;
+    return costs[i - 1] + (costs[i] - costs[i - 1]) * (value - values[i - 1]) / (values[i] - values[i - 1]);
+  }
+
+  function quadratic(change) {
+    let cost = payload.cost;
+    change.forEach((d, i) => {
+      if (d !== 0) cost += known(payload.gradient[i]) * d;
+      change.forEach((other, j) => {
+        if (d !== 0 && other !== 0) cost += 0.5 * d * known(payload.hessian[i][j]) * other;
+      });
+    });
+    return cost;
+  }
+
+  function moveCurves(run, doc) {
+    const by = new Map(sliders.map((slider, k) => [slider.place, moved[k]]));
+    const shift = (place) => by.get(place) || 0;
+    function change(key, edit) {
+      const source = doc.get_model_by_name(key);
+      const data = { ...source.data };
+      edit(data);
+      source.data = data;
+    }
+    change("modes", (data) => {
+      data.left = Float64Array.from(data.fit_left, (left, i) => left + shift(data.left_place[i]));
+      data.right = Float64Array.from(data.fit_right, (right, i) => right + shift(data.right_place[i]));
+    });
+    change("transitions", (data) => { data.x = Float64Array.from(data.fit_x, (x, i) => x + shift(data.place[i])); });
+    for (const name of Object.keys(run.sources).filter((own) => /^(curve|samples)-/.test(own))) {
+      change(name, (data) => {
+        for (const key of Object.keys(data)) if (/^fit_y/.test(key)) data[key.slice(4)] = Float64Array.from(data[key]);
+        for (const [key, slope] of Object.entries(data)) {
+          const [, place, k] = key.match(/^d(\d+)_(\d+)$/) || []; // a derivative of channel k
+          const d = place === undefined ? 0 : shift(Number(place));
+          if (d !== 0) data[`y${k}`].forEach((_, i, values) => { values[i] += slope[i] * d; });
+        }
+      });
+    }
+    const still = moved.some((d) => d !== 0);
+    for (const model of doc.roots().flatMap((root) => [...root.references()])) {
+      if (model.name === "still") model.visible = still;
+    }
+  }
+
+  // What is in the figure of J: columns by source.
+  function sliceColumns() {
+    const { values, costs, theta } = sliders[last];
+    const change = (value) => sliders.map((_, k) => (k === last ? value - theta : 0));
+    const rise = (cost) => known(cost) - payload.cost;
+    return {
+      slice: { x: values, exact: costs.map(rise), quadratic: values.map((value) => rise(quadratic(change(value)))) },
+      mark: { x: [theta + moved[last]], y: [rise(interpolate(last, theta + moved[last]))] },
+    };
+  }
+
+  function sliceLabel() {
+    const { name, unit, clock } = sliders[last];
+    const shown = clock ? clock.named : unit;
+    return shown ? `${name} (${shown})` : name;
+  }
+
+  // Labels of the axis of J: dates where the unknown that was moved last is one.
+  window.switchfitSlice = {
+    label(tick, ticks) {
+      const { clock } = sliders[last];
+      return clock ? switchfitDates.label(tick, ticks, clock.start, clock.length, clock.zone) : `${Number(tick.toPrecision(6))}`;
+    },
+  };
+
+  function sliceSources() {
+    return Object.fromEntries(Object.entries(sliceColumns()).map(([name, columns]) =>
+      [name, { type: "map", entries: Object.entries(columns) }]));
+  }
+
+  function drawSlice() {
+    const doc = documents.get("slice");
+    if (!doc) return;
+    for (const [name, columns] of Object.entries(sliceColumns())) doc.get_model_by_name(name).data = columns;
+    doc.get_model_by_name("slice-label").text = sliceLabel();
+  }
+
+  function move() {
+    if (!sliders.length) return;
+    sliders.forEach((slider, k) => {
+      const [low, high] = ends(k);
+      const step = (high - low) / 400;
+      const output = document.querySelector(`[data-slider="${k}"] output`);
+      const change = moved[k] ? ` (${moved[k] > 0 ? "+" : "−"}${digits(Math.abs(moved[k]), step)})` : "";
+      const value = slider.theta + moved[k];
+      const { start, length, zone } = slider.clock || {};
+      output.textContent = slider.clock
+        ? switchfitDates.show(value, step, start, length, zone) + change.replace(")", ` ${slider.unit})`)
+        : `${digits(value, step)} ${slider.unit}`.trim() + change;
+    });
+    const away = moved.flatMap((d, k) => (d === 0 ? [] : [k]));
+    const one = away.length === 1 ? interpolate(away[0], sliders[away[0]].theta + moved[away[0]]) : null;
+    const cost = away.length === 0 ? payload.cost : one === null ? quadratic(moved) : one;
+    const how = away.length === 0 ? "at the estimate" : one === null ? "by the quadratic approximation" : "evaluated";
+    const rise = away.length ? `, ${number(cost - payload.cost, 3)} above the estimate's` : "";
+    document.getElementById("cost").textContent = Number.isNaN(cost) ? "J is not known there" : `J = ${number(cost, 8)}${rise} (${how})`;
+    payload.runs.forEach((run, k) => { const doc = documents.get(`run-${k}`); if (doc) moveCurves(run, doc); });
+    drawSlice();
+  }
+
+  function place(k) {
+    const [low, high] = ends(k);
+    document.getElementById(`slider-${k}`).value = Math.round(400 * (sliders[k].theta + moved[k] - low) / (high - low));
+  }
+
+  sliders.forEach((slider, k) => {
+    place(k);
+    document.getElementById(`slider-${k}`).addEventListener("input", (event) => {
+      const [low, high] = ends(k);
+      const value = low + (high - low) * Number(event.target.value) / 400;
+      moved[k] = Math.abs(value - slider.theta) <= 0.5 * (high - low) / 400 ? 0 : value - slider.theta;
+      last = k;
+      move();
+    });
+  });
+  const reset = document.getElementById("reset");
+  if (reset) reset.addEventListener("click", () => { moved.fill(0); sliders.forEach((_, k) => place(k)); move(); });
 
   // --- start ---------------------------------------------------------------------------------------------------------
 
@@ -187,6 +332,8 @@ window.switchfitDates = switchfitDates;
   (async () => {
     await show("0");
     for (const [name, packed] of Object.entries(payload.drawings)) await unpack(name, packed);
+    if (sliders.length) await embed("slice", { template: "slice", sources: sliceSources(), ranges: {} });
+    move();
     document.documentElement.dataset.ready = "true";
   })();
 })();
