@@ -227,7 +227,7 @@ def test_the_compilation_cache_is_used_or_off_and_its_configuration_as_before(pl
 
 
 HEAVY = (
-    *("jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich"),
+    *("bokeh", "jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich"),
     *("scipy.optimize", "scipy.integrate", "scipy.sparse", "scipy.interpolate", "scipy.stats"),
 )
 

@@ -469,6 +469,25 @@ def test_many_logs_with_origins_of_their_own_are_not_shown_read_dates():
     np.testing.assert_allclose(other.theta[1, 0] - other.theta[0, 0], 1.0, rtol=1e-6)
 
 
+@pytest.mark.slow
+def test_the_browser_agrees_with_zoneinfo(browser, fits, tmp_path):
+    dated, _ = fits
+    dated.save_report(tmp_path / "report.html")
+    browser.open(tmp_path / "report.html")
+    (shown,) = browser.evaluate(
+        "[...document.querySelectorAll('[data-slider=\"0\"] output')].map((o) => o.textContent)"
+    )
+    assert shown == format_date(dated.transition_dates[0][0], 600)
+    start = dated.trajectory.origin.instant.astype(int) / 1e3
+    for low, high in ((0, 19), (8.5, 10), (9, 9.01), (0, 900), (-3000, 3000)):
+        ticks = browser.evaluate(f"switchfitDates.findTicks({low}, {high}, {start}, 864e5, 'Europe/Berlin')")
+        assert 3 <= len(ticks) <= 10
+        dates = [dated.trajectory.origin.find_date(round(tick * 864e5) / 864e5, "d") for tick in ticks]
+        if high - low > 0.1:
+            assert not any(date.second or date.microsecond for date in dates), dates
+    assert browser.errors == []
+
+
 # --- texts ------------------------------------------------------------------------------------------------------------
 
 

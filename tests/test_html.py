@@ -5,10 +5,10 @@ import gzip
 import hashlib
 import html.parser
 import importlib.metadata
-import importlib.util
 import io
 import json
 import re
+import sys
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -397,8 +397,8 @@ def test_many_runs_stay_small_and_the_worst_come_first():
 
 
 def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
-    real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "bokeh" else real(name, *more))
+    monkeypatch.delitem(sys.modules, "switchfit.report.html.page")
+    monkeypatch.setitem(sys.modules, "bokeh", None)
     with pytest.raises(ImportError, match=r"needs bokeh, not installed here: pip install 'switchfit\[report\]'"):
         heater.save_report(tmp_path / "report.html")
     done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])

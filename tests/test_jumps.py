@@ -16,6 +16,7 @@ from switchfit.fit.solution import idle_unknowns
 from switchfit.io.command_line import describe_experiments, summarize_estimate
 from switchfit.io.problem_file import load_problem, read_experiments
 from switchfit.problem.functions import use_float64
+from switchfit.report.html.curves import collect_curves
 from switchfit.strategy.known_order import find_times
 
 DOSES = np.array([0.0, 8.0, 16.0, 24.0])
@@ -386,6 +387,16 @@ def test_figure_page_and_file_have_the_jumps(fit, tmp_path):
         assert there[-1] - there[0] == pytest.approx(AMOUNT / fit.parameters["V"])
     fit.save(tmp_path / "fit.json")
     np.testing.assert_array_equal(sf.Estimate.load(tmp_path / "fit.json").trajectory.jump_times, DOSES)
+    # The curves of the page are divided at the jumps; their derivatives have no jump's size.
+    (curves, *_) = collect_curves(fit, 0, [0, 1], 2000)
+    times, step = curves.curve["t"], 0.1 * fit.standard_errors[0]
+    breaks = np.flatnonzero(np.isnan(times))
+    np.testing.assert_array_equal([times[breaks - 1], times[breaks + 1]], [DOSES, DOSES])
+    path = sf.simulate(fit.problem, fit.theta + np.array([step, 0.0]))
+    there = np.isfinite(times) & ~np.isin(times, DOSES)
+    exact = np.interp(times[there], path.times, path.states[:, 0])
+    linear = (curves.curve["y0"] + step * curves.curve["d0_0"])[there]
+    assert np.abs(exact - linear).max() < 1e-3 * np.ptp(exact)
 
 
 def test_prediction_and_profile_know_the_jumps(fit):

@@ -104,7 +104,7 @@ def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
 
     importing = threading.Thread(target=_import_figures, daemon=True)
-    if prepare_figures:  # matplotlib, which must not look for a display, loads while LLVM compiles
+    if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         importing.start()
     with terminal.stop_on_interrupt(
@@ -210,7 +210,7 @@ def _import_figures() -> None:
         import matplotlib.backends.backend_agg
         import matplotlib.figure  # noqa: F401
 
-        import switchfit.report.html.page  # noqa: F401  # with Jinja2
+        import switchfit.report.html.page  # noqa: F401  # with Bokeh and Jinja2
 
 
 def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None:

@@ -229,6 +229,26 @@ def _tell_apart(date: datetime.datetime) -> str:
     return f"{date:%z}"
 
 
+def describe_clock(run: Timed) -> dict[str, Any] | None:
+    """Return how a page's script shows times as dates; None where they are no dates.
+
+    It is given the milliseconds since 1970 at 0, those of a unit, the zone, and its name as the user gave it. Browsers
+    know names of zones, but not all of them know offsets: these are added to the start.
+
+    Parameters
+    ----------
+    run : Timed
+    """
+    if run.origin is None:
+        return None
+    named, zone = run.origin.time_zone, run.origin.zone
+    offset = zone.utcoffset(None) if isinstance(zone, datetime.timezone) else None
+    shift = 0.0 if offset is None else 1e3 * offset.total_seconds()
+    length = 1e3 * SECONDS[normalize_time_unit(run.time_unit)]
+    known = "UTC" if offset is not None else named or "UTC"
+    return {"start": run.origin.instant.astype(np.int64) / 1e3 + shift, "length": length, "zone": known, "named": named}
+
+
 def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str, str]:
     """Return the estimate of an unknown, a date or rounded, and "± error".
 

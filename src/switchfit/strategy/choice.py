@@ -291,10 +291,11 @@ def find_other_minimum(fit: Estimate) -> FloatArray | None:
 
     Not where the state meets corners: each place of a scan takes a search for where it does.
     """
-    corners = any(run.branches is not None for run in fit.evaluator.runs)
-    if corners or not fit.problem.is_least_squares or fit.status is not Status.CONVERGED:
+    evaluator = fit.evaluator_at_solution()
+    corners = any(run.branches is not None for run in evaluator.runs)
+    if corners or not evaluator.problem.is_least_squares or fit.status is not Status.CONVERGED:
         return None
-    return next(iter(choose_hops(fit.evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
+    return next(iter(choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
 
 
 def _write_to(

@@ -1,7 +1,8 @@
 """Results as HTML: in a notebook, their text with a small figure below; the report of a fit as one file.
 
-The file needs no network and has no scripts: templates of Jinja2 with figures of Matplotlib. Jinja2 comes with the
-extra ``report``. It, and `page`, which puts the file together, are imported when a page is made, not with switchfit.
+The file needs no network: templates of Jinja2, figures of Bokeh where sliders move them, of Matplotlib elsewhere. Both
+libraries come with the extra ``report``. They, `page`, which puts the file together and draws what moves, and `curves`,
+which prepares its numbers, are imported when a page is made, not with switchfit.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     Raises
     ------
     MissingExtraError
-        If Jinja2 is not installed.
+        If Bokeh or Jinja2 are not installed.
     """
     try:
         from switchfit.report.html.page import build_page

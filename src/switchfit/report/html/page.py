@@ -29,8 +29,7 @@ from bokeh.resources import Resources
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import Provenance
+from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
