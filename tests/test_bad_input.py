@@ -120,10 +120,7 @@ def refused(build, error, *said):
         (lambda: system(reset_maps=[grow]), ["reset_maps must be a dict of (mode before, mode after) -> function"]),
         (lambda: system(reset_maps={"grow": grow}), ["reset_maps must be a dict of (mode before, mode after)", "grow"]),
         (lambda: system(reset_maps={("grow", "shrink"): 1}), ["reset map ('grow', 'shrink') must be a function"]),
-        (
-            lambda: system(state_names="x"),
-            ["state_names must be a sequence of strings", "got 'x': give a list or a tuple"],
-        ),
+        (lambda: system(state_names="x"), ["state_names must be a sequence of strings", "got 'x': give a list or a t"]),
         (lambda: samples(observe=3), ["observe must be a function h(t, x, p); got 3"]),
         (lambda: samples(sigma={"x": 1}), ["sigma must be a number or an array of numbers; got {'x': 1}"]),
         (
@@ -134,10 +131,7 @@ def refused(build, error, *said):
         (lambda: sf.TerminalCost(3), ["TerminalCost must be a function phi(x, p); got 3"]),
         (lambda: sf.ReferenceSignal(TIMES), ["by sf.ReferenceSignal.from_samples(times, values, ...)"]),
         (lambda: sf.Parameter(1.0, prior=0.1), ["must be an sf.Normal or an sf.LogNormal; got 0.1"]),
-        (
-            lambda: experiment(mode_sequence="grow"),
-            ["mode_sequence must be a sequence of mode names; got 'grow': give a list or a tuple"],
-        ),
+        (lambda: experiment(mode_sequence="grow"), ["mode_sequence must be a sequence of mode names; got 'grow': giv"]),
         (lambda: experiment(transition_times=[None]), ["a transition time must be a number", "None"]),
         (lambda: experiment(inputs=3), ["inputs must be an sf.Input; got int"]),
         (lambda: experiment(data=[SAMPLES, 3]), ["data must be sf.Measurements", "or a list of them; got int"]),
@@ -160,14 +154,8 @@ def test_wrong_types(build, said):
         (lambda: system(initial_state=[]), ["initial_state must have shape (n,)", "got shape (0,)"]),
         (lambda: system(initial_state=[math.nan]), ["initial_state must be finite; got nan at index [0]"]),
         (lambda: system(reset_maps={("grow", "fall"): grow}), ["reset_maps names the unknown mode 'fall'; the modes"]),
-        (
-            lambda: system(state_names=("x", "y")),
-            ["state_names must have one entry for each of the 1 states; got ('x'"],
-        ),
-        (
-            lambda: problem(of=system(initial_state=lambda p: p["k"][None], state_names=("x", "y"))),
-            ["of the 1 states; got ("],
-        ),
+        (lambda: system(state_names=("x", "y")), ["state_names must have one entry for each of the 1 states; got ('x"]),
+        (lambda: problem(of=system(initial_state=lambda p: p["k"][None], state_names=("x", "y"))), ["of the 1 states"]),
         # Data
         (lambda: samples([0.0, 0.0], [1.0, 2.0]), ["must increase strictly; got 0.0 followed by 0.0"]),
         (lambda: samples([0.0, 1.0], [1.0]), ["values of shape (K,) or (K, q); got (2,) and (1,)"]),
@@ -198,10 +186,7 @@ def test_wrong_types(build, said):
         (lambda: reference(values=[1, 2, math.inf, 4, 5]), ["must be finite, or NaN", "got infinity"]),
         (lambda: reference(lowpass_hz=0), ["lowpass_hz must be positive; got 0"]),
         (lambda: reference(weights=[1.0, 2.0]), ["weights must have shape (1,) or (1, 1); got (2,)"]),
-        (
-            lambda: reference(values=np.zeros((5, 2)), weights=[[1.0, 2.0], [0.0, 1.0]]),
-            ["symmetric and positive semi-definite; got [[1.0, 2.0]"],
-        ),
+        (lambda: reference(values=np.zeros((5, 2)), weights=[[1.0, 2.0], [0.0, 1.0]]), ["symmetric and positive semi"]),
         (lambda: reference(weights=[-1.0]), ["positive semi-definite; got [[-1.0]]"]),
         # Parameters
         (lambda: sf.Parameter("a"), ["Parameter value must be a number or a date; got 'a'"]),
@@ -227,10 +212,7 @@ def test_wrong_types(build, said):
         (lambda: experiment(mode_sequence=()), ["mode_sequence is empty; name at least one mode"]),
         (lambda: experiment(transition_times=()), ["one fewer than the 2 modes", "got 0"]),
         (lambda: experiment(transition_times=(1.5,)), ["increase strictly inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
-        (
-            lambda: experiment(transition_times=(math.nan,)),
-            ["a transition time must be a number", "must be finite; got nan"],
-        ),
+        (lambda: experiment(transition_times=(math.nan,)), ["a transition time must be a number", "must be finite; g"]),
         (
             lambda: experiment(transition_times=([0.1, 0.2],)),
             ["transition time 1 must be a single number", "the shape (2,)"],
@@ -238,33 +220,18 @@ def test_wrong_types(build, said):
         (lambda: three_modes((0.5, 0.2)), ["transition_times must increase strictly", "got [0.5, 0.2]"]),
         (lambda: three_modes((0.5, 0.5)), ["transition_times must increase strictly", "got [0.5, 0.5]"]),
         (lambda: three_modes([[0.5, 0.6], 0.7]), ["transition time 1 must be a single number", "(2,)"]),
-        (
-            lambda: experiment(inputs=UP_TO_HALF),
-            ["known over (t0, tf) = (0.0, 1.0); its samples reach from 0.0 to 0.5"],
-        ),
+        (lambda: experiment(inputs=UP_TO_HALF), ["known over (t0, tf) = (0.0, 1.0); its samples reach from 0.0 to 0."]),
         (lambda: experiment(initial_state=[math.nan]), ["initial_state must be finite; got nan at index [0]"]),
         (lambda: experiment(data=[]), ["data is empty: an experiment needs at least one cost"]),
         (lambda: experiment(data=samples([-1, 0.5, 2], [1, 1, 1])), ["inside [t0, tf] = [0.0, 1.0]; 2 of 3 do not"]),
         (lambda: experiment(data=reference(TIMES / 2)), ["over (t0, tf) = (0.0, 1.0)", "from 0.0 to 0.5", "Give t0"]),
         # What the horizon is taken from
-        (
-            lambda: experiment(data=RUNNING, t0=None, tf=None),
-            ["t0 and tf must be given, as nothing among the data (RunningCost) has times"],
-        ),
-        (
-            lambda: experiment(data=TERMINAL, tf=None),
-            ["tf must be given, as nothing among the data (TerminalCost) has times"],
-        ),
+        (lambda: experiment(data=RUNNING, t0=None, tf=None), ["t0 and tf must be given, as nothing among the data (R"]),
+        (lambda: experiment(data=TERMINAL, tf=None), ["tf must be given, as nothing among the data (TerminalCost) ha"]),
         (lambda: experiment(data=samples(), t0=None, tf=None), ["got (0.5, 0.5) (t0 and tf from the data)"]),
         (lambda: experiment(t0=2.0, tf=None), ["t0 < tf; got (2.0, 1.0) (tf from the data)"]),
-        (
-            lambda: experiment(t0=None, tf=sf.Parameter(-1.0, upper=2.0)),
-            ["t0 < tf; got (0.0, -1.0) (t0 from the data)"],
-        ),
-        (
-            lambda: experiment(data=[UP_TO_TWO, reference()], tf=None),
-            ["over (t0, tf) = (0.0, 2.0)", "Give t0 and tf inside"],
-        ),
+        (lambda: experiment(t0=None, tf=sf.Parameter(-1.0, upper=2.0)), ["t0 < tf; got (0.0, -1.0) (t0 from the data"]),
+        (lambda: experiment(data=[UP_TO_TWO, reference()], tf=None), ["over (t0, tf) = (0.0, 2.0)", "Give t0 and tf"]),
         # Problems
         (lambda: problem(experiment(mode_sequence=("grow", "fall"))), ["unknown mode 'fall'; the modes are grow, s"]),
         (lambda: problem(solver="euler"), ["solver must be 'auto', 'explicit' or 'stiff'; got 'euler'"]),
@@ -272,52 +239,28 @@ def test_wrong_types(build, said):
         (lambda: problem(rtol=1e-16), ["rtol must lie between 1e-13", "got 1e-16"]),
         (lambda: problem(atol=-1.0), ["atol must be positive; got -1.0"]),
         (lambda: problem(parameters={"k": "x"}), ["parameter 'k' must be a number, an array or an sf."]),
-        (
-            lambda: problem(experiment(transition_times=(KNOWN,)), parameters={"k": KNOWN}),
-            ["Nothing to estimate: every"],
-        ),
+        (lambda: problem(experiment(transition_times=(KNOWN,)), parameters={"k": KNOWN}), ["Nothing to estimate: eve"]),
         (lambda: problem(parameters={"k": 1.0, "tau_1": 1.0}), ["Two unknowns share a name: tau_1"]),
         (lambda: problem(min_duration=0.5), ["min_duration is 0.5 s, but the guess gives mode 1 ('grow')"]),
-        (
-            lambda: problem([experiment(), three_modes((0.4, 0.6))], min_duration=0.3),
-            ["mode 2 ('shrink') of run2 only 0.2 s"],
-        ),
+        (lambda: problem([experiment(), three_modes((0.4, 0.6))], min_duration=0.3), ["mode 2 ('shrink') of run2 onl"]),
         (lambda: problem(min_duration=-0.5), ["min_duration must be 0 or more; got -0.5"]),
-        (
-            lambda: problem(experiment(initial_state=[1.0, 2.0])),
-            ["as many entries in the system and all experiments; got {1, 2}"],
-        ),
+        (lambda: problem(experiment(initial_state=[1.0, 2.0])), ["as many entries in the system and all experiments;"]),
         (lambda: with_data(samples(values=[[1.0, 2.0]])), ["whole state is compared: its 1 entries; got 2", "-> (2,)"]),
         # Noise, priors and delays of a problem
         (lambda: noisy("s"), ["sigma names 's', which must be a parameter of one number; the problem has k"]),
         (lambda: noisy("s", {"s": 0.1}), ["which must stay positive", "lower bound -inf"]),
-        (
-            lambda: noisy("s", {"s": sf.Parameter([0.1], lower=0.01)}),
-            ["sigma names 's', which must be a parameter of one number"],
-        ),
-        (
-            lambda: with_data(seen(), seen(sigma="s"), parameters=NOISE),
-            ["sigma is left out in some Measurements, and something is weighed"],
-        ),
+        (lambda: noisy("s", {"s": sf.Parameter([0.1], lower=0.01)}), ["sigma names 's', which must be a parameter of"]),
+        (lambda: with_data(seen(), seen(sigma="s"), parameters=NOISE), ["sigma is left out in some Measurements, and"]),
         (lambda: noisy(None, PRIOR), ["something is weighed against the noise: a prior", "sigma is left out"]),
         (lambda: noisy(0.1, delay="late"), ["delay names 'late', which must be a parameter of one number"]),
         (lambda: noisy(0.1, {"d": 0.0}, delay="d"), ["may lie in [-inf, inf]", "only from 0 to 0 s are all"]),
         (lambda: noisy(0.1, LATE, delay="d"), ["the delay 'd' may lie in [0.0, 0.3]", "narrower bounds, move t0"]),
         (lambda: noisy(0.1, delay=0.1), ["Measurements times less the delay of 0.1 must lie inside"]),
-        (
-            lambda: sf.evaluate(DELAYED, [0.4, 1.0, 0.6]),
-            ["delays with which samples are of moments from -0.1 to -0.1 s, outside ("],
-        ),
+        (lambda: sf.evaluate(DELAYED, [0.4, 1.0, 0.6]), ["delays with which samples are of moments from -0.1 to -0.1"]),
         # Functions of other kinds than modes
         (lambda: problem(experiment(inputs=sf.Input([0.0], [1.0]))), ["is called as f(t, x, p, u), but takes the arg"]),
-        (
-            lambda: with_modes(lambda t, x, p: x[0], initial_state=[1.0, 2.0]),
-            ["mode 'grow'", "shape (2,); got shape ()"],
-        ),
-        (
-            lambda: resetting(two),
-            ["reset map ('grow', 'shrink')", "R(t, x, p) must return an array of shape (1,); got sh"],
-        ),
+        (lambda: with_modes(lambda t, x, p: x[0], initial_state=[1.0, 2.0]), ["mode 'grow'", "shape (2,); got shape"]),
+        (lambda: resetting(two), ["reset map ('grow', 'shrink')", "R(t, x, p) must return an array of shape (1,); go"]),
         (lambda: starting_at(lambda p: jnp.zeros((2, 2))), ["must return an array of shape (n,); got shape (2, 2)"]),
         (lambda: starting_at(lambda p: p["k"]), ["initial_state(p) must return an array of shape (n,); got shape ()"]),
         (lambda: starting_at(lambda p: [p["k"] if p["k"] > 0 else 1.0]), ["initial_state branches on the value of t"]),

@@ -373,10 +373,7 @@ def late_and_jumping():
 
 
 def free_end():
-    costs = [
-        sf.TerminalCost(lambda x, p: (x[0] - 0.1) ** 2 + x[1] ** 2),
-        sf.RunningCost(lambda t, x, p: x[0] ** 2),
-    ]
+    costs = [sf.TerminalCost(lambda x, p: (x[0] - 0.1) ** 2 + x[1] ** 2), sf.RunningCost(lambda t, x, p: x[0] ** 2)]
     return with_spring(costs, sf.Parameter(2.3, lower=1.0, upper=4.0))
 
 
