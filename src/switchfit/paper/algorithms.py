@@ -38,6 +38,10 @@ LOOKS: dict[str, dict[str, Any]] = {
 }
 
 
+#: Largest number of points of a history that are drawn.
+DRAWN = 300
+
+
 def fit_kinds(problem: Problem, kinds: Sequence[HessianKind], say: Say) -> dict[str, Found]:
     """Return the fit of a problem by each algorithm, to 1e-7, with its history."""
     found: dict[str, Found] = {}
@@ -67,8 +71,9 @@ def convergence_figure(fits: Found) -> Figure:
     figure = vehicle.new_figure(vehicle.COLUMN, 3.0)
     ax = figure.subplots()
     for kind, fit in fits.items():
-        iterations, norms = fit["history"]
-        ax.loglog(np.array(iterations) + 1, np.maximum(norms, 1e-13), linewidth=1.2, **LOOKS[kind])
+        iterations, norms = np.array(fit["history"])
+        shown = np.unique(np.geomspace(1, len(norms), DRAWN).astype(int)) - 1  # evenly in the logarithm
+        ax.loglog(iterations[shown] + 1, np.maximum(norms[shown], 1e-13), linewidth=1.2, **LOOKS[kind])
     ax.axhline(1e-7, color=DARK, linewidth=0.6)
     ax.annotate("tolerance", (1, 1e-7), xytext=(1, 3), textcoords="offset points", fontsize=6)
     vehicle.tidy(ax, "iteration + 1", r"$\|DJ\|$")
