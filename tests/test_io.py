@@ -252,16 +252,17 @@ def test_a_transition_time_on_a_logarithmic_scale(folder):
 def test_problem_built_in_python(folder):
     (folder / "built.py").write_text(
         "import switchfit as sf\nfrom room import room\n"  # a neighbour in the same folder
-        "def make():\n"
-        "    run = sf.Experiment(sf.Measurements([1.0, 3.0], [15.0, 16.0]), ('on', 'off'), (2.5,), 0.0, 4.0)\n"
+        "def make(tau=2.5):\n"
+        "    run = sf.Experiment(sf.Measurements([1.0, 3.0], [15.0, 16.0]), ('on', 'off'), (tau,), 0.0, 4.0)\n"
         "    return sf.Problem(room, run, {'heating': 0.3, 'cooling': 0.05})\n"
         "problem = make()\n"
     )
     path = folder / "p.toml"
-    for name in ("make", "problem"):
-        path.write_text(f'problem = "built.py:{name}"\n[options]\nhessian = "gauss-newton"\n')
+    early = '{ name = "built.py:make", arguments = { tau = 1.5 } }'
+    for name, tau in (('"built.py:make"', 2.5), ('"built.py:problem"', 2.5), (early, 1.5)):
+        path.write_text(f'problem = {name}\n[options]\nhessian = "gauss-newton"\n')
         loaded = load_problem(path)
-        assert isinstance(loaded.problem, sf.Problem)
+        assert loaded.problem.initial_theta[0] == tau
         assert loaded.options == {"hessian": "gauss-newton"}
 
 

@@ -124,6 +124,7 @@ def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
 @dataclass(frozen=True)
 class Output:
     """What is printed of a fit, and written; the format of the figure, empty for none."""
+
     folder: Path | None
     figures: str
     certificate: bool
@@ -283,6 +284,7 @@ def modes(
 
 def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
     """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
+
     def describe(progress: Any) -> str:
         best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
         return f"{progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}"
