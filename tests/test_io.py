@@ -220,28 +220,26 @@ def test_loss_delay_priors_and_scales(folder):
 
 
 INPUTS = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = ["u"] }'
+MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
 
 
 @pytest.mark.parametrize(
     ("old", "new", "find", "expected"),
     [
-        ("sigma = 0.1", 'sigma = ["sd"]', lambda run: run.data[0].sigma[:3, 0].tolist(), [0.1, 0.1, 0.2]),
-        ('["T"]\nsigma', '"room.py:fahrenheit"\nsigma', lambda run: run.data[0].observe(0.0, 10.0, {}), 50.0),
-        ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda run: run.data[0].weights.tolist(), [[2.0]]),
-        ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda run: run.initial_state, [17.0]),
-        ("t0 = 0.0", INPUTS, lambda run: (run.inputs.kind, *run.inputs.values[2:5]), ("hold", 1, 1, 0)),
+        ("sigma = 0.1", 'sigma = ["sd"]', lambda p, run: run.data[0].sigma[:3, 0].tolist(), [0.1, 0.1, 0.2]),
+        ('["T"]\nsigma', '"room.py:fahrenheit"\nsigma', lambda p, run: run.data[0].observe(0.0, 10.0, {}), 50.0),
+        ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda p, run: run.data[0].weights.tolist(), [[2.0]]),
+        ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda p, run: run.initial_state, [17.0]),
+        ("t0 = 0.0", INPUTS, lambda p, run: (run.inputs.kind, *run.inputs.values[2:5]), ("hold", 1, 1, 0)),
+        ('"room.py:room"', MAKE, lambda p, run: p.system.initial_state, [18.0]),
+        ('"room.py:room"', '"room.py:make"', lambda p, run: p.system.initial_state, [15.0]),
+        ("min_duration = 0.5", "atol = 1e-5", lambda p, run: (p.atol, p.min_duration), (1e-5, 0.0)),
     ],
 )
 def test_forms_of_keys(folder, old, new, find, expected):
     (folder / "room.py").write_text(ROOM.replace("(t, x, p)", "(t, x, p, u)") if new.endswith(INPUTS) else ROOM)
-    assert find(changed(folder, (old, new)).problem.experiments[0]) == expected
-
-
-@pytest.mark.parametrize(
-    ("model", "start"), [('{ name = "room.py:make", arguments = { start = 18.0 } }', 18.0), ('"room.py:make"', 15.0)]
-)
-def test_models_by_functions(folder, model, start):
-    assert changed(folder, ('"room.py:room"', model)).problem.system.initial_state == [start]
+    problem = changed(folder, (old, new)).problem
+    assert find(problem, problem.experiments[0]) == expected
 
 
 def test_a_transition_time_on_a_logarithmic_scale(folder):
