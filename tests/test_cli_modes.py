@@ -171,8 +171,8 @@ def test_options_override_the_library_of_the_file(folder, monkeypatch):
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
     file = {"first": ["rise"], "min_duration": 0.2, "successions": {"rise": ["fall", "drift"], "fall": ["rise"]}}
     assert given == {name: (defaults | file)[name] for name in given}
-    run("modes", folder / "problem.toml", "--criterion", "mbic", "--width", 12, "--method", "beam", "--switch-cost", 5)
-    assert [given[name] for name in ("criterion", "width", "method", "switch_cost")] == ["mbic", 12, "beam", 5.0]
+    run("modes", folder / "problem.toml", "--criterion", "mbic", "--max-switches", 3, "--method", "beam")
+    assert [given[name] for name in ("criterion", "max_switches", "method")] == ["mbic", 3, "beam"]
 
 
 def test_ctrl_c_keeps_the_best(folder, tmp_path, monkeypatch):

@@ -220,28 +220,26 @@ def test_loss_delay_priors_and_scales(folder):
 
 
 INPUTS = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = ["u"] }'
+MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
 
 
 @pytest.mark.parametrize(
     ("old", "new", "find", "expected"),
     [
-        ("sigma = 0.1", 'sigma = ["sd"]', lambda run: run.data[0].sigma[:3, 0].tolist(), [0.1, 0.1, 0.2]),
-        ('["T"]\nsigma', '"room.py:fahrenheit"\nsigma', lambda run: run.data[0].observe(0.0, 10.0, {}), 50.0),
-        ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda run: run.data[0].weights.tolist(), [[2.0]]),
-        ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda run: run.initial_state, [17.0]),
-        ("t0 = 0.0", INPUTS, lambda run: (run.inputs.kind, *run.inputs.values[2:5]), ("hold", 1, 1, 0)),
+        ("sigma = 0.1", 'sigma = ["sd"]', lambda p, run: run.data[0].sigma[:3, 0].tolist(), [0.1, 0.1, 0.2]),
+        ('["T"]\nsigma', '"room.py:fahrenheit"\nsigma', lambda p, run: run.data[0].observe(0.0, 10.0, {}), 50.0),
+        ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda p, run: run.data[0].weights.tolist(), [[2.0]]),
+        ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda p, run: run.initial_state, [17.0]),
+        ("t0 = 0.0", INPUTS, lambda p, run: (run.inputs.kind, *run.inputs.values[2:5]), ("hold", 1, 1, 0)),
+        ('"room.py:room"', MAKE, lambda p, run: p.system.initial_state, [18.0]),
+        ('"room.py:room"', '"room.py:make"', lambda p, run: p.system.initial_state, [15.0]),
+        ("min_duration = 0.5", "atol = 1e-5", lambda p, run: (p.atol, p.min_duration), (1e-5, 0.0)),
     ],
 )
 def test_forms_of_keys(folder, old, new, find, expected):
     (folder / "room.py").write_text(ROOM.replace("(t, x, p)", "(t, x, p, u)") if new.endswith(INPUTS) else ROOM)
-    assert find(changed(folder, (old, new)).problem.experiments[0]) == expected
-
-
-@pytest.mark.parametrize(
-    ("model", "start"), [('{ name = "room.py:make", arguments = { start = 18.0 } }', 18.0), ('"room.py:make"', 15.0)]
-)
-def test_models_by_functions(folder, model, start):
-    assert changed(folder, ('"room.py:room"', model)).problem.system.initial_state == [start]
+    problem = changed(folder, (old, new)).problem
+    assert find(problem, problem.experiments[0]) == expected
 
 
 def test_a_transition_time_on_a_logarithmic_scale(folder):
@@ -252,16 +250,17 @@ def test_a_transition_time_on_a_logarithmic_scale(folder):
 def test_problem_built_in_python(folder):
     (folder / "built.py").write_text(
         "import switchfit as sf\nfrom room import room\n"  # a neighbour in the same folder
-        "def make():\n"
-        "    run = sf.Experiment(sf.Measurements([1.0, 3.0], [15.0, 16.0]), ('on', 'off'), (2.5,), 0.0, 4.0)\n"
+        "def make(tau=2.5):\n"
+        "    run = sf.Experiment(sf.Measurements([1.0, 3.0], [15.0, 16.0]), ('on', 'off'), (tau,), 0.0, 4.0)\n"
         "    return sf.Problem(room, run, {'heating': 0.3, 'cooling': 0.05})\n"
         "problem = make()\n"
     )
     path = folder / "p.toml"
-    for name in ("make", "problem"):
-        path.write_text(f'problem = "built.py:{name}"\n[options]\nhessian = "gauss-newton"\n')
+    early = '{ name = "built.py:make", arguments = { tau = 1.5 } }'
+    for name, tau in (('"built.py:make"', 2.5), ('"built.py:problem"', 2.5), (early, 1.5)):
+        path.write_text(f'problem = {name}\n[options]\nhessian = "gauss-newton"\n')
         loaded = load_problem(path)
-        assert isinstance(loaded.problem, sf.Problem)
+        assert loaded.problem.initial_theta[0] == tau
         assert loaded.options == {"hessian": "gauss-newton"}
 
 

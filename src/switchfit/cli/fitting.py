@@ -102,7 +102,6 @@ def _override(loaded: ProblemFile, options: dict[str, Any]) -> ProblemFile:
 
 def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
-
     importing = threading.Thread(target=_import_figures, daemon=True)
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
@@ -224,7 +223,6 @@ def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None
 
 def _write_page(estimate: Any, provenance: Any, path: Path) -> None:
     """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
-
     try:
         page = format_page(estimate, provenance=provenance)
     except MissingExtraError as missing:
@@ -242,17 +240,12 @@ ModesFolder = Annotated[
 ]
 MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most switches of a run. Default: 8.")]
 Criterion = Annotated[
-    Literal["bic", "mbic", "aicc", "cost"],
-    option(help="Price of a switch. bic, the default: log n; mbic: twice as much; cost: --switch-cost."),
-]
-SwitchCost = Annotated[
-    float | None, option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost.")
+    Literal["bic", "mbic", "aicc"], option(help="Price of a switch. bic, the default: log n; mbic: twice as much.")
 ]
 Method = Annotated[
     Literal["auto", "beam", "insertion"],
     option(help="What proposes sequences. Default: auto, the beam for data if the model has machine code."),
 ]
-Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
 
 
 @terminal.command("json", "quiet", "verbose")
@@ -261,9 +254,7 @@ def modes(
     out: ModesFolder = None,
     max_switches: MaxSwitches = 8,
     criterion: Criterion = "bic",
-    switch_cost: SwitchCost = None,
     method: Method = "auto",
-    width: Width = 40,
     figures: terminal.FigureFormat = "png",
 ) -> None:
     """Find which modes were active, in which order, and when.
@@ -275,8 +266,7 @@ def modes(
     Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
     fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
     """
-    settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
-    settings |= {"criterion": criterion, "switch_cost": switch_cost}
+    settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "criterion": criterion}
     loaded = terminal.load(problem, out, searched=True)
     from switchfit.io.command_line import summarize_modes
 

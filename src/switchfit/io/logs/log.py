@@ -352,12 +352,6 @@ def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str 
     return next((name for name in given if name.strip() == TEMPERATURE and name not in channels), None)
 
 
-def _find_spelled_unit(name: str) -> str:
-    """Return the unit of time that is a word in a name, such as in ``seconds_elapsed`` or ``millis``; "" if none is."""
-    words = re.split(r"[ _.\-/]", name.lower())
-    return next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
-
-
 def _find_epoch_unit(time: float) -> str | None:
     """Return the unit in which a number is a time since 1970, None if it is too small for one."""
     low, high = EPOCH_SECONDS
@@ -444,7 +438,9 @@ def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple
         return column / second, "s", 0.0
     numbers = np.asarray(column, dtype=np.float64)
     unit = normalize_time_unit(unit)
-    unit = unit if unit in SECONDS else _find_spelled_unit(name)
+    if unit not in SECONDS:  # it may be a word in the name, such as in seconds_elapsed or millis
+        words = re.split(r"[ _.\-/]", name.lower())
+        unit = next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
     finite = numbers[np.isfinite(numbers)]
     epoch = _find_epoch_unit(float(finite[0])) if len(finite) else None
     if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):

@@ -71,7 +71,8 @@ def _read_topic(path: Path, reader: Any, options: Options) -> Log:
     zero = start if abs(int(moments[0]) - start) < FAR else 0  # all topics of a bag count from its begin
     names = dict.fromkeys(name for record in records for name in record)
     values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
-    units = {name: _UNITS.get(_strip(name), "") if kind in _READERS else "" for name in values}
+    quantities = {name: name.rpartition(".")[2].removeprefix("sigma_") for name in values}
+    units = {name: _UNITS.get(quantity, "") for name, quantity in quantities.items() if kind in _READERS}
     issues = () if has_stamps else (Issue("log: no stamps", (str(path), topic)),)
     name = "stamp" if has_stamps else "received"
     columns = {**values, name: (moments - zero) / SECOND}
@@ -101,11 +102,6 @@ def _read_stamp(message: Any) -> int:
     """Return the stamp of a header in nanoseconds; 0 without a header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0 if stamp is None else int(stamp.sec) * SECOND + int(stamp.nanosec)
-
-
-def _strip(name: str) -> str:
-    """Return the quantity that a channel is of: "x" for "sigma_x", "velocity" for "left.velocity"."""
-    return name.rpartition(".")[2].removeprefix("sigma_")
 
 
 # --- types of messages ------------------------------------------------------------------------------------------------

@@ -91,11 +91,6 @@ def is_data(cell: str) -> bool:
     return bool(_NUMBER.fullmatch(cell)) or is_date(cell)
 
 
-def has_text(cells: Sequence[str]) -> bool:
-    """Return whether there is a cell that is neither missing nor a number or date."""
-    return any(not is_missing(cell) and not is_data(cell) for cell in cells)
-
-
 def read_header(rows: Sequence[list[str]], comment: list[str]) -> tuple[list[str], list[str], dict[str, int], int]:
     """Return the names of the columns, their units, the column of each name in the header, and the first row of data.
 
@@ -126,7 +121,8 @@ def _skip_preamble(rows: Sequence[list[str]]) -> int:
 
 def _is_header(cells: list[str], first: bool) -> bool:
     """Return whether cells are names or units; numbers may be names in the first line, but not in its first field."""
-    return has_text(cells) and not any(map(is_data, cells[:1] if first else cells))
+    has_text = any(not is_missing(cell) and not is_data(cell) for cell in cells)
+    return has_text and not any(map(is_data, cells[:1] if first else cells))
 
 
 def _strip_end(cells: list[str]) -> list[str]:

@@ -86,12 +86,8 @@ def _wrap_name(given: Any) -> Any:
     return given if isinstance(given, dict) else {"name": given}
 
 
-def _wrap_entry(given: Any) -> Any:
-    """Return a list; a single entry becomes a list of one."""
-    return given if isinstance(given, list) else [given]
-
-
-ENTRY = BeforeValidator(_wrap_entry)
+ENTRY = BeforeValidator(lambda given: given if isinstance(given, list) else [given])
+"""A list; a single entry becomes a list of one."""
 
 Other = TypeVar("Other")
 Entries = TypeVar("Entries")
