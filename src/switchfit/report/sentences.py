@@ -251,7 +251,7 @@ def write_issue(issue: Issue) -> str:
         return write_sentence(_ISSUES[issue.kind], issue)
     if issue.kind in _REASONS:
         text = write_sentence(_REASONS[issue.kind], issue)
-        return f"{text if text.startswith(issue.subjects) else capitalise(text)}."
+        return f"{text if text.startswith(tuple(filter(None, issue.subjects))) else capitalise(text)}."
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
