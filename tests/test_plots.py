@@ -1,7 +1,6 @@
 """Plots: what is drawn equals the numbers, labels have units, and one rule for axes holds for all of them."""
 
 import csv
-import html
 import warnings
 from dataclasses import replace
 
@@ -213,7 +212,7 @@ def test_costs_of_starts(starts):
     assert high / low > 100
 
 
-# --- one line and notebooks -------------------------------------------------------------------------------------------
+# --- one line ---------------------------------------------------------------------------------------------------------
 
 
 def test_every_result_is_one_line(heater, starts, models):
@@ -233,15 +232,6 @@ def test_every_result_is_one_line(heater, starts, models):
     assert repr(starts) == "Multistart(8 fits, 8 good, tau_1, k)"
     assert repr(problem) == "Problem(1 experiment, unknowns tau_1, k)"
     assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
-
-
-@pytest.mark.slow
-def test_a_notebook_shows_the_text_and_a_small_figure(heater, starts, models):
-    found = [heater.profile("k"), starts, models, heater.validate(heater.problem), heater.predict([1.0, 7.0])]
-    for result in (*found, sf.find_modes(heater.problem, max_switches=1)):
-        page = result._repr_html_()
-        assert page.startswith(f"<div><pre>{html.escape(str(result))}</pre><img ")
-        assert len(page) < 60_000
 
 
 def test_one_panel_of_several(heater, models):

@@ -245,6 +245,8 @@ FITS: dict[str, Fit] = {
     "a mode that is called collapsed": made(**mode_held("minimum duration", 0.5, "collapsed")),
     "at a kink": made(kinks=KINKS[:1], free_basis=np.eye(3)[:, 1:], cost=28.5),
     "at kinks": made(kinks=KINKS, free_basis=np.eye(3)[:, 2:], cost=29.0),
+    "stopped at a kink": made(kinks=KINKS[:1], free_basis=np.eye(3)[:, 1:], status=Status.MAX_ITERATIONS),
+    "stopped with a short mode": made(**mode_held("minimum duration", 0.5), status=Status.MAX_ITERATIONS),
     "an indefinite Hessian": made(hessian=np.diag([1.0, -4.0, 1.0]), status=Status.SADDLE),
     "a singular Hessian": made(**correlated(0.0), status=Status.SINGULAR),
     "a nearly singular Hessian": made(**correlated(1e-7)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import io
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ LETTER, HANDLE = 0.55, 4.8
 
 
 def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | float) -> dict[str, Any]:
-    """Return settings of a legend with as many columns, all as wide as the widest, as a width has room for.
+    """Return settings of a legend with as many columns as a width has room for.
 
     Parameters
     ----------
@@ -38,8 +39,18 @@ def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | floa
     """
     # In points, so that it stays the same where the size is changed outside of a context with other fonts.
     size = FontProperties(size=fontsize).get_size_in_points()
-    widest = size * (HANDLE + LETTER * max(map(len, labels), default=0))
-    return {"fontsize": size, "ncols": int(np.clip(72 * inches / widest, 1, most)), "frameon": False}
+    columns = min(most, max(len(labels), 1))
+    while columns > 1 and _measure_legend(labels, columns) > 72 * inches / size:
+        columns -= 1
+    return {"fontsize": size, "ncols": columns, "frameon": False}
+
+
+def _measure_legend(labels: list[str], columns: int) -> float:
+    """Return the width of a legend in sizes of its font; matplotlib fills it column by column."""
+    rows, longer = divmod(len(labels), columns)
+    ends = [k * rows + min(k, longer) for k in range(columns + 1)]
+    parts = [labels[begin:end] for begin, end in pairwise(ends)]
+    return sum(HANDLE + LETTER * max(map(len, part), default=0) for part in parts)
 
 
 class NotebookFigure(Figure):

@@ -250,7 +250,8 @@ def write_issue(issue: Issue) -> str:
     if issue.kind in _ISSUES:
         return write_sentence(_ISSUES[issue.kind], issue)
     if issue.kind in _REASONS:
-        return f"{capitalise(write_sentence(_REASONS[issue.kind], issue))}."
+        text = write_sentence(_REASONS[issue.kind], issue)
+        return f"{text if text.startswith(tuple(filter(None, issue.subjects))) else capitalise(text)}."
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
