@@ -10,7 +10,7 @@ import pytest
 import scipy.optimize
 from optimizer import box, free, minimize, rows
 
-from switchfit.optimize import Status
+from switchfit.optimize import Status, step
 from switchfit.optimize.qp import Equalities, Room, find_normal_step, solve_composite
 from switchfit.problem.functions import use_float64
 
@@ -219,6 +219,14 @@ def test_constraints_that_cannot_be_met_are_named(constraints, violated, evaluat
     assert not found.status.successful
     assert {name: value for name, value in found.violated if abs(value) > 1e-3} == pytest.approx(violated, abs=1e-3)
     assert found.evaluations < evaluations
+
+
+def test_constraints_are_not_stuck_where_a_step_reduces_their_violation(monkeypatch):
+    """However long it has stayed the same: here, from the first iteration on."""
+    monkeypatch.setattr(step, "STAGNANT", 0)
+    found = solve(lambda x: x[0] + x[1], lambda x: [x[0] ** 2 + x[1] ** 2 - 2], [3.0, -2.0])
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, [-1.0, -1.0], atol=1e-7)
 
 
 def test_a_saddle_on_a_surface_is_left():
