@@ -10,7 +10,6 @@ import ctypes
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, TypeVar
@@ -413,10 +412,13 @@ class NativeExperiment:
         self._find_first_cells(tau, side)
         if self._late:
             self._find_late_cells(p)
-        self._multipliers[:] = 0.0
         if multipliers is not None:
             self._multipliers[self._constraint_rows] = multipliers
-        self._function(self._address, *self._counts)
+        try:
+            self._function(self._address, *self._counts)
+        finally:
+            if multipliers is not None:
+                self._multipliers[:] = 0.0
         check = self._check.item(0)
         # If the cost is not finite, it is returned without fallback: the caller rejects the point anyway.
         if check != check and math.isfinite(self._J.item(0)):
@@ -529,10 +531,10 @@ class NativeEngine:
     def _try(self, order: Order, use: Callable[..., Found], fall_back: Callable[..., Found], *given: Any) -> Found:
         """Return what one function finds in machine code of an order, or what another finds by JAX."""
         native = self.at(order)
-        with suppress(FailedCheckError):
-            if native is not None:
-                return use(native, *given)
-        return fall_back(*given)
+        try:
+            return fall_back(*given) if native is None else use(native, *given)
+        except FailedCheckError:
+            return fall_back(*given)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
