@@ -235,18 +235,19 @@ class Dense(SymmetricMatrix):
             factor = CholeskyFactor.of_scaled(scaled, scaling) if qp.has_curvature(scaled) else None
             if factor is not None:
                 return self, factor
+        make_definite: Callable[[FloatArray], FloatArray] = make_absolute
         if reach is None:
             scaling = diagonal_scaling(self, floor)
-            scaled, make_definite = self.scale(scaling).array, make_absolute
-            if qp.has_curvature(scaled):
+            weight, rows = scaling[:, None] * scaling, normals / scaling
+            if qp.has_curvature(self.array / weight):
                 return self, CholeskyFactor.of(self.array)
         else:
             # In the metric of the region all unknowns that move by their reach are alike: a multiple of the identity is
             # added there.
-            scaling = 1.0 / reach
-            scaled, make_definite = self.scale(scaling).array, lambda matrix: qp.shift_to_positive(matrix)[0]
-        convex = Dense(_convex_on_face(scaled, normals / scaling, make_definite)).scale(1.0 / scaling)
-        return convex, CholeskyFactor.of(convex.array)
+            weight, rows = 1.0 / (reach[:, None] * reach), normals * reach
+            make_definite = lambda matrix: qp.shift_to_positive(matrix)[0]  # noqa: E731
+        convex = _convex_on_face(self.array / weight, rows, make_definite) * weight
+        return Dense(convex), CholeskyFactor.of(convex)
 
     def solve(self, gradient: FloatArray, factor: CholeskyFactor, room: Room) -> tuple[FloatArray, FloatArray]:
         """Minimize ``gᵀd + ½ dᵀBd`` inside a room, B being this matrix; result as of `solve_programme`."""
