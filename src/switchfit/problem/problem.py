@@ -725,7 +725,7 @@ def require_samples(problem: Problem) -> None:
     names = name_runs(problem.experiments)
     for name, run in zip(names, problem.experiments, strict=True):
         if not all(len(item.times) for item in run.measurements):
-            raise ValueError(f"the Measurements of {name} have no samples; only sf.OnlineEstimator needs none.")
+            raise ValueError(f"the Measurements of {name} have no samples: give times and values.")
 
 
 def require_unknowns(problem: Problem) -> None:
