@@ -61,7 +61,7 @@ def check_sequences(system: HybridSystem, experiments: tuple[Experiment, ...], m
     if max_transitions is not None:
         longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
         if max_transitions < longest:
-            raise ValueError(f"max_transitions is {max_transitions}; there are {longest} transitions and jumps.")
+            raise ValueError(f"max_transitions is {max_transitions}, but a mode_sequence has {longest} transitions.")
 
 
 def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
