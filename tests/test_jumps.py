@@ -437,7 +437,7 @@ def make_jumping(*jumps):
         (lambda: make_problem(TIMES, 3.0), TypeError, "jumps must be an sf.Jump or a sequence"),
         (lambda: make_jumping(sf.Jump(1.0, lambda t, x, p: np.zeros(2))), ValueError, "the map of a Jump.*\\(2,\\)"),
         (lambda: make_changing(TIMES, guess=8.0), ValueError, "time 1 is guessed at 8.0, the time of a jump"),
-        (lambda: make_changing(TIMES, max_transitions=4), ValueError, "max_transitions is 4; there are 5 transitions"),
+        (lambda: make_changing(TIMES, max_transitions=4), ValueError, "max_transitions is 4, but .* has 5 transitions"),
         (lambda: sf.simulate(make_jumping(UNDEFINED)), ValueError, "the map of a Jump at t = 1 h"),
     ],
 )

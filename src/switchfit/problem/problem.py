@@ -61,7 +61,7 @@ def check_sequences(system: HybridSystem, experiments: tuple[Experiment, ...], m
     if max_transitions is not None:
         longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
         if max_transitions < longest:
-            raise ValueError(f"max_transitions is {max_transitions}; there are {longest} transitions and jumps.")
+            raise ValueError(f"max_transitions is {max_transitions}, but a mode_sequence has {longest} transitions.")
 
 
 def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
@@ -725,7 +725,7 @@ def require_samples(problem: Problem) -> None:
     names = name_runs(problem.experiments)
     for name, run in zip(names, problem.experiments, strict=True):
         if not all(len(item.times) for item in run.measurements):
-            raise ValueError(f"the Measurements of {name} have no samples; only sf.OnlineEstimator needs none.")
+            raise ValueError(f"the Measurements of {name} have no samples: give times and values.")
 
 
 def require_unknowns(problem: Problem) -> None:
