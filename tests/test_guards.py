@@ -138,7 +138,9 @@ def test_many_guarded_runs_are_fitted_jointly(count):
     assert len(fit.constraints) == count
     np.testing.assert_allclose(fit.parameters["rim"], 2.2, rtol=0, atol=1e-8)
     np.testing.assert_allclose([fit.parameters[f"inflow_{i}"] for i in range(count)], inflows, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(np.concatenate(fit.transition_times), -10 * np.log(1 - 0.22 / inflows), atol=1e-7)
+    times = np.concatenate(fit.transition_times)
+    np.testing.assert_allclose(times, -10 * np.log(1 - 0.22 / inflows), atol=1e-7)
+    np.testing.assert_allclose(sf.evaluate_on_guards(fit.problem, fit.theta).times, times, atol=1e-7)
 
 
 def test_unknowns_on_a_logarithmic_scale_are_fitted_beside_guards():
