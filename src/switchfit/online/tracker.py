@@ -407,6 +407,8 @@ class Tracker:
         self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self.behind = np.zeros((KEPT, settings.entries))
+        self._views = [beam.engine.view(records[: settings.width]) for records in self.records]
+        self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
         self._coded: tuple[Any, list[int]] = (None, [])
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
@@ -436,7 +438,9 @@ class Tracker:
 
     def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses whose records are at a place."""
-        return kept, self.beam.engine.view(self.records[place, : len(kept.mode)])
+        count = len(kept.mode)
+        usual = count == self.settings.width
+        return kept, self._views[place] if usual else self.beam.engine.view(self.records[place, :count])
 
     def has(self, node: int) -> bool:
         """Return whether the hypotheses at a node are kept."""
@@ -457,10 +461,12 @@ class Tracker:
         """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
         which of those that have more after it.
         """
-        last = len(self.declared) - 1
-        same = (kept.modes[:, : last + 1] == self.declared).all(1)
-        ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
-        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in ways)
+        if self._known[0] is not kept or self._known[1] is not self.declared:
+            last = len(self.declared) - 1
+            same = (kept.modes[:, : last + 1] == self.declared).all(1)
+            ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
+            self._known = kept, self.declared, ways
+        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in self._known[2])
         return int(value.argmin()), exact, more
 
     def step(self, node: int, births: bool) -> None:
