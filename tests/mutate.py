@@ -302,8 +302,8 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "what has left the window counts half": swap(TRACKER, "slope = along[:, :D]", "slope = 0.5 * along[:, :D]"),
         "no minimum along what has no effect": swap(
             TRACKER,
-            "matrix, empty = H[:D, :D] - H[:D, D:] @ solved[:, :-1]",
-            "matrix, empty = H[:D, :D]",
+            "H -= row[:, :, None] * row[:, None, :] / pivot",
+            "H -= 0 * row[:, :, None] * row[:, None, :] / pivot",
         ),
         "a new value is not joined to the old one": swap(
             TRACKER, "[[1.0, -1.0], [-1.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]"

@@ -8,8 +8,9 @@ import pytest
 from models import decay
 
 import switchfit as sf
+from switchfit.engine.protocol import Hypotheses
 from switchfit.models import skid_steer
-from switchfit.online.tracker import Start, forget, invert
+from switchfit.online.tracker import Past, Start, forget, invert
 
 SIGMA = 0.05
 TIMES = 0.1 * np.arange(1, 131)
@@ -497,26 +498,51 @@ def quadratic(rng: np.random.Generator, D: int) -> tuple[np.ndarray, np.ndarray]
     return rng.standard_normal(D), R.T @ R
 
 
-@pytest.mark.parametrize(("chosen", "variance"), [([3], 0.3), ([3], np.inf), ([2, 3], np.inf)])
-def test_what_has_a_new_value_or_leaves_the_window_takes_its_minimum(chosen, variance):
-    """Of ``J + g'd + d'Hd/2`` with the state ``Z d`` held, and with what joins new values to the old ones."""
-    rng, A, held = np.random.default_rng(1), 2, [k for k in (2, 3) if k not in chosen]
-    g, H = quadratic(rng, 4)  # two entries, and two parameters or times
+def test_a_time_that_leaves_the_window_takes_its_minimum():
+    """Of ``J + g'd + d'Hd/2`` with the state ``Z d`` held, against the minimum over all d with that state."""
+    rng, A, births, M = np.random.default_rng(0), 2, 2, 1
+    D, prior = A + births + M, 0.0
+    g, H = quadratic(rng, D)
+    Z = rng.standard_normal((2, D))
+    Z[:, A + 1], H[A + 1], H[:, A + 1], g[A + 1] = 0.0, 0.0, 0.0, 0.0
+    past = Past.of(Z, A, births)
+    one = Hypotheses(*(np.array([v]) for v in (0.0, 1.0)), g[None].copy(), H[None].copy(), np.zeros((1, D)),
+                     np.zeros((1, 2)), Z[None].copy())  # fmt: skip
+    H0 = H + np.diag(np.arange(D) == A + 1)
+    past.absorb(one, prior)
+    for _ in range(5):
+        state, p = rng.standard_normal(2), rng.standard_normal()
+        own = [0, 1, 2, 4]  # all but the empty slot; of these p is the last
+        C, b = np.vstack([Z[:, own], [0, 0, 0, 1]]), np.append(state, p)
+        K = np.block([[H0[np.ix_(own, own)], C.T], [C, np.zeros((3, 3))]])
+        d = np.linalg.solve(K, np.append(-g[own], b))[:4]
+        cost = 1.0 + g[own] @ d + 0.5 * d @ H0[np.ix_(own, own)] @ d
+        Zn, Hn, gn = one.tangents[0], one.matrices[0], one.gradients[0]
+        e = np.linalg.solve(Zn[:, :2], state - Zn[:, 4] * p)
+        d = np.array([*e, 0.0, 0.0, p])
+        assert one.costs[0] + gn @ d + 0.5 * d @ Hn @ d == pytest.approx(cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("variance", [0.3, np.inf])
+def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
+    rng, A = np.random.default_rng(1), 2
+    g, H = quadratic(rng, 4)  # two entries, two parameters, of which the last gets a new value
     Z = rng.standard_normal((2, 4))
     start = Start(np.zeros(4), 1.0, g, H, np.zeros(2), Z)
-    found, turn = forget(start, A, np.array(chosen), np.full(len(chosen), variance))
-    assert not found.tangent[:, chosen].any()
+    found, turn = forget(start, A, np.array([3]), np.array([variance]))
     for _ in range(5):
-        state, there = rng.standard_normal(2), rng.standard_normal(4)
-        C, b = np.vstack([Z, np.eye(4)[held]]), np.append(state, there[held])
-        link = np.where(np.isin(np.arange(4), chosen), 1 / variance, 0.0)
-        K = np.block([[H + np.diag(link), C.T], [C, np.zeros((len(C), len(C)))]])
-        d = np.linalg.solve(K, np.append(-g + link * there, b))[:4]
-        cost = 1.0 + g @ d + 0.5 * d @ H @ d + 0.5 * link @ (d - there) ** 2
-        there[:2] = np.linalg.solve(found.tangent[:, :2], state - found.tangent[:, held] @ there[held])
+        state, p, new = rng.standard_normal(2), rng.standard_normal(), rng.standard_normal()
+        C, b = np.vstack([Z, [0, 0, 1, 0]]), np.append(state, p)
+        link = np.diag([0, 0, 0, 1 / variance])
+        K = np.block([[H + link, C.T], [C, np.zeros((3, 3))]])
+        d = np.linalg.solve(K, np.append(-g + [0, 0, 0, new / variance], b))[:4]
+        cost = 1.0 + g @ d + 0.5 * d @ H @ d + (d[3] - new) ** 2 / (2 * variance)
+        e = np.linalg.solve(found.tangent[:, :2], state - found.tangent[:, 2] * p)
+        assert not found.tangent[:, 3].any()
+        there = np.array([*e, p, new])
         value = found.cost + found.gradient @ there + 0.5 * there @ found.matrix @ there
         assert value == pytest.approx(cost, rel=1e-9)
-        np.testing.assert_allclose(np.append(d[:2], d[chosen]) @ turn, there[:2], atol=1e-9)
+        np.testing.assert_allclose(np.append(d[:2], d[3]) @ turn, e, atol=1e-9)
 
 
 def test_what_is_not_known_has_an_infinite_variance():

@@ -34,7 +34,6 @@ from switchfit.online.tracker import (
     StoppedError,
     Tracker,
     append_update,
-    drop_artificial,
     invert,
     read,
     read_journal,
@@ -805,10 +804,10 @@ class OnlineEstimator:
         """Return the linearised cost of a hypothesis with so many times in the window, in these and the problem's
         parameters.
         """
-        A, into = self._settings.entries, self._beam.into
-        matrix = into.T @ drop_artificial(found.matrices[b], self._tracker.artificial) @ into
-        state, tangent = found.states[b].copy(), found.tangents[b] @ into
-        return Best(self._read_theta(found.moved[b]), state, tangent, slice(A, A + count), self._slices, matrix)
+        of_engine, A = (found.matrices[b].copy(), found.tangents[b].copy()), self._settings.entries
+        theta, times = self._read_theta(found.moved[b]), slice(A, A + count)
+        artificial = self._tracker.artificial
+        return Best(theta, found.states[b].copy(), times, self._slices, of_engine, artificial, self._beam.into)
 
     def _measure_walks(self, best: Best) -> FloatArray:
         """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).

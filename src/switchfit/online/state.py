@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import compare
-from switchfit.online.tracker import Start, invert
+from switchfit.online.tracker import Start, drop_artificial, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
@@ -87,24 +87,39 @@ class Alarm(NamedTuple):
     statistic: float
 
 
-class Best(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Best:
     """The linearised cost of the best hypothesis, and its state, in D unknowns.
 
     Attributes
     ----------
     theta : (U,), parameters and initial states in the order of the problem's theta
-    state, tangent : (n,), (n, D), the state and its derivatives
+    state : (n,)
     times : slice, of the transition times that are not past
     parameters : dict of str to slice, of the free parameters
-    matrix : (D, D), second derivatives of the cost
+    of_engine, artificial : ((E, E), (n, E)), (E,)
+        Second derivatives and tangent in the engine's E unknowns, and what the diagonal has that is no knowledge.
+    into : (E, D)
+        How these unknowns follow from the D.
     """
 
     theta: FloatArray
     state: FloatArray
-    tangent: FloatArray
     times: slice
     parameters: dict[str, slice]
-    matrix: FloatArray
+    of_engine: tuple[FloatArray, FloatArray]
+    artificial: FloatArray
+    into: FloatArray
+
+    @cached_property
+    def matrix(self) -> FloatArray:
+        """Second derivatives of the cost, (D, D)."""
+        return self.into.T @ drop_artificial(self.of_engine[0], self.artificial) @ self.into
+
+    @property
+    def tangent(self) -> FloatArray:
+        """Derivatives of the state, (n, D)."""
+        return self.of_engine[1] @ self.into
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,9 @@ The start of a window: a state whose uncertainty is that of unknowns that the sa
 
 Samples before the window stay as J, g and H, the value, gradient and Gauss-Newton matrix of their cost (the arrival
 cost), in the unknowns ``d = (e, tau, p)``: A = n entries e that shift the state at the start of the window, the
-transition times in the window, and the parameters, ``x = x_w + Z d``. Transition times that leave the window become
-further entries of e; as more than n directions cannot all move n entries of the state, there are combinations without
-effect on the state, and the cost takes its minimum along them (the Schur complement).
+transition times in the window, and the parameters, ``x = x_w + Z d``. A transition time that leaves the window becomes
+a further entry of e; as n + 1 directions cannot all move n entries of the state, one combination has no effect on the
+state, and the cost takes its minimum along it (the Schur complement).
 
 The state of an online estimator in a file, and the journal of the samples since then.
 """
@@ -200,23 +200,22 @@ class Start(NamedTuple):
 
 
 def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: FloatArray) -> tuple[Start, FloatArray]:
-    """Return a start at which parameters have new values, each around its old one, or at which transition times have
-    left the window, whose slots are then free for other births.
+    """Return a start at which parameters have new values, each around its old one.
 
-    The old values join e, since the state depends on them; what has no effect on the state is eliminated. They are
-    joined to the new ones by ``(p_new - p_old)^2 / (2 variance)``.
+    The old values join e, since the state depends on them; what has no effect on the state is eliminated, as in `Past`.
+    They are joined to the new ones by ``(p_new - p_old)^2 / (2 variance)``.
 
     Parameters
     ----------
     start : Start
     entries : int, A
-    chosen : (m,) int, positions of these among the D unknowns
+    chosen : (m,) int, positions of the parameters among the D unknowns
     variances : (m,), infinite where the old value says nothing about the new one
 
     Returns
     -------
     start : Start
-    turn : (A + m, A), how the new entries e follow from the old ones and the old values
+    turn : (A + m, A), how the new entries e follow from the old ones and the old parameters
     """
     D, m = len(start.gradient), len(chosen)
     old, new = np.concatenate([np.arange(entries), chosen]), np.arange(D, D + m)
@@ -250,6 +249,66 @@ def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: Floa
     return found, np.pad(turn, ((0, 0), (0, entries - rank)))
 
 
+class Past(NamedTuple):
+    """How the first transition time of a window joins the A entries e before it.
+
+    Attributes
+    ----------
+    rotation : (A + 1, A + 1), orthonormal: of the columns of Z, the last has no effect on the state
+    births : int, transition times that there is room for
+    """
+
+    rotation: FloatArray
+    births: int
+
+    @classmethod
+    def of(cls, tangent: FloatArray, entries: int, births: int) -> Past:
+        """Return it for a tangent (n, D) at the start of the window."""
+        return cls(np.linalg.svd(tangent[:, : entries + 1])[2].T, births)
+
+    def turn(self, values: FloatArray) -> FloatArray:
+        """Return values (..., D) along the unknowns in the new ones; the one without effect becomes the last time."""
+        A = len(self.rotation) - 1
+        first, rest, p = np.split(values, [A + 1, A + self.births], axis=-1)
+        turned = first @ self.rotation
+        return np.concatenate([turned[..., :A], rest, turned[..., A:], p], axis=-1)
+
+    def absorb(self, found: Hypotheses, prior: float) -> None:
+        """Let the first time of B hypotheses join e, in place; its slot is then free for another birth.
+
+        Parameters
+        ----------
+        found : Hypotheses
+            Views of records.
+        prior : float
+            The second derivative that a birth begins with, which the absorbed time loses and the free slot gets.
+        """
+        A = len(self.rotation) - 1
+        free = A + self.births - 1
+        H = np.array(found.matrices)
+        # H_0 of the birth has done its work, to keep the time near its node, unless the data say too little about it.
+        lost = np.zeros(H.shape[1])
+        lost[A] = prior
+        reduced = H - np.diag(lost)
+        certain = np.linalg.eigvalsh(reduced[:, : A + 1, : A + 1])[:, 0] > 1e-9 * prior
+        H = np.where(certain[:, None, None], reduced, H)
+        H = self.turn(self.turn(H).swapaxes(1, 2))
+        g = self.turn(np.array(found.gradients))
+        # Schur complement of the combination without effect, now last among the times; infinity leaves all as it is.
+        pivot = np.where(H[:, free, free] > 0, H[:, free, free], np.inf)
+        row, slope = H[:, free].copy(), g[:, free].copy()
+        found.costs[:] -= 0.5 * slope**2 / pivot
+        g -= row * (slope / pivot)[:, None]
+        H -= row[:, :, None] * row[:, None, :] / pivot[:, None, None]
+        # Its slot is empty: no slope, the curvature of H_0 for the next birth, and no effect on the state.
+        g[:, free], H[:, free], H[:, :, free], H[:, free, free] = 0.0, 0.0, 0.0, prior
+        found.gradients[:], found.matrices[:] = g, H
+        found.tangents[:] = self.turn(np.array(found.tangents))
+        found.tangents[..., free] = 0.0
+        found.moved[:] = self.turn(np.array(found.moved))
+        found.moved[:, free] = 0.0
+
+
 KEPT = 32
 """Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
 
@@ -264,11 +323,8 @@ LONGEST_APART = 2.0
 """How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
 
 REPEATED = 12
-"""Hypotheses that go on where all are propagated anew over the window: parameters get new values, a transition leaves
-it, or a sample comes so late that the hypotheses at the node before it are not kept."""
-
-CERTAIN = 1e-9
-"""Curvature, as a part of what a birth begins with, above which the data have determined its time."""
+"""Hypotheses that go on where all are propagated anew over the window: parameters get new values, or a sample comes so
+late that the hypotheses at the node before it are not kept."""
 
 NOTHING = 1e-9
 """Part of the artificial terms of H below which what is left without them is rounding."""
@@ -351,6 +407,8 @@ class Tracker:
         self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self.behind = np.zeros((KEPT, settings.entries))
+        self._views = [beam.engine.view(records[: settings.width]) for records in self.records]
+        self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
         self._coded: tuple[Any, list[int]] = (None, [])
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
@@ -380,7 +438,9 @@ class Tracker:
 
     def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses whose records are at a place."""
-        return kept, self.beam.engine.view(self.records[place, : len(kept.mode)])
+        count = len(kept.mode)
+        usual = count == self.settings.width
+        return kept, self._views[place] if usual else self.beam.engine.view(self.records[place, :count])
 
     def has(self, node: int) -> bool:
         """Return whether the hypotheses at a node are kept."""
@@ -401,10 +461,12 @@ class Tracker:
         """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
         which of those that have more after it.
         """
-        last = len(self.declared) - 1
-        same = (kept.modes[:, : last + 1] == self.declared).all(1)
-        ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
-        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in ways)
+        if self._known[0] is not kept or self._known[1] is not self.declared:
+            last = len(self.declared) - 1
+            same = (kept.modes[:, : last + 1] == self.declared).all(1)
+            ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
+            self._known = kept, self.declared, ways
+        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in self._known[2])
         return int(value.argmin()), exact, more
 
     def step(self, node: int, births: bool) -> None:
@@ -513,51 +575,67 @@ class Tracker:
         known = drop_artificial(found.matrices[b], self.artificial)
         errors = np.sqrt(np.diag(invert(known)))[A : A + gone] if gone else np.zeros(0)
         there.moved[:, : A + S] = 0.0
+        pasts = []
+        # Transitions that are behind the new start become entries e, one after the other; for each one combination of n
+        # + 1 directions has no effect on the state, and is eliminated (`window`).
+        for _ in range(gone):
+            pasts.append(Past.of(there.tangents[0], A, S))
+            pasts[-1].absorb(there, self.birth_information)
         x, Z, g = there.states[0].copy(), there.tangents[0].copy(), there.gradients[0].copy()
         H = there.matrices[0] - self._artificial
         self.start = Start(there.moved[0].copy(), float(there.costs[0]), g, H, x, Z)
-        modes, times = own.modes[0, : gone + 1], times[0, :gone]
-        self.left += map(Left, modes[:gone].tolist(), times.tolist(), errors.tolist())
+        modes = own.modes[0, : gone + 1]
+        self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
         self.behind -= moved[:, :A]
-        kept, found = self.at(last)
-        is_early = kept.times[:, 0] + found.moved[:, A] < end
-        chosen = np.arange(len(kept.mode))
-        if gone or kept.switches[is_early].any():
-            # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
-            chosen = self._find_agreeing(kept, found.moved, modes, times, end)
+        # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
+        for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
+            self._follow(node, pasts, modes, times[0, :gone], end)
         self.first = following
         if gone:
-            self._absorb(self.start, kept.take(chosen), found.take(chosen), times)
-        elif len(chosen) < len(kept.mode):
-            self.keep(last, kept.take(chosen), found.records[chosen], np.arange(len(chosen)))
+            self.declared = self.declared[gone:]
 
-    def _find_agreeing(
-        self, kept: Sequences, moved: FloatArray, modes: NDArray[np.int64], times: FloatArray, end: float
-    ) -> NDArray[np.intp]:
-        """Return the hypotheses that have the same modes (k + 1,) before the new start of the window, at about the same
-        times (k,), and no birth of others before it.
+    def _follow(self, node: int, pasts: list[Past], modes: NDArray[np.int64], times: FloatArray, end: float) -> None:
+        """Drop the hypotheses of a node that disagree about what has left the window, and express the others by its
+        new start.
+
+        Parameters
+        ----------
+        node : int
+        pasts : list of Past, for each of k transitions that have left
+        modes, times : (k + 1,) int, (k,)
+        end : float, time of the start
         """
-        k, begin, own = len(times), float(self.feed.nodes[self.first]), self.times(kept, moved)
-        agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
-        # Times may have moved to before the window.
-        agrees &= (np.abs(np.maximum(own[:, :k], begin) - times) <= LONGEST_APART * self.spacing).all(1)
-        is_born = self._slots < kept.switches[:, None]
-        return np.flatnonzero(agrees & ~(is_born & (own < end))[:, k:].any(1))
-
-    def _absorb(self, start: Start, kept: Sequences, found: Hypotheses, times: FloatArray) -> None:
-        """Let the first times (k,) of all hypotheses join the entries e: they have left the window."""
-        A, k = self.settings.entries, len(times)
-        # H_0 of a birth has done its work, to keep the time near its node, unless the data say too little about it.
-        if np.linalg.eigvalsh(start.matrix[: A + k, : A + k])[0] <= CERTAIN * self.birth_information:
-            start.matrix[range(A, A + k), range(A, A + k)] += self.birth_information
-        self.start, turn = forget(start, A, np.arange(A, A + k), np.full(k, np.inf))
-        # They are measured from those of the best hypothesis, at which the new start was made.
+        place, A, k = (node + self.dropped) % KEPT, self.settings.entries, len(pasts)
+        there = self.kept[place]
+        if there is None:
+            return
+        kept, found = there
+        self.catch_up(place, found)
+        is_early = kept.times[:, 0] + found.moved[:, A] < end
+        if not pasts and not kept.switches[is_early].any():
+            return
         own = self.times(kept, found.moved)
-        found.moved[:, :A] = np.hstack([found.moved[:, :A], own[:, :k] - times]) @ turn
-        found.moved[:, A : A + self.settings.births] = 0.0
-        modes, own = np.roll(kept.modes, -k, axis=1), np.roll(own, -k, axis=1)
-        self.declared = self.declared[k:]
-        self.repeat(kept._replace(modes=modes, times=own, switches=kept.switches - k), found)
+        is_born = self._slots < kept.switches[:, None]
+        # The same modes before the new start, at about the same times, and no birth of the others before it.
+        agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
+        begin = float(self.feed.nodes[self.first])  # times may have moved to before it
+        agrees &= (np.abs(np.maximum(own[:, :k], begin) - times) <= LONGEST_APART * self.spacing).all(1)
+        agrees &= ~(is_born & (own < end))[:, k:].any(1)
+        chosen = np.flatnonzero(agrees)
+        if not len(chosen):
+            self.kept[place] = None
+            return
+        kept, found = kept.take(chosen), self.beam.engine.view(found.records[chosen])
+        # Times that have left are measured from those of the best hypothesis, at which the new start was made.
+        found.moved[:, A : A + k] = own[chosen, :k] - times
+        for past in pasts:
+            past.absorb(found, self.birth_information)
+        if k:
+            rolled = np.roll(kept.modes, -k, axis=1), np.roll(kept.times, -k, axis=1)
+            for array in rolled:
+                array[:, -k:] = 0
+            kept = kept._replace(modes=rolled[0], times=rolled[1], switches=kept.switches - k)
+        self.keep(node, kept, found.records, np.arange(len(chosen)))
 
     def renew(self, chosen: NDArray[np.intp], variances: FloatArray) -> None:
         """Give parameters new values from the start of the window on, which differ from the old ones by `variances`.
