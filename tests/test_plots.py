@@ -242,6 +242,10 @@ def test_one_panel_of_several(heater, models):
     assert (alone.get_xlabel(), alone.get_ylabel()) == (whole.get_xlabel(), "run")
     assert [text.get_text() for text in alone.get_legend().get_texts()] == ["good"]
     whole, alone = found.plot(), found.plot(channel="thermometer").axes[0]
+    (prediction,) = found.predictions
+    reach = np.abs(prediction.prediction_band()[:, 0] - prediction.outputs).max()
+    assert whole.axes[1].get_ylim()[0] < -reach, "the band about the residuals' zero is cut off"
+    assert whole.axes[1].get_ylim()[1] > reach
     np.testing.assert_array_equal(alone.lines[1].get_data(), whole.axes[0].lines[1].get_data())
     labels = {text.get_text() for text in whole.legends[0].get_texts()}
     assert {"measured", "predicted", "95 % prediction", "95 % confidence", "± sigma"} < labels
