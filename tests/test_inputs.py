@@ -157,7 +157,7 @@ def test_bad_values(values, error, message):
     [
         ("k", NAMED, "mode 'pull' reads 'k', which is not there: p has k; u has left, right"),
         (0, NAMED, "reads 0, which is not there: p has k; u has left, right"),
-        ("left", np.ones((7, 2)), "mode 'pull'.* raised TypeError: .*string"),
+        ("left", np.ones((7, 2)), r"mode 'pull'.* u has no names: give sf.Input a dict of name -> samples"),
     ],
 )
 def test_modes_that_ask_for_what_is_not_there(left, values, message):

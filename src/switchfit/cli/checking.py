@@ -269,8 +269,8 @@ Part = Annotated[
 def paper(out: PaperFolder = Path("paper"), quick: Quick = False, only: Part = None) -> None:
     """Reproduce the paper's experiments and figures.
 
-    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run leaves the
-    parts that are done; --only runs another one.
+    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when
+    the same command is run again.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
     from switchfit.paper import TABLE, run
@@ -279,6 +279,6 @@ def paper(out: PaperFolder = Path("paper"), quick: Quick = False, only: Part = N
     try:
         run(out, quick=quick, only=only, say=terminal.print_note)
     except KeyboardInterrupt:
-        terminal.fail("interrupted; run the parts that are missing by --only.", terminal.INTERRUPTED)
+        terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
     terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
     terminal.print_note(f"written to {out}")

@@ -79,13 +79,20 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = l
         For an unknown part.
     OSError
         If a file cannot be written.
+
+    Notes
+    -----
+    Each part is written when it is done. Where parts are missing in ``results.json``, as after an interruption (by
+    KeyboardInterrupt), the same call does these.
     """
     if only is not None and only not in PARTS:
         raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
     names = list(PARTS) if only is None else [only]
     out.mkdir(parents=True, exist_ok=True)
-    is_kept = only is not None and (out / RESULTS).exists()
-    results: dict[str, Any] = json.loads((out / RESULTS).read_bytes()) if is_kept else {}
+    before: dict[str, Any] = json.loads((out / RESULTS).read_bytes()) if (out / RESULTS).exists() else {}
+    results = before if only is not None or len(before) < len(PARTS) else {}
+    if only is None:
+        names = [name for name in names if name not in results or results[name]["quick"] != quick]
     for number, name in enumerate(names, start=1):
         part, began = PARTS[name], time.perf_counter()
 

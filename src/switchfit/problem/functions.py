@@ -457,7 +457,10 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
             "transition time."
         ) from error
     except Exception as error:
-        raise ValueError(f"{what}: {form} raised {type(error).__name__}: {str(error).rstrip('.')}.") from error
+        message = str(error).rstrip(".")
+        if "u)" in form and "string indexing" in message:  # u["left"] of an array
+            message += ". u has no names: give sf.Input a dict of name -> samples"
+        raise ValueError(f"{what}: {form} raised {type(error).__name__}: {message}.") from error
     try:
         return jnp.asarray(value)
     except (TypeError, ValueError) as error:
