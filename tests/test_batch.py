@@ -414,7 +414,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
     kept = settings | {"folder": tmp_path / "study"}
     partial = sf.monte_carlo(room(), 4 * CHUNK, **kept, callback=lambda done, total: seen.append(done) or True)
     assert len(partial) < 4 * CHUNK
-    assert "STOPPED" in str(partial)
+    assert "stopped, " in str(partial)
     assert partial.verdict.reasons[-1].kind == "stopped"
     done = len(list(kept["folder"].iterdir())) * CHUNK
     whole = sf.monte_carlo(room(), 4 * CHUNK, **kept, callback=lambda done, total: seen.append(done))

@@ -16,6 +16,7 @@ from switchfit.engine.native.templates import Order
 from switchfit.fit import accuracy
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.problem.functions import use_float64
 
 G, SLOW = 9.81, 1e-2
 TIMES = np.arange(1, 101) * 0.02
@@ -94,8 +95,9 @@ def judge(h, slopes, states, f_x, weights):
 
 def measure(f, f_x, tableau, weights, h):
     """The jump of a row of x' = f(t, x) from 1 at 0, whose slope in t is 0 beside jumps."""
-    found = propagation.compute_stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
-    found = rows.Stages(*([np.asarray(value) for value in part] for part in found))
+    with use_float64():
+        found = propagation.compute_stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
+        found = rows.Stages(*([np.asarray(value) for value in part] for part in found))
     slopes = [np.array([[f_x(found.times[j], found.states[j][0])]]) for j in (0, -1)]
     return float(rows.measure_jump(*judge(h, found.slopes, found.states, slopes, weights), np)[0])
 

@@ -181,8 +181,8 @@ WRONG = {
     r"hessian must be ('auto' or 'exact'|one of)": lambda: sf.estimate(tank(), hessian="none"),
     "guards names the unknown mode 'c'; the modes are air": lambda: ball_system(guards={("air", "c"): abs}),
     r"guard \('air', 'air'\) must be a function g\(t, x, p\)": lambda: ball_system(guards={("air", "air"): 3.0}),
-    r"TerminalConstraint must be a function psi\(x, p\); got int": lambda: sf.TerminalConstraint(3),
-    r"an array of shape \(m,\); got shape \(2, 2\)": lambda: constrain(lambda x, p: jnp.ones((2, 2)) * x[0]),
+    r"TerminalConstraint must be a function psi\(x, p\); got 3": lambda: sf.TerminalConstraint(3),
+    r"must return a number or \(m,\) of them; got \(2, 2\)": lambda: constrain(lambda x, p: jnp.ones((2, 2)) * x[0]),
 }
 
 

@@ -350,7 +350,7 @@ def test_a_problem_may_have_a_shortest_duration_for_each_mode():
     assert abs(np.diff(fit.transition_times[0])[0] - 3.5) < 1e-9
     with pytest.raises(ValueError, match="min_duration names the unknown mode 'jump'"):
         sf.Problem(SYSTEM, run, FREE, min_duration={"jump": 1.0})
-    with pytest.raises(ValueError, match="min_duration must be zero or positive"):
+    with pytest.raises(ValueError, match="min_duration of 'turn' must be 0 or more"):
         sf.Problem(SYSTEM, run, FREE, min_duration={"turn": -1.0})
     with pytest.raises(ValueError, match="the guess gives mode 2"):
         sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 5.0})
@@ -487,8 +487,8 @@ def test_parameters_far_off_are_found_from_other_starts():
         ({"successions": {"rise": "jump"}}, "successions of 'rise' names the unknown mode 'jump'"),
         ({"successions": {"rise": "rise"}}, "names the mode itself"),
         ({"first": "rise", "last": "turn", "successions": {"rise": "fall"}}, "can be reached from first"),
-        ({"min_duration": -1.0}, "min_duration must be zero or positive; got -1.0"),
-        ({"min_duration": {"rise": -1.0}}, "min_duration must be zero or positive; got {'rise': -1.0}"),
+        ({"min_duration": -1.0}, "min_duration must be 0 or more; got -1.0"),
+        ({"min_duration": {"rise": -1.0}}, "min_duration of 'rise' must be 0 or more; got -1.0"),
         ({"min_duration": {"jump": 1.0}}, "min_duration names the unknown mode 'jump'"),
         ({"max_switches": -1}, "max_switches"),
         ({"width": 2}, "width must be 3 or more; got 2"),

@@ -19,7 +19,7 @@ from switchfit.problem.dates import Origin, read_date_text
 from switchfit.problem.experiment import count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_instance, shorten
+from switchfit.problem.validation import as_array, as_index, as_instance, set_fields, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import format_line, join_first
 
@@ -152,6 +152,9 @@ class Comparison:
     downweighted: NDArray[np.bool_] | None = None
     weights: FloatArray | None = None
     units: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_fields(self, units=self.units or ("",) * len(self.names))
 
     def __repr__(self) -> str:
         return format_line(self, self.kind, join_first(self.names), f"{len(self.times)} times")

@@ -12,7 +12,16 @@ from switchfit.fit.result import Fit, Step, disagreement
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.report import formats
-from switchfit.report.formats import Table, Timed, format_rounded, format_table, format_time, format_unit, wrap_text
+from switchfit.report.formats import (
+    Table,
+    Timed,
+    format_rounded,
+    format_table,
+    format_time,
+    format_unit,
+    get_unit,
+    wrap_text,
+)
 from switchfit.report.frames import list_holds
 from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
@@ -209,13 +218,13 @@ def tabulate_channels(fit: Fit) -> Table:
     fit : Fit
     """
     rows, shares = [], []
-    for label, _, comparison, k in list_channels(fit.comparisons, fit.run_names):
+    for label, e, comparison, k in list_channels(fit.comparisons, fit.run_names):
         residual, sigma = comparison.residuals[:, k], comparison.sigma
         count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
         scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
         share = explain_channel(comparison, k)
         explained = "" if np.isnan(share) else format_share(share)
-        unit = format_unit(comparison.units[k])
+        unit = get_unit(comparison, k, fit.trajectories[e])
         rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
         shares.append(share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]

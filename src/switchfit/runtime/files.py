@@ -24,12 +24,13 @@ from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from switchfit.runtime.errors import InputError
+
+if TYPE_CHECKING:  # it is imported where arrays are: files are also written and read without NumPy
+    import numpy as np
+    from numpy.typing import NDArray
 
 PREFIX, SUFFIX = ".switchfit-", ".tmp"
 """Prefix and suffix of the names of temporary files."""
@@ -206,6 +207,8 @@ def to_json(record: Any, kind: type) -> Any:
 
 def _encode_array(value: Any) -> Any:
     """Return an array as a list, or with its dtype and shape; TypeError for anything else."""
+    import numpy as np
+
     if not isinstance(value, np.ndarray):
         raise TypeError(f"a {type(value).__name__} cannot be saved.")
     if value.dtype == np.float64 and value.size > 0:
@@ -290,6 +293,9 @@ def find_dtype(kind: Any) -> np.dtype[Any] | None:
     kind : type
         ``NDArray[...]``: a name for ``np.ndarray[...]``, or from NumPy 2.5 on an alias with an origin of its own.
     """
+    import numpy as np
+    from numpy.typing import NDArray
+
     if get_origin(kind) not in (np.ndarray, NDArray):
         return None
     last = get_args(kind)[-1]
@@ -298,6 +304,8 @@ def find_dtype(kind: Any) -> np.dtype[Any] | None:
 
 def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
     """Return an array of the declared type from a list of numbers, or from its dtype, shape and values."""
+    import numpy as np
+
     if isinstance(value, dict):
         array = np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])
     else:

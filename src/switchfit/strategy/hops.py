@@ -203,7 +203,7 @@ def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -
     problem = evaluator.problem
     where, run = problem.unknowns.times[e], problem.experiments[e]
     ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
-    for i, place in enumerate(where.tolist()):
+    for i, place in enumerate(where.tolist()[: len(ends) - 2]):  # without a free tf
         nearest = SCAN_FIRST * errors[place] if place >= 0 else 0.0
         for end in (ends[i], ends[i + 2]):
             room = abs(end - theta[place])

@@ -170,8 +170,6 @@ def _read_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dic
     if given is not None:
         asked = check_durations(given, problem.system)
         found |= {name: asked.get(name, found[name]) if isinstance(asked, dict) else asked for name in names}
-    if not all(0 <= least < np.inf for least in found.values()):
-        raise ValueError(f"min_duration must be zero or positive; got {shorten(given)}.")
     return found
 
 
