@@ -43,7 +43,7 @@ from switchfit.optimize import algebra
 from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.matrix import Dense, Hessian
 from switchfit.optimize.problem import Problem, Trial, move
-from switchfit.optimize.qp import NONE, Equalities, Room, find_normal_step, is_definite, solve_composite
+from switchfit.optimize.qp import NONE, TINY, Equalities, Room, find_normal_step, is_definite, solve_composite
 from switchfit.optimize.state import MET, Accepted, Finding, Oracle, Point, Sample, State
 from switchfit.optimize.threads import one_thread
 
@@ -274,9 +274,11 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
         # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
         if accepted is None and k == 0 and state.iteration >= PATIENCE and not constrained:
             accepted = _step_back(oracle, state, direction)
+        if accepted is not None and k == 0:
+            return accepted._replace(step_length=1.0)
         length = measure_in_box(problem, direction.step)
         if accepted is not None:
-            return accepted._replace(step_length=length / measure_in_box(problem, whole) if k else 1.0)
+            return accepted._replace(step_length=length / measure_in_box(problem, whole))
         if length < SMALLEST_RADIUS if constrained else _is_hopeless(state, direction, k + 1):
             return None
         radius = direction.radius
@@ -393,7 +395,7 @@ def _judge(
 
 def _residual(state: State, point: Point) -> float:
     """Return how far a point is from the optimality conditions: relative optimality and violation."""
-    return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
+    return point.optimality / max(state.gradient_scale, TINY) + point.violation
 
 
 #: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [1]_, (18.36).

@@ -293,7 +293,7 @@ def find_other_minimum(fit: Estimate) -> FloatArray | None:
     """
     evaluator = fit.evaluator_at_solution()
     corners = any(run.branches is not None for run in evaluator.runs)
-    if corners or not evaluator.problem.is_least_squares or fit.status is not Status.CONVERGED:
+    if corners or not evaluator.problem.is_sigma_known or fit.status is not Status.CONVERGED:
         return None
     return next(iter(choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
 
