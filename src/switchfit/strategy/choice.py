@@ -270,14 +270,14 @@ def estimate(
             if strategy == "local":
                 raise
             failure = error
-        other = None
+        other, is_over = None, strategy == "local"
         if best is not None and strategy == "auto":
-            is_cut = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # only a few were asked for
-            if hessian == "auto" and not is_cut and is_enough(problem, best):
+            only_few = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # were asked for
+            is_over = hessian != "auto" or only_few
+            if not is_over and is_enough(problem, best):
                 other = find_other_minimum(best)
-                is_cut = other is None
-            strategy = "local" if hessian != "auto" or is_cut else strategy
-        if best is not None and strategy == "local":
+                is_over = other is None
+        if best is not None and is_over:
             return best
         search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, other)
         search.run(callback, budget)
@@ -295,7 +295,10 @@ def find_other_minimum(fit: Estimate) -> FloatArray | None:
     corners = any(run.branches is not None for run in evaluator.runs)
     if corners or not evaluator.problem.is_sigma_known or fit.status is not Status.CONVERGED:
         return None
-    return next(iter(choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
+    try:
+        return next(iter(choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
+    except (KeyboardInterrupt, NotIntegrableError):  # the fit stays
+        return None
 
 
 def _write_to(
