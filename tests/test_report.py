@@ -269,9 +269,7 @@ FITS: dict[str, Fit] = {
 }  # fmt: skip
 CALLED = "mode 'm' compares with k at own.py:3"
 REASONS = {
-    "a wrong slope": Issue(
-        "wrong slope", ("k",), {"before": -4.0, "after": 4.0, "derivatives": (-2.0,), "differences": (2.0,)}
-    ),
+    "a wrong slope": Issue("wrong slope", (), {"before": -4.0, "after": 4.0}),
     "a jump": Issue("jump", ("k",), {"before": 0.49, "after": 2.49, "at": (0.3,)}),
     "a jump in two unknowns": Issue("jump", ("k", "c"), {"before": 0.49, "after": 2.49, "at": (0.3, 1.0)}),
     "a hidden switch": Issue("switch", ("k", CALLED), {"before": 1.0, "after": 2.0, "at": 0.3}),

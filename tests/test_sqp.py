@@ -387,10 +387,8 @@ def test_infinite_and_undefined_regions_are_backed_away_from():
     assert np.isnan(start.cost)
 
 
-@pytest.mark.parametrize(
-    ("factor", "entries"), [([-2.0, -2.0], [[0, -2.0, 2.0], [1, -2.0, 2.0]]), ([2.0, -2.0], [[1, -2.0, 2.0]])]
-)
-def test_the_entries_of_the_gradient_that_are_wrong_are_named(factor, entries):
+@pytest.mark.parametrize("factor", [[-2.0, -2.0], [2.0, -2.0]])
+def test_a_gradient_that_is_wrong_is_seen(factor):
     evaluate = smooth(lambda t: (t @ t, np.array(factor) * t, 2 * np.eye(2)))
     result = minimize(evaluate, [1.0, 1.0], constraints=free(2))
     assert result.status is Status.LINE_SEARCH_FAILED
@@ -398,7 +396,6 @@ def test_the_entries_of_the_gradient_that_are_wrong_are_named(factor, entries):
     np.testing.assert_array_equal(result.theta, [1.0, 1.0])
     assert result.evaluations < 110  # 88 without the search for a jump of J near by
     assert result.reason.kind == "wrong slope"
-    assert np.array(result.reason.entries) == pytest.approx(np.array(entries))
 
 
 def unnamed_kink(theta):

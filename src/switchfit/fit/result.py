@@ -175,13 +175,9 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
     figures: dict[str, float | tuple[float, ...]] = {**found.figures}
     if found.places:
         figures["at"] = tuple(value for _, value in found.places)
-    if found.entries:
-        figures["derivatives"] = tuple(stated for _, stated, _ in found.entries)
-        figures["differences"] = tuple(measured for _, _, measured in found.entries)
     if problem.estimates_delays:
         figures["delayed"] = 1.0
-    named = [i for i, _ in found.places] + [i for i, _, _ in found.entries]
-    return Issue(found.kind, tuple(names[i] for i in named), figures)
+    return Issue(found.kind, tuple(names[i] for i, _ in found.places), figures)
 
 
 CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]

@@ -350,18 +350,17 @@ class _Change(NamedTuple):
             history=history,
             multipliers=result.multipliers / np.concatenate([rows, slopes, slopes]),
             kinks=tuple((i, left / float(slopes[i]), right / float(slopes[i])) for i, left, right in result.kinks),
-            explain=find and cache(lambda: self._convert_finding(result.theta, slopes, find())),
+            explain=find and cache(lambda: self._convert_finding(result.theta, find())),
         )
 
-    def _convert_finding(self, z: FloatArray, slopes: FloatArray, found: Finding) -> Finding:
-        """Return why the line search failed, in theta instead of the variables z (d,); `slopes`: dtheta/dz (d,)."""
+    def _convert_finding(self, z: FloatArray, found: Finding) -> Finding:
+        """Return why the line search failed, in theta instead of the variables z (d,)."""
         places = []
         for i, value in found.places:
             there = z.copy()
             there[i] = value
             places.append((i, float(self.variables.outward(there)[i])))
-        entries = [(i, stated / float(slopes[i]), measured / float(slopes[i])) for i, stated, measured in found.entries]
-        return found._replace(places=tuple(places), entries=tuple(entries))
+        return found._replace(places=tuple(places))
 
 
 def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:

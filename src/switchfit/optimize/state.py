@@ -429,14 +429,11 @@ class Finding(NamedTuple):
     places : tuple of (int, float)
         Coordinates of the jump or the kink, or of the point from which on J is not finite, and where each of them is
         there.
-    entries : tuple of (int, float, float)
-        Coordinates whose derivative is wrong: the derivative, and the difference quotient.
     """
 
     kind: Literal["wrong slope", "jump", "kink", "not finite", "rounding", "valley"]
     figures: Mapping[str, float]
     places: tuple[tuple[int, float], ...] = ()
-    entries: tuple[tuple[int, float, float], ...] = ()
 
 
 Explain = Callable[[], Finding]

@@ -499,22 +499,16 @@ class _Line(NamedTuple):
     step: FloatArray
     noise: float
 
-    @property
-    def begin(self) -> _Place:
-        """Its begin, on the sides of kinks to which the step leads; it is not evaluated again."""
-        point = self.state.point
-        cost, right = point.plus.lagrangian(point.forces)
-        gradient = algebra.mix_sides(right, point.minus.lagrangian(point.forces)[1], self.step)
-        return _Place(0.0, point.theta, cost, float(gradient @ self.step), gradient)
-
     def see(self, fraction: float) -> _Place:
-        """Evaluate J at a fraction of the step."""
+        """Evaluate J at a fraction of the step; at its begin J is known, on the sides of kinks to which it leads."""
         point = self.state.point
         theta = point.theta + fraction * self.step
-        sample = self.oracle.sample(theta, 1)
+        sample = self.oracle.sample(theta, 1) if fraction else point.plus
         if sample is None:
             return _Place(fraction, theta, np.inf, np.inf, self.step)
         cost, gradient = sample.lagrangian(point.forces)
+        if not fraction:
+            gradient = algebra.mix_sides(gradient, point.minus.lagrangian(point.forces)[1], self.step)
         return _Place(fraction, theta, cost, float(gradient @ self.step), gradient)
 
     def jumps(self, low: _Place, high: _Place) -> bool:
@@ -523,7 +517,7 @@ class _Line(NamedTuple):
 
     def bends(self, low: _Place, high: _Place) -> bool:
         """Return whether the slope of J rises between two places by more than a part of what it was at the begin."""
-        return high.slope - low.slope > DISAGREES * max(abs(self.begin.slope), abs(low.slope))
+        return high.slope - low.slope > DISAGREES * max(abs(self.see(0.0).slope), abs(low.slope))
 
 
 #: Part of its distance, and of the step, within which a jump or a kink is located.
@@ -541,7 +535,7 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Findi
     """Find out why no fraction of a step decreases J although its slope is negative."""
     step, noise = direction.step, algebra.NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
     line = _Line(oracle, state, step, noise)
-    begin = line.begin
+    begin = line.see(0.0)
     if not begin.slope < 0.0:
         return Finding("rounding", {"noise": noise})
     low, high = _locate_rise(line)
@@ -550,7 +544,7 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Findi
     # After the jump: differences across one contradict a slope that is right between jumps.
     measured = _contradict_slope(line)
     if measured is not None:
-        return Finding("wrong slope", {"before": begin.slope, "after": measured}, (), _list_wrong(line))
+        return Finding("wrong slope", {"before": begin.slope, "after": measured})
     if high.cost == np.inf:
         return Finding("not finite", {}, _list_places(np.flatnonzero(step), high))
     if line.bends(low, high):
@@ -571,7 +565,7 @@ def _locate_rise(line: _Line) -> tuple[_Place, _Place]:
     They are as near to each other as makes no difference where J jumps or bends between them, or is not finite from
     there on; where it is smooth, their slopes are nearly equal.
     """
-    low = high = line.begin
+    low = high = begin = line.see(0.0)
     # From the shortest length, a power of 1/64, from which on J is larger.
     for k in range(10):
         there = line.see(64.0**-k)
@@ -582,7 +576,7 @@ def _locate_rise(line: _Line) -> tuple[_Place, _Place]:
         if high.cost < np.inf and not line.jumps(low, high) and not line.bends(low, high):
             break
         middle = line.see(0.5 * (low.fraction + high.fraction))
-        rises = middle.cost > line.begin.cost + line.noise or middle.slope >= 0.0
+        rises = middle.cost > begin.cost + line.noise or middle.slope >= 0.0
         low, high = (low, middle) if rises else (middle, high)
     return low, high
 
@@ -607,7 +601,7 @@ def _contradict_slope(line: _Line) -> float | None:
 
     They have to contradict the slopes farther on as well: at a kink within the shortest difference they do not.
     """
-    begin, values, errors, farther = line.begin, [], [], []
+    begin, values, errors, farther = line.see(0.0), [], [], []
     # J is smooth, if it is what it is said to be, up to the next breakpoint or bound.
     low, high = line.oracle.problem.breakpoints.piece(begin.theta, line.oracle.problem.constraints)
     moving = np.flatnonzero(line.step)
@@ -625,15 +619,3 @@ def _contradict_slope(line: _Line) -> float | None:
     best = int(np.argmin(spread)) + 1
     error = 2 * spread[best - 1] + DISAGREES * max(abs(begin.slope), abs(values[best]))
     return values[best] if min(abs(values[best] - begin.slope), farther[best]) > error else None
-
-
-def _list_wrong(line: _Line) -> tuple[tuple[int, float, float], ...]:
-    """Find coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
-    wrong, theta = [], line.begin.theta
-    for i in np.flatnonzero(line.step).tolist():
-        alone = np.zeros(theta.size)
-        alone[i] = math.copysign(0.01 * max(abs(theta[i]), line.oracle.problem.size[i], 1e-3), line.step[i])
-        measured = _contradict_slope(line._replace(step=alone))
-        if measured is not None:
-            wrong.append((i, float(line.begin.gradient[i]), float(measured / alone[i])))
-    return tuple(wrong[:NAMED])

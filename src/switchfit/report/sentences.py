@@ -265,12 +265,6 @@ def _write_combination(issue: Issue) -> str:
     return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
 
 
-def _list_wrong(issue: Issue) -> str:
-    """Return the entries of a gradient that are wrong."""
-    entries = list_each(issue, "{} (derivative {:.3g}, differences {:.3g})", "derivatives", "differences")
-    return f"; it is wrong in {entries}" if entries else ""
-
-
 def _write_jump(issue: Issue) -> str:
     """Return where the cost jumps, as the beginning of a sentence; empty where that is not known."""
     template = "The cost jumps from {before:.8g} to {after:.8g} where {0} passes {at:.8g}: "
@@ -373,7 +367,7 @@ _ISSUES: dict[str, Sentence] = {
     "derivatives of another cost": "the derivatives do not belong to the cost",
     # Why a line search failed, or a fit ended with an error
     "wrong slope": "The gradient does not belong to the cost: along that direction it says {before:.3g}, differences "
-    "of the cost say {after:.3g}{wrong entries}. Check the derivatives.{delay}",
+    "of the cost say {after:.3g}. Check the derivatives.{delay}",
     "jump": "The cost jumps from {before:.8g} to {after:.8g} where the step passes {places}. The optimiser needs a "
     "cost that is continuous there.{delay}",
     "switch": "{jump}{1}, and derivatives do not include such a switch. If {0} is a time, make it a transition time; "
@@ -695,7 +689,6 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
     "correlated": lambda issue: list_each(issue, "{} ({:.2f})", "correlation"),
     "non-normal": lambda issue: list_each(issue, _NOT_NORMAL, "kurtosis", "outliers"),
-    "wrong entries": _list_wrong,
     "jump": _write_jump,
     "places": lambda issue: list_each(issue, "{} = {:.8g}", "at"),
     "kind": lambda issue: issue.kind,
