@@ -26,7 +26,7 @@ from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import PREFIX, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
-from switchfit.engine.native.segments import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, layout_of
+from switchfit.engine.native.segments import layout_of
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, finish_simulation
 from switchfit.problem.data import FloatArray
@@ -156,23 +156,19 @@ class NativeExperiment:
             "multipliers": np.zeros(max(self._rows["count"], 1)),
             "units": _find_own_directions(sizes, structure.N, structure.jumps)[0],
         } | places_in_library(structure)
-        whole = {name: given[name] for name in WHOLE_NUMBERS}
-        floats = {name: given[name] for name in GIVEN if name not in whole}
         for k, (samples, count) in enumerate(zip(arguments.samples, self._counts, strict=True)):
-            cell, *values = (np.asarray(a)[:count] for a in samples)
-            whole |= {f"cell {k}": cell, f"segment {k}": np.zeros(count, int)}
-            floats |= zip((f"time {k}", f"value {k}", f"weight {k}"), values, strict=True)
+            given |= {f"{name} {k}": np.asarray(values)[:count] for name, values in samples._asdict().items()}
             is_late = structure.measurements[k].delay is not None
-            floats[f"seen {k}"] = np.zeros(is_late * count * (1 + sizes.n))
+            given |= {f"segment {k}": np.zeros(count, int), f"seen {k}": np.zeros(is_late * count * (1 + sizes.n))}
         self._named: dict[str, Any] = {}
         self._addresses: dict[str, int] = {}
         # One block of memory per type: the addresses of its parts follow from one that is looked up.
-        for arrays, kind in ((whole, np.int64), (floats, np.float64)):
+        for kind in np.int64, np.float64:
+            arrays = {name: a for name, a in given.items() if a.dtype.kind == np.dtype(kind).kind}
             block = np.concatenate(list(arrays.values()), axis=None, dtype=kind)
             self._divide(block, {name: a.size for name, a in arrays.items()})
         self._divide(np.zeros(sum(layout.sums.values())), layout.sums)
-        of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
-        self._pointers = [*layout.pointers, *of_samples]
+        self._pointers = layout.names
         self._memory = np.zeros(0)  # the scratch space that the table points to, after the first call
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
@@ -246,7 +242,7 @@ class NativeExperiment:
         if self._judged < 0:
             return ()
         if self._size_of_states is None:
-            states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
+            states = self._named["x"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
             largest = np.abs(states).max(axis=0)
             is_known = (largest > 0.0) & np.isfinite(largest)
             # Fixed at the first point: errors of later ones are compared with the same sizes.
@@ -309,11 +305,11 @@ class NativeExperiment:
                 return starts, ends[1:]
 
             none, derives = np.zeros((cells + N, 0)), self.order > Order.COST
-            rows = times[:-1], times[1:], *beside_rows("states", n), none, none
-            tangents = Tangents(*beside_rows("tangents", n, width), none, none) if derives else None
+            rows = times[:-1], times[1:], *beside_rows("x", n), none, none
+            tangents = Tangents(*beside_rows("Z", n, width), none, none) if derives else None
             simulation = Simulation(self._J.item(0), self.times, first_cell, *rows, tangents=tangents)
             late = {k: self._named[f"seen {k}"].reshape(-1, 1 + n).copy() for k, *_ in self._late}
-            return simulation, of_rows("costates", cells + N if derives else 0, n), late
+            return simulation, of_rows("costate", cells + N if derives else 0, n), late
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
@@ -651,9 +647,10 @@ def foreign_derivatives(
         "units": units,
     }
     given |= places
-    buffers = [given[key] for key in GIVEN]
-    for samples in arguments.samples:
-        buffers += [*samples, np.zeros(1, dtype=np.int64), np.zeros(1)]  # none is late
+    for k, samples in enumerate(arguments.samples):
+        given |= {f"{name} {k}": values for name, values in samples._asdict().items()}
+        given |= {f"segment {k}": np.zeros(1, dtype=np.int64), f"seen {k}": np.zeros(1)}  # none is late
+    buffers = [given[name] for name in layout.arguments]
     lengths = layout.sums
     of_memory = sum(fixed + each * (cells + N) for fixed, each in layout.memory.values())
     results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]

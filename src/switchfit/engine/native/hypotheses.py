@@ -231,7 +231,7 @@ class HypothesisWriter(Writer):
 
     def __init__(self, library: Structure, sizes: Sizes, module: Module) -> None:
         super().__init__(library, sizes, Order.GAUSS_NEWTON, module)
-        own = (f"{name}_{k}" for k in range(len(library.measurements)) for name in OF_SAMPLES)
+        own = (f"{name} {k}" for k in range(len(library.measurements)) for name in OF_SAMPLES)
         self.names = (*GIVEN, *scratch_sizes(sizes), *own)
 
     def find(self, record: Value) -> Pointers:
@@ -246,12 +246,10 @@ class HypothesisWriter(Writer):
         # Nodes are at known times: `moves` is the row of zeros. A jump maps x and Z in place.
         found |= {"moves": found["units"], "x_after": found["x"], "Z_after": found["Z"]}
         found["time"] = self.at(found["nodes"], node)
-        for k, sensor in enumerate(self.library.measurements):
-            lengths = {"time": 1, "value": sensor.channels, "weight": sensor.channels}
-            begin, end = (self.get("i64", found[f"first_{k}"], at) for at in (node, node + 1))
+        for k in range(len(self.library.measurements)):
+            begin, end = (self.get("i64", found[f"first {k}"], at) for at in (node, node + 1))
             with self.loop(begin, end) as place:
-                here = {name: self.at(found[f"{name}_{k}"], place, length) for name, length in lengths.items()}
-                self.call(f"sample_{k}", found | here)
+                self.call(f"sample_{k}", found | self.at_sample(found, k, place))
         if self.library.reset_maps:
             begin, end = (self.get("i64", found["jump_first"], at) for at in (node, node + 1))
             with self.loop(begin, end) as place:
@@ -603,7 +601,7 @@ class NativeHypotheses:
         self._follow_order = program.function(f"{prefix}follow_order", *[kind] * 14)
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
-        self._arrays |= {f"{name}_{k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
+        self._arrays |= {f"{name} {k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
 
     def reserve(self, cells: int, samples: int) -> tuple[FloatArray, FloatArray, list[SampleArrays]]:
         """Replace nodes (G + 1,), signals (G, 4, S) and samples by empty arrays, which are to be filled while a log
@@ -619,8 +617,8 @@ class NativeHypotheses:
         given: dict[str, Any] = {"nodes": np.zeros(cells + 1), "signals": np.zeros((cells, *wide))}
         self._arrays |= given | {"jump_first": np.zeros(cells + 2, dtype=np.int64)}
         of_sensors = []
-        for k in range(sum(name.startswith("first_") for name in self._arrays)):
-            channels = self._arrays[f"value_{k}"].shape[1]
+        for k in range(sum(name.startswith("first ") for name in self._arrays)):
+            channels = self._arrays[f"value {k}"].shape[1]
             first, time = np.zeros(cells + 2, dtype=np.int64), np.zeros(samples)
             of_sensors.append((first, time, np.zeros((samples, channels)), np.zeros((samples, channels))))
             self._set_samples(k, *of_sensors[-1])

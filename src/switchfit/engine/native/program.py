@@ -33,7 +33,7 @@ from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Operand, Program, Value, Variable, compile_modules
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
-from switchfit.engine.native.segments import GIVEN, OF_SAMPLES, Pointers, Writer
+from switchfit.engine.native.segments import Pointers, Writer
 from switchfit.engine.native.templates import ELL, ELL_X, F_X, F, Order, Sizes
 from switchfit.engine.native.trace import Unsupported
 from switchfit.problem.functions import use_float64
@@ -52,13 +52,11 @@ DATA, DIMENSIONS = 24, 40
 def write_handler(writer: Writer) -> str:
     """Return the text of the handler, which fills the table of pointers and calls `evaluate`.
 
-    Arguments are those of `GIVEN`, then those of the samples; results are all accumulators in one array, and
-    the scratch space.
+    Results are all accumulators in one array, and the scratch space.
     """
-    measurements = len(writer.library.measurements)
-    names = [*GIVEN, *(f"{name} {k}" for k in range(measurements) for name in OF_SAMPLES)]
+    names = writer.layout.arguments
     (frame,) = writer.begin("ptr @xla_handler(ptr %frame)")
-    table = writer.allocate("ptr", len(writer.names) + len(OF_SAMPLES) * measurements)
+    table = writer.allocate("ptr", len(writer.names))
     extension = writer.load("ptr", writer.into(frame, EXTENSION))
     with writer.when(extension.differs("null")), writer.when(writer.load("i32", writer.into(extension, 8)).equals(1)):
         metadata = writer.load("ptr", writer.into(extension, 24))  # XLA queries the version of the interface
@@ -82,9 +80,9 @@ def write_handler(writer: Writer) -> str:
     for name, (fixed, each_row) in writer.layout.memory.items():
         found[name] = writer.at(between, place)
         place = rows * each_row + fixed + place
-    for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
+    for k, name in enumerate(writer.names):
         writer.put(found[name], table, k)
-    of_cells = (names.index(f"{OF_SAMPLES[0]} {k}") for k in range(measurements))
+    of_cells = (k for k, name in enumerate(names) if name.startswith("cell "))
     writer.invoke("evaluate", table, *(writer.get("i64", of_buffer(arguments, k, DIMENSIONS), 0) for k in of_cells))
     return writer.end("ptr null")
 
@@ -103,21 +101,20 @@ def write_evaluation(writer: Writer) -> str:
     for name in segments.ZEROED:
         fixed, each_row = layout.memory[name]
         writer.zero(found[name], rows * each_row + fixed)
-    first = segments.state_pointers(writer, found, 0)
-    writer.call("start", found | {f"{name}_after": pointer for name, pointer in first.items()})
+    writer.call("start", found | writer.at_row(found, 0, "x", "Z", suffix="_after"))
     with writer.loop(0, N + 1) as segment:
         writer.invoke("forward", table, segment)
     for k, count in enumerate(counts):
         writer.invoke(f"samples_{k}", table, count)
     # No row follows the end: what the terminal terms add to the costate goes to psi itself.
-    library, given = writer.library, found | segments.state_pointers(writer, found, rows) | {"jump": found["psi"]}
+    library, given = writer.library, found | writer.at_row(found, rows, "x", "Z") | {"jump": found["psi"]}
     given |= segments.constraint_pointers(writer, found, layout.constraint_rows["end"])
     for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
         writer.call(name, given)
     if writer.order > Order.COST:
         with writer.loop(0, N + 1) as turn:
             writer.invoke("backward", table, N - turn)
-        writer.call("start_back", found | {"jump": found["jumps"]})
+        writer.call("start_back", found)
     return writer.end()
 
 

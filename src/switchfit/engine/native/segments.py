@@ -1,8 +1,8 @@
 """The loops over rows and samples in hand-written LLVM IR, and the layout of the memory that machine code works with.
 
-The table of pointers, which calls from Python and from XLA share, holds, in the order of `Layout.pointers`, the
-arguments, the accumulators and the scratch space, then for each Measurements what `OF_SAMPLES` lists. Sizes count
-doubles; those of the scratch space grow with the number of rows.
+The table of pointers, which calls from Python and from XLA share, holds, in the order of `Layout.names`, the
+arguments, the accumulators and the scratch space. Sizes count doubles; those of the scratch space grow with the number
+of rows.
 """
 
 from __future__ import annotations
@@ -27,10 +27,8 @@ GIVEN = (
 """Arguments: nodes (G + 1,), signals (G, 4, S), constants, p (M,); the transition times between t0 and tf (N + 2,);
 the cell in which each segment begins, then the last cell (N + 2,); the mode of each segment (N + 1,); the index of the
 reset map and of the function of each kind at each transition, -1 without one (N,); multipliers of all constraints; the
-derivatives of the transition times, after a row of zeros (D + 1, width)."""
-
-WHOLE_NUMBERS = ("first_cell", "modes", "resets", *AT_TRANSITIONS)
-"""Arguments that are 64-bit integers."""
+derivatives of the transition times, after a row of zeros (D + 1, width). Cells, modes and indices are 64-bit integers.
+"""
 
 OF_SAMPLES = ("cell", "time", "value", "weight", "segment", "seen")
 """Arguments of each Measurements: the cell at whose end a sample lies, or that holds a late sample, (K,); times (K,),
@@ -38,7 +36,7 @@ values (K, q), weights (K, q); the segment that holds a late sample, (K,); resul
 the state, and this state, (K, 1 + n)."""
 
 
-ZEROED = ("jumps", "late")
+ZEROED = ("jump", "late")
 """Parts of the scratch space that start at zero, as the accumulators do; others are written before they are read."""
 
 
@@ -49,19 +47,21 @@ class Layout(NamedTuple):
     ----------
     constraint_rows : the rows of constraints: those of guards, one per transition, come first, "end" is the first
         terminal one, and "count" the number of all
+    arguments : names of `GIVEN` and, with the number of each Measurements, of `OF_SAMPLES`
     sums : sizes of the accumulators, which start at zero: they are the results
     memory : sizes of the parts of the scratch space, each a fixed one and what every row adds; late samples have a row
         of their own behind all others
     """
 
     constraint_rows: dict[str, int]
+    arguments: list[str]
     sums: dict[str, int]
     memory: dict[str, tuple[int, int]]
 
     @property
-    def pointers(self) -> tuple[str, ...]:
-        """The names in its table, except those of the samples."""
-        return (*GIVEN, *self.sums, *self.memory)
+    def names(self) -> list[str]:
+        """The names in its table."""
+        return [*self.arguments, *self.sums, *self.memory]
 
 
 @lru_cache(maxsize=64)
@@ -74,24 +74,25 @@ def layout_of(library: Structure, sizes: Sizes, order: Order) -> Layout:
     resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
     implicit = int(any(library.implicit))
     late = int(any(sensor.delay is not None for sensor in library.measurements))
-    of_row = {"stages": STAGES * n, "stage_tangents": STAGES * n * width, "kept": count_kept(library, n, order)}
+    of_row = {"X": STAGES * n, "XZ": STAGES * n * width, "kept": count_kept(library, n, order)}
     sums = {"psi": n, "J": 1, "g": width, "H": sizes.D * width}
     sums |= {"constraints": count, "jacobian": count * width, "errors": n, CHECKED: 1}
     memory = {
-        "states": (n + n * late, n),
-        "reset_states": (N * n * resets, 0),
-        "tangents": (n * width * (1 + late), n * width * derivatives),
-        "reset_tangents": (N * n * width * resets, 0),
+        "x": (n + n * late, n),
+        "reset_x": (N * n * resets, 0),
+        "Z": (n * width * (1 + late), n * width * derivatives),
+        "reset_Z": (N * n * width * resets, 0),
         **{name: (size * late, size * derivatives) for name, size in of_row.items()},
-        "jumps": (n, n * derivatives * jumps),
+        "jump": (n, n * derivatives * jumps),
         "late": (0, n * derivatives * late),
-        "costates": (0, n * derivatives),
+        "costate": (0, n * derivatives),
         "increments": (len(STIFF.b) * n * implicit, 0),
         "newton": (2 * implicit, 0),
         "entries": (STAGES * (1 + n + sizes.M) ** 2, 0),
         "length": (width, 0),
     }
-    return Layout({"end": end, "count": count}, sums, memory)
+    of_samples = [f"{name} {k}" for k in range(len(library.measurements)) for name in OF_SAMPLES]
+    return Layout({"end": end, "count": count}, [*GIVEN, *of_samples], sums, memory)
 
 
 Pointers = dict[str, Value]
@@ -105,7 +106,7 @@ class Writer(Lines):
     ----------
     library, sizes, order, module : as given
     layout : Layout
-    names : tuple of str
+    names : sequence of str
         Names of the pointers in the table.
     """
 
@@ -113,16 +114,20 @@ class Writer(Lines):
         super().__init__()
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
         self.layout = layout_of(library, sizes, order)
-        self.names = self.layout.pointers
+        self.names: Sequence[str] = self.layout.names
 
     def pointers(self) -> Pointers:
         """Load all pointers of the table."""
         return {name: self.get("ptr", "%table", k) for k, name in enumerate(self.names)}
 
-    def samples_of(self, k: int) -> Pointers:
-        """Load the pointers of the k-th Measurements."""
-        first = len(self.names) + len(OF_SAMPLES) * k
-        return {name: self.get("ptr", "%table", first + m) for m, name in enumerate(OF_SAMPLES)}
+    def at_row(self, found: Pointers, row: Operand, *names: str, suffix: str = "") -> Pointers:
+        """Emit the addresses of parts of the scratch space at a row, as names with a suffix."""
+        return {f"{name}{suffix}": self.at(found[name], row, self.layout.memory[name][1]) for name in names}
+
+    def at_sample(self, found: Pointers, k: int, sample: Value) -> Pointers:
+        """Emit the addresses of the time, the values and the weights of a sample of the k-th Measurements."""
+        lengths = {"time": 1} | dict.fromkeys(("value", "weight"), self.library.measurements[k].channels)
+        return {name: self.at(found[f"{name} {k}"], sample, length) for name, length in lengths.items()}
 
     def into(self, pointer: Operand, offset: int) -> Value:
         """Emit an address, in bytes from a pointer."""
@@ -157,6 +162,9 @@ class Writer(Lines):
 KINDS = "inner", "end"
 """Rows that do not move with theta, and those beside a transition, which do."""
 
+OF_STAGES = "kept", "X", "XZ"
+"""Parts of the scratch space that belong to the stages of a row."""
+
 
 def start_row(writer: Writer, found: Pointers, segment: Value, cell: Value) -> Pointers:
     """Emit where the row of a segment in a cell starts: its time, the first node of the cell, the signals there.
@@ -183,7 +191,6 @@ def _units(writer: Writer, found: Pointers, moves: Value, index: Value) -> Value
 
 def row_pointers(writer: Writer, found: Pointers, segment: Value, cell: Value, last: Value) -> tuple[Pointers, Value]:
     """Emit the pointers of the row of a segment in a cell; return them with the case of `row_cases`."""
-    n = writer.sizes.n
     # Rows are numbered by cell + segment, as in `mesh.build_rows`; states by the row that they are before, so that the
     # state after row r is state r + 1.
     place, row, ends = start_row(writer, found, segment, cell), cell + segment, cell.equals(last)
@@ -194,30 +201,13 @@ def row_pointers(writer: Writer, found: Pointers, segment: Value, cell: Value, l
     times = writer.allocate("double", 3)
     for k, value in enumerate((place["start"], end, place["origin"])):
         writer.put(value, times, k)
+    pointers = place | {"row": times, "closes": _units(writer, found, closes, segment + 1)}
     # `jump` is read at the end of the row, `late` and `costate` belong to its start.
-    pointers = place | {
-        "row": times,
-        "closes": _units(writer, found, closes, segment + 1),
-        "jump": writer.at(found["jumps"], after, n),
-        "late": writer.at(found["late"], row, n),
-        "costate": writer.at(found["costates"], row, n),
-    }
-    here, there = state_pointers(writer, found, row), state_pointers(writer, found, after)
-    pointers |= here | {f"{name}_after": pointer for name, pointer in there.items()}
-    pointers |= stage_pointers(writer, found, row)
+    pointers |= writer.at_row(found, after, "jump") | writer.at_row(found, row, "late", "costate", "x", "Z", *OF_STAGES)
+    pointers |= writer.at_row(found, after, "x", "Z", suffix="_after")
     # Case 2 mode + kind: only rows beside a transition have the code for times that move.
     kind = (place["begins"] | closes).to("i64")
     return found | pointers, writer.get("i64", found["modes"], segment) * len(KINDS) + kind
-
-
-def stage_pointers(writer: Writer, found: Pointers, row: Operand) -> Pointers:
-    """Return pointers to what belongs to the stages of a row."""
-    n, width = writer.sizes.n, writer.sizes.width
-    return {
-        "kept": writer.at(found["kept"], row, count_kept(writer.library, n, writer.order)),
-        "X": writer.at(found["stages"], row, STAGES * n),
-        "XZ": writer.at(found["stage_tangents"], row, STAGES * n * width),
-    }
 
 
 def count_rows(writer: Writer, found: Pointers) -> Value:
@@ -229,12 +219,6 @@ def row_cases(writer: Writer, case: Value) -> Iterator[tuple[int, str]]:
     """Emit a switch among the modes and `KINDS` of rows."""
     for k in writer.cases(case, len(KINDS) * len(writer.library.modes)):
         yield k // len(KINDS), KINDS[k % len(KINDS)]
-
-
-def state_pointers(writer: Writer, found: Pointers, index: Operand) -> Pointers:
-    """Return pointers to the state and its tangent at the end of a row, by its index."""
-    n, width = writer.sizes.n, writer.sizes.width
-    return {"x": writer.at(found["states"], index, n), "Z": writer.at(found["tangents"], index, n * width)}
 
 
 NEWTON_ITERATIONS = 15
@@ -287,12 +271,6 @@ def add_curvature(writer: Writer, curvature: Curvature, given: Pointers, moving:
         writer.call(curvature.name, given | {"entries": entries, "XZ": tangents})
 
 
-def _find_cells(writer: Writer, found: Pointers, segment: Value) -> tuple[Value, Value, Value]:
-    """Emit the first and the last cell of a segment, and their number."""
-    first, last = (writer.get("i64", found["first_cell"], k) for k in (segment, segment + 1))
-    return first, last, last - first + 1
-
-
 def find_reset(writer: Writer, found: Pointers, segment: Value, opens: Value) -> tuple[Value, Pointers]:
     """Emit the index of the reset map at the start of a segment, -1 without one; return it with its pointers."""
     n, width = writer.sizes.n, writer.sizes.width
@@ -302,8 +280,8 @@ def find_reset(writer: Writer, found: Pointers, segment: Value, opens: Value) ->
     return opens.choose(writer.get("i64", found["resets"], safe), -1), {
         "time": writer.at(found["bounds"], segment),
         "moves": writer.at(found["units"], segment, width),
-        "x_after": writer.at(found["reset_states"], safe, n),
-        "Z_after": writer.at(found["reset_tangents"], safe, n * width),
+        "x_after": writer.at(found["reset_x"], safe, n),
+        "Z_after": writer.at(found["reset_Z"], safe, n * width),
     }
 
 
@@ -317,8 +295,8 @@ def write_forward(writer: Writer) -> str:
     """Write a segment forward: its reset map, its rows, and the functions at its end."""
     _, segment = writer.begin("void @forward(ptr %table, i64 %segment)")
     found = writer.pointers()
-    first, last, count = _find_cells(writer, found, segment)
-    start = state_pointers(writer, found, first + segment)
+    first, last = (writer.get("i64", found["first_cell"], k) for k in (segment, segment + 1))
+    start = writer.at_row(found, first + segment, "x", "Z")
     if writer.library.reset_maps:
         which, given = find_reset(writer, found, segment, segment > 0)
         for k in writer.cases(which, len(writer.library.reset_maps)):
@@ -327,8 +305,8 @@ def write_forward(writer: Writer) -> str:
     # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
     flag = writer.get("i64", found["modes"], writer.sizes.N + 1)
     mode, modes = writer.get("i64", found["modes"], segment), len(writer.library.modes)
-    with writer.loop(0, count) as turn:
-        given, case = row_pointers(writer, found, segment, first + turn, last)
+    with writer.loop(first, last + 1) as cell:
+        given, case = row_pointers(writer, found, segment, cell, last)
         # The first row begins behind the reset map, whose state is not among those of the rows.
         given |= {name: given["first"].choose(start[name], given[name]) for name in ("x", "Z")}
         for k, kind in row_cases(writer, case):
@@ -339,7 +317,7 @@ def write_forward(writer: Writer) -> str:
             for k in writer.cases((flag > level).choose(mode, -1), modes):
                 writer.call(f"{name}_{k}", given)
     after = last + segment + 1
-    given = found | state_pointers(writer, found, after)
+    given = found | writer.at_row(found, after, "x", "Z")
     # Once per segment: what is not finite stays so to its end.
     writer.call("check_state", given)
     _call_transition_functions(writer, given, segment, last, after)
@@ -354,7 +332,7 @@ def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, 
         "moves": writer.at(found["units"], next_, writer.sizes.width),
         "origin": writer.at(found["nodes"], last),
         "signal": writer.at(found["signals"], last, 4 * writer.sizes.signals),
-        "jump": writer.at(found["jumps"], after, writer.sizes.n),
+        **writer.at_row(found, after, "jump"),
     }
     for kind in AT_TRANSITIONS:
         count = len(getattr(writer.library, kind))
@@ -379,14 +357,14 @@ def write_backward(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -
     """
     _, segment = writer.begin("void @backward(ptr %table, i64 %segment)")
     found = writer.pointers()
-    first, last, count = _find_cells(writer, found, segment)
-    with writer.loop(0, count) as turn:
+    first, last = (writer.get("i64", found["first_cell"], k) for k in (segment, segment + 1))
+    with writer.loop(0, last - first + 1) as turn:
         given, case = row_pointers(writer, found, segment, last - turn, last)
         for k, kind in row_cases(writer, case):
             writer.call(f"backward_{kind}_{k}", given)
             add_curvature(writer, curvatures[k][kind], given, moving=kind == "end")
     if writer.library.reset_maps:
-        state = state_pointers(writer, found, first + segment)
+        state = writer.at_row(found, first + segment, "x", "Z")
         which, given = find_reset(writer, found, segment, segment > 0)
         for k in writer.cases(which, len(writer.library.reset_maps)):
             # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
@@ -398,42 +376,35 @@ def write_backward(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -
 def write_samples(writer: Writer, k: int) -> str:
     """Write the loop over the samples of the k-th Measurements, which are at the ends of rows."""
     _, count = writer.begin(f"void @samples_{k}(ptr %table, i64 %count)")
-    found, own = writer.pointers(), writer.samples_of(k)
+    found = writer.pointers()
     # The state at the end of a cell is that of the last row inside it: cell + (segments begun in it or before) + 1.
     begins = [writer.get("i64", found["first_cell"], i) for i in range(1, writer.sizes.N + 1)]
     with writer.loop(0, count) as sample:
-        cell = writer.get("i64", own["cell"], sample)
+        cell = writer.get("i64", found[f"cell {k}"], sample)
         index = sum(((cell >= begin).to("i64") for begin in begins), cell + 1)
-        given = found | state_pointers(writer, found, index) | _sample_pointers(writer, k, own, sample)
+        given = found | writer.at_row(found, index, "x", "Z", "jump") | writer.at_sample(found, k, sample)
         # Samples at nodes have known times: `moves` is the row of zeros.
-        given |= {"moves": found["units"], "jump": writer.at(found["jumps"], index, writer.sizes.n)}
-        writer.call(f"sample_{k}", given)
+        writer.call(f"sample_{k}", given | {"moves": found["units"]})
     return writer.end()
 
 
-def _sample_pointers(writer: Writer, k: int, own: Pointers, sample: Value) -> Pointers:
-    lengths = {"time": 1} | dict.fromkeys(("value", "weight"), writer.library.measurements[k].channels)
-    return {name: writer.at(own[name], sample, length) for name, length in lengths.items()}
-
-
-def _write_late_row(writer: Writer, k: int, found: Pointers, own: Pointers, sample: Value) -> tuple[Pointers, Value]:
+def _write_late_row(writer: Writer, k: int, found: Pointers, sample: Value) -> tuple[Pointers, Value]:
     """Write the forward step of a late sample's row, which is behind all others in memory; return pointers and its
     mode.
     """
-    n, width = writer.sizes.n, writer.sizes.width
-    cell, segment = (writer.get("i64", own[name], sample) for name in ("cell", "segment"))
+    cell, segment = (writer.get("i64", found[f"{name} {k}"], sample) for name in ("cell", "segment"))
     row, place, last = cell + segment, start_row(writer, found, segment, cell), count_rows(writer, found)
     times = writer.allocate("double", 3)
     for entry, name in ((0, "start"), (2, "origin")):
         writer.put(place[name], times, entry)
-    state = state_pointers(writer, found, row)
+    state = writer.at_row(found, row, "x", "Z")
     if writer.library.reset_maps:
         state = choose_state(*find_reset(writer, found, segment, place["begins"]), state)
-    psi = writer.allocate("double", n)
-    given = found | place | state | _sample_pointers(writer, k, own, sample) | stage_pointers(writer, found, last)
-    given |= {f"{name}_after": pointer for name, pointer in state_pointers(writer, found, last + 1).items()}
-    given |= {"row": times, "closes": writer.allocate("double", width), "psi": psi, "jump": psi}
-    given |= {"late": writer.at(found["late"], row, n), "J": writer.allocate("double")}
+    psi = writer.allocate("double", writer.sizes.n)
+    given = found | place | state | writer.at_sample(found, k, sample) | writer.at_row(found, last, *OF_STAGES)
+    given |= writer.at_row(found, last + 1, "x", "Z", suffix="_after") | writer.at_row(found, row, "late")
+    given |= {"row": times, "closes": writer.allocate("double", writer.sizes.width), "psi": psi, "jump": psi}
+    given["J"] = writer.allocate("double")
     writer.call(f"late_time_{k}", given)
     mode = writer.get("i64", found["modes"], segment)
     for m in writer.cases(mode, len(writer.library.modes)):
@@ -449,10 +420,10 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
     `curvatures` have for each mode what adds the second derivatives of such a row to H.
     """
     _, count = writer.begin(f"void @samples_{k}(ptr %table, i64 %count)")
-    found, own = writer.pointers(), writer.samples_of(k)
+    found = writer.pointers()
     with writer.loop(0, count) as sample:
-        given, mode = _write_late_row(writer, k, found, own, sample)
-        seen = writer.at(own["seen"], sample, 1 + writer.sizes.n)
+        given, mode = _write_late_row(writer, k, found, sample)
+        seen = writer.at(found[f"seen {k}"], sample, 1 + writer.sizes.n)
         time = writer.at(given["row"], 1)
         writer.copy(seen, time, 1)
         writer.copy(writer.at(seen, 1), given["x_after"], writer.sizes.n)
