@@ -25,7 +25,7 @@ ALGEBRA, QP, STATE, STEP = (f"optimize/{name}.py" for name in ("algebra", "qp", 
 PROGRAMS, COURSE, SPLIT = "engine/jax.py", "engine/branches.py", "engine/choice.py"
 HYPOTHESES = "engine/native/hypotheses.py"
 KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
-    f"engine/native/{name}.py" for name in ("kernels", "segments", "templates", "elimination", "llvm")
+    f"engine/native/{name}.py" for name in ("kernels", "program", "templates", "arrays", "llvm")
 )
 BEAM, FITTER, MODE_POOL = "strategy/beam.py", "modes/fitter.py", "modes/hunt.py"
 ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design.py"
@@ -147,7 +147,9 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "f in the error of a row": swap(
             ROWS, "damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)"
         ),
-        "the factors of the last row": swap(SEGMENTS, 'at(found["kept"], row,', 'at(found["kept"], 0,'),
+        "the factors of the last row": swap(
+            SEGMENTS, '"x", "Z", *OF_STAGES)', '"x", "Z", "X", "XZ") | writer.at_row(found, 0, "kept")'
+        ),
         "no second derivative of Newton's map": swap(
             KERNELS,
             "second[j] = list_entries(S, with_time=moving)",

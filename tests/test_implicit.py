@@ -15,7 +15,7 @@ import switchfit as sf
 from switchfit.discretization.rows import STIFF, STIFF_BEND, measure_jump
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import derivatives_inside_program
-from switchfit.engine.native import elimination, kernels, llvm
+from switchfit.engine.native import arrays, kernels, llvm
 from switchfit.engine.native.engine import native_experiment, places_in_library
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph
@@ -220,7 +220,7 @@ def test_a_routine_for_the_linear_systems(monkeypatch):
     native, by_jax = both("everything")
     theta = native.problem.initial_theta
     straight_line = native(theta).hessian
-    monkeypatch.setattr(elimination, "MOST_PRODUCTS", 0)
+    monkeypatch.setattr(arrays, "MOST_PRODUCTS", 0)
     drop_programs()
     mesh = refine_mesh(native.problem, 0, theta)
     assert mesh.cells == native.meshes[0].cells
@@ -342,9 +342,9 @@ def compile_solve(filled, kind):
     module, graph = llvm.Module(6), Graph()
     f_x = [graph.loads("f_x", n * n, n * n * j).reshape(n, n) * filled for j in range(3)]
     right = [graph.loads("right", n, n * j, vector=kind == "vectors") for j in range(3)]
-    factors = elimination.eliminate(STIFF.a, graph.constant(1.0), f_x)
+    factors = arrays.eliminate(STIFF.a, graph.constant(1.0), f_x)
     x = np.concatenate(factors.solve(right, transposed=kind == "transposed"))
-    module.write_straight_line("run", [("x", k, node) for k, node in enumerate(x)], ("f_x", "right", "x"))
+    module.write_straight_line("run", [("x", k, node) for k, node in enumerate(x)])
     program = llvm.compile_modules([module.take()])
     run = program.function("run", *[ctypes.c_void_p] * 3)
 
@@ -395,7 +395,7 @@ def test_elimination_needs_no_pivots(kind, n, limit, way):
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("n", [3, 9, 40])
 def test_a_routine_eliminates_with_pivots(n, way, monkeypatch):
-    monkeypatch.setattr(elimination, "MOST_PRODUCTS", 0)
+    monkeypatch.setattr(arrays, "MOST_PRODUCTS", 0)
     rng = np.random.default_rng(4)
     solve = compile_solve(np.ones((n, n)), way)
     jacobians = (make_jacobian(rng, n, kind) for kind in ("stable", "unstable", "any") for _ in range(1000 // n))
@@ -408,7 +408,7 @@ def test_the_order_of_elimination_keeps_an_arrow_sparse():
     n = 30
     arrow = np.eye(n, dtype=bool)
     arrow[0] = arrow[:, 0] = True
-    order, products = elimination.order_states(arrow)
+    order, products = arrays.order_states(arrow)
     assert order[-2:] == [0, n - 1]
     assert products == 4 * (n - 1) + 1
 

@@ -136,14 +136,25 @@ def derivatives(
     if matrix == "gauss-newton":
         return differentiate_residuals(model, theta, side)
 
-    differentiate = _differentiate_backward if method == "discrete-adjoint" else _differentiate_forward
     if matrix == "none":
-        g, J = differentiate(lambda theta: (_evaluate(model, theta, side)[0],) * 2, theta)
+        g, J = _differentiate(method, lambda theta: (_evaluate(model, theta, side)[0],) * 2, theta)
         return J, g, jnp.full((theta.size, theta.size), jnp.nan)
+    lam = jnp.zeros(0) if multipliers is None else multipliers
     evaluate = partial(_evaluate, model, side=side, constrained=multipliers is not None)
-    if multipliers is None:
-        return _differentiate_twice(evaluate, theta, jnp.zeros(0), differentiate)[:3]
-    return _differentiate_twice(evaluate, theta, multipliers, differentiate)
+
+    # Row k of H: the slope of the Lagrangian along e_k by one tangent, and its gradient is D (D J . e_k).
+    def along(direction: Array) -> tuple[Array, ...]:
+        def slope(theta: Array) -> tuple[Array, tuple[Array, ...]]:
+            (J, c), (J_d, c_d) = jax.jvp(evaluate, (theta,), (direction,))
+            # c_d is the column of the Jacobian along this direction: vmap stacks them on axis 1.
+            lagrangian_d = J_d + lam @ c_d
+            return lagrangian_d, (J, lagrangian_d, c, c_d)
+
+        row, (J, lagrangian_d, c, c_d) = _differentiate(method, slope, theta)
+        return J, lagrangian_d, row, c, c_d
+
+    found: tuple[Array, ...] = jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
+    return found[:3] if multipliers is None else found
 
 
 def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False) -> tuple[Array, Array]:
@@ -154,33 +165,10 @@ def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False
     return compute_path_cost(model, path, p), c
 
 
-def _differentiate_twice(
-    evaluate: Callable[..., tuple[Array, Array]], theta: Array, multipliers: Array, differentiate: Callable[..., Any]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return what `derivatives` does with multipliers, of a function that returns J and c."""
-
-    # Row k of H: the slope of the Lagrangian along e_k by one tangent, and its gradient is D (D J . e_k).
-    def along(direction: Array) -> tuple[Array, Array, Array, Array, Array]:
-        def slope(theta: Array) -> tuple[Array, tuple[Array, ...]]:
-            (J, c), (J_d, c_d) = jax.jvp(evaluate, (theta,), (direction,))
-            # c_d is the column of the Jacobian along this direction: vmap stacks them on axis 1.
-            lagrangian_d = J_d + multipliers @ c_d
-            return lagrangian_d, (J, lagrangian_d, c, c_d)
-
-        row, (J, lagrangian_d, c, c_d) = differentiate(slope, theta)
-        return J, lagrangian_d, row, c, c_d
-
-    return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
-
-
-def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
-    """Return the derivative (D,) of the first result, and the second."""
-    return jax.jacfwd(function, has_aux=True)(theta)
-
-
-def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
-    """Do what `_differentiate_forward` does, backward; forward through a loop of unknown length, as JAX cannot else."""
-    return _try_backward(function, theta) or _differentiate_forward(function, theta)
+def _differentiate(method: Method, function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
+    """Return the derivative (D,) of the first result, and the second; JAX cannot go back through an endless loop."""
+    found = _try_backward(function, theta) if method == "discrete-adjoint" else None
+    return found or jax.jacfwd(function, has_aux=True)(theta)
 
 
 def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> Any:

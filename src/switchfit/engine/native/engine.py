@@ -24,9 +24,8 @@ from switchfit.discretization.mesh import Arguments, Mesh, Samples, build_rows
 from switchfit.discretization.model import AT_TRANSITIONS, read_parameters
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.llvm import Program
-from switchfit.engine.native.program import PREFIX, program_of, second_order
+from switchfit.engine.native.program import PREFIX, layout_of, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
-from switchfit.engine.native.segments import layout_of
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, finish_simulation
 from switchfit.problem.data import FloatArray
@@ -184,8 +183,10 @@ class NativeExperiment:
         self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
         self._signals = self._named["signals"].reshape(cells, 4 * sizes.signals)
-        H, jacobian = (self._named[name].reshape(-1, sizes.width) for name in ("H", "jacobian"))
-        self._g, self._H, self._jacobian = self._named["g"][: sizes.D], H[:, : sizes.D], jacobian
+        self._g = self._named["g"][: sizes.D]
+        self._H, self._jacobian = (
+            self._named[each].reshape(-1, sizes.width)[:, : sizes.D] for each in ("H", "jacobian")
+        )
         self._set_sequence(structure)
 
     def assign_sequence(self, structure: Structure, places: dict[str, NDArray[np.int64]]) -> None:
@@ -223,7 +224,7 @@ class NativeExperiment:
         """
         with self._program.lock:
             self._evaluate(tau, p, side, multipliers)
-            g, H = self._read_derivatives()
+            g, H = self._spread(self._g), self._spread(self._spread(self._H).T)
             if multipliers is None:
                 hessian = H if self.order > Order.GRADIENT else np.full_like(H, np.nan)
                 return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
@@ -249,21 +250,12 @@ class NativeExperiment:
             self._size_of_states = np.where(is_known, largest, np.finfo(float).max)  # a state that stays 0 has no error
         return (max((self._errors / self._size_of_states).tolist()),)
 
-    def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
-        """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's times and parameters.
-
-        They are 0 in the times of jumps, which are no unknowns.
-        """
-        if self._has_all:
-            return self._g.copy(), self._H.copy()
-        # Rows and columns of the program's unknowns taken to the experiment's; jumps have none, and are zero.
-        every = np.where(self._there[:, None], self._spread(self._H)[self._places], 0.0)
-        return self._spread(self._g), every
-
     def _spread(self, values: FloatArray) -> FloatArray:
-        """Return derivatives along the last axis in the experiment's times and parameters, 0 in the times of jumps."""
-        found: FloatArray = values[..., self._places]
-        return found if self._has_all else np.where(self._there, found, 0.0)
+        """Return a copy of derivatives along the last axis, in the experiment's times and parameters.
+
+        They are 0 in the times of jumps, which are no unknowns of the program.
+        """
+        return values.copy() if self._has_all else np.where(self._there, values[..., self._places], 0.0)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
@@ -293,7 +285,7 @@ class NativeExperiment:
 
             def of_rows(name: str, count: int, *shape: int) -> FloatArray:
                 values = self._named[name].reshape(-1, *shape)[:count]
-                return self._spread(values) if len(shape) > 1 else np.array(values)
+                return self._spread(values[..., : self.sizes.D]) if len(shape) > 1 else np.array(values)
 
             def beside_rows(name: str, *shape: int) -> tuple[FloatArray, FloatArray]:
                 """Return the values at the starts of rows, those before or of reset maps, and at their ends."""
@@ -346,7 +338,7 @@ class NativeExperiment:
         given = {"time": times, "x": np.ascontiguousarray(states), "Z": Z, "y": y, "Y": Y}
         if np.isnan(self._call("outputs", given, p, L)).any():
             raise FailedCheckError
-        return y, self._spread(Y)
+        return y, self._spread(Y[..., : self.sizes.D])
 
     def initial_state(self, p: FloatArray) -> FloatArray:
         """Return x(t0): (n,)."""

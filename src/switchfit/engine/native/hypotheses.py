@@ -28,13 +28,21 @@ from numpy.typing import NDArray
 from switchfit.discretization import rows
 from switchfit.discretization.mesh import Arguments
 from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine, times_vector
-from switchfit.engine.native.elimination import eliminate
+from switchfit.engine.native.arrays import eliminate
 from switchfit.engine.native.engine import count_samples, get_address
 from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, as_vector, list_entries, store_all
 from switchfit.engine.native.llvm import Module, Program, Value, Variable
-from switchfit.engine.native.program import PREFIX, compile_library, write_slope
+from switchfit.engine.native.program import (
+    PREFIX,
+    Pointers,
+    Writer,
+    add_curvature,
+    compile_library,
+    solve_stages,
+    write_newton,
+    write_slope,
+)
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
-from switchfit.engine.native.segments import Pointers, Writer, add_curvature, solve_stages, write_newton
 from switchfit.engine.native.templates import COST_TO_GO, F_X, F, Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
@@ -61,7 +69,7 @@ GIVEN = "nodes", "signals", "c", "units", "tolerances", "low", "high", "most", "
 it may move at once."""
 
 OF_SAMPLES = ("first", "time", "value", "weight")
-"""For each Measurements: the place of the first sample at each node (G + 2,), then as `segments.OF_SAMPLES`."""
+"""For each Measurements: the place of the first sample at each node (G + 2,), then as `program.OF_SAMPLES`."""
 
 SMALLEST_RATE = 1e-30
 """Square of the rate of a guard below which it says nothing on the time."""

@@ -9,7 +9,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
     X, XZ           at the stages of a row: (s, n), (s, n, width)
                     at those of an implicit row that moves with theta, also its slopes behind them: (2 s, ...)
     kept            functions of the C library at the stages of a row, for its backward step: (s, count); then the
-                    factors of the coupled equations of an implicit row: see `elimination`
+                    factors of the coupled equations of an implicit row: see `arrays`
     increments      increments of an implicit row: (s, n)
     newton          of the increments: 0 if their last change was small for the largest state, else 1; 1 if they have
                     converged, else 0
@@ -39,7 +39,7 @@ import numpy as np
 from switchfit.discretization import rows
 from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.discretization.rows import EXPLICIT, STIFF, Stages, Tableau, Tangent, combine, times_vector
-from switchfit.engine.native.elimination import Elimination, Routine, count_factors, eliminate
+from switchfit.engine.native.arrays import Elimination, Routine, count_factors, eliminate
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.scalars import CHECKED, MAY_FAIL, Graph, Namespace, Node, Objects, Template
 from switchfit.engine.native.templates import COST_TO_GO, ELL, ELL_X, F_P, F_T, F_X, SLOPES, F, Order, Sizes, Templates
@@ -178,7 +178,7 @@ class Kernels:
             at_stages.append(stage(graph, *at(t, X), only=wanted, also=kept, checked=checked))
             return at_stages[-1][0]
 
-        # The increments k_j = h K_j were found by the loop of `segments.write_newton` before; here they are inputs.
+        # The increments k_j = h K_j were found by the loop of `program.write_newton` before; here they are inputs.
         k = self.load_increments(graph) if tableau.coupled else []
         found = rows.stages(tableau, field, start, end, x, k)
         after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))

@@ -212,14 +212,10 @@ class Lines:
         one = self.let(kind, f"insertelement {kind} poison, double {value}, i64 0")
         return self.let(kind, f"shufflevector {kind} {one}, {kind} poison, {zeros}")
 
-    def invoke(self, name: str, *given: Operand, returns: str = "void") -> Value:
+    def invoke(self, name: str, *given: Operand) -> None:
         """Emit the call of a function with values and integers."""
         arguments = ", ".join(f"{a.kind} {a}" if isinstance(a, Value) else f"i64 {a}" for a in given)
-        call = f"call {returns} @{name}({arguments})"
-        if returns != "void":
-            return self.let(returns, call)
-        self.line(call)
-        return Value(self, "void", "")
+        self.line(f"call void @{name}({arguments})")
 
     def name_block(self) -> str:
         """Return a new name for blocks."""
@@ -421,13 +417,11 @@ class Module:
         self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
 
-    def write_straight_line(
-        self, name: str, stores: Sequence[tuple[str, int, Node]], pointers: Sequence[str] = ()
-    ) -> None:
+    def write_straight_line(self, name: str, stores: Sequence[tuple[str, int, Node]]) -> None:
         """Write a function that loads, computes, and then stores each ``(pointer, offset, node)``.
 
         All loads come before the first store. Offsets count doubles, or vectors if the node is a vector. The arguments
-        are the `pointers`; by default those that it uses.
+        are the pointers that it uses, sorted.
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
@@ -439,7 +433,7 @@ class Module:
                 raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
             writer.used.add(pointer)
             writer.store(writer.value(node), writer.place(f"%{pointer}", offset, node))
-        self.pointers[name] = tuple(pointers or sorted(writer.used))
+        self.pointers[name] = tuple(sorted(writer.used))
         writer.begin(f"void @{self.prefix}{name}({', '.join(f'ptr %{pointer}' for pointer in self.pointers[name])})")
         self._functions.append(writer.end())
 
