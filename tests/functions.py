@@ -254,7 +254,6 @@ ORDER: dict[str, Function] = {
     **{f"argsort {n}": lambda x, n=n: some(n)(x)[jnp.argsort(some(n)(x))] * jnp.argsort(-some(n)(x)) for n in (2, 8)},
     "sort with NaN": lambda x: jnp.sort(jnp.where(x > 0.5, x, jnp.nan)),
     "sort of pairs": lambda x: lax.sort((jnp.floor(2 * x), x * np.arange(3.0)))[1],
-    "lexsort": lambda x: x[jnp.lexsort((x, jnp.floor(x)))],
     "quantile by the state": lambda x: jnp.quantile(some(6)(x), jax.nn.sigmoid(x[0])),
     "nanmedian": lambda x: jnp.nanmedian(jnp.where(x > 0.5, x, jnp.nan)),
     "top_k 4": lambda x: lax.top_k(some(6)(x), 4)[0] * lax.top_k(some(6)(x), 4)[1],

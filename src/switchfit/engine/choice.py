@@ -439,15 +439,13 @@ def hypotheses_of(
 
 
 def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engine:
-    """Return one record for several experiments: "jax" if any is evaluated by JAX; the reason names these."""
+    """Return one record for several experiments: "jax" if any is evaluated by JAX; the reason names the first."""
     records = [each.engine for each in engines]
-    by_jax = [(name, record) for name, record in zip(names, records, strict=True) if record.name == "jax"]
     implicit_modes = tuple(dict.fromkeys(mode for record in records for mode in record.implicit_modes))
-    if not by_jax or len(by_jax) == len(records):
-        return replace(records[0], implicit_modes=implicit_modes)
-    which = ", ".join(name for name, _ in by_jax)
-    reason = f"{by_jax[0][1].reason} (in {which}; the other experiments run in machine code)"
-    return Engine("jax", reason, implicit_modes)
+    by_jax = [k for k, record in enumerate(records) if record.name == "jax"]
+    found = records[by_jax[0] if by_jax else 0]
+    reason = f"{found.reason} (in {names[by_jax[0]]})" if 0 < len(by_jax) < len(records) else found.reason
+    return replace(found, reason=reason, implicit_modes=implicit_modes)
 
 
 def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments]) -> bool:

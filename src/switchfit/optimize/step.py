@@ -114,7 +114,8 @@ def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piec
     labels = np.arange(d, dtype=float) if state.careful else problem.labels
     # Curvature of each unknown that counts as none.
     floor = algebra.curvature_floor(state.scale, state.cost_scale, point.largest_slopes)
-    matrix, descends = hessian, _descends(problem, hessian, free)
+    matrix: Any = hessian
+    descends = _descends(problem, hessian, free)
     if descends:
         matrix, floor = Dense(np.eye(d) / state.metric), np.zeros(d)
     elif labels is not None:
@@ -129,8 +130,6 @@ def _solve_on_sides(problem: Problem, state: State, sides: IntArray, piece: Piec
         kept, part = matrix.keep(free)
         own, pressed, floor = (gradient * free)[part], (pressed * free)[:, part], (floor * free)[part]
         room, reach = room.of(part, free), reach[part]
-    convex: Hessian
-    factor: Any
     convex, factor = kept.convexify(pressed, floor, reach if problem.hessian == "auto" else None)
     definite, radius = convex is kept, state.radius
     if problem.hessian == "auto" and radius == np.inf and not definite:
@@ -274,11 +273,9 @@ def _search_in_region(oracle: Oracle, state: State, direction: Direction) -> Acc
         # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
         if accepted is None and k == 0 and state.iteration >= PATIENCE and not constrained:
             accepted = _step_back(oracle, state, direction)
-        if accepted is not None and k == 0:
-            return accepted._replace(step_length=1.0)
         length = measure_in_box(problem, direction.step)
         if accepted is not None:
-            return accepted._replace(step_length=length / measure_in_box(problem, whole))
+            return accepted if k == 0 else accepted._replace(step_length=length / measure_in_box(problem, whole))
         if length < SMALLEST_RADIUS if constrained else _is_hopeless(state, direction, k + 1):
             return None
         radius = direction.radius
@@ -453,28 +450,22 @@ def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> boo
     """Return whether the decrease that a step still promises is below the rounding error of J.
 
     This error is a part of J or, where J is a small difference of large terms, as at a perfect fit, more. The largest J
-    seen is a bound on it, which says little where the start was far away: between the two the error is measured.
+    seen is a bound on it, which says little where the start was far away: between the two the error is measured, as
+    standard deviation along the step. Differences of the fourth order of a smooth J at equal distances vanish, those of
+    its error do not ([3]_). A jump or a kink makes them large too; it is on one side of the point, so that the smaller
+    of both sides counts.
     """
     smallest, largest = 10 * algebra.NOISE * abs(state.point.cost), 10 * algebra.NOISE * state.cost_scale
     if not smallest < direction.reduction <= largest:
         return direction.reduction <= smallest
-    return direction.reduction <= 10 * _measure_noise(oracle, state, direction.step)
-
-
-def _measure_noise(oracle: Oracle, state: State, step: FloatArray) -> float:
-    """Return the standard deviation of the error of J along a step (d,); infinite if unknown.
-
-    Differences of the fourth order of a smooth J at equal distances vanish, those of its error do not ([3]_). A jump or
-    a kink makes them large too; it is on one side of the point, so that the smaller of both sides counts.
-    """
-    found = []
+    found, step = [np.inf], direction.step
     for side in (1.0, -1.0):
         trials = [move(oracle.problem, state.point.theta, side * k / 8 * step, state.scale) for k in range(9)]
         samples = [sample for trial in trials if (sample := oracle.first(trial)) is not None]
         if len(samples) == 9:
             values = [sample.lagrangian(state.point.forces)[0] for sample in samples]
             found.append(math.sqrt(float(np.mean(np.diff(values, 4) ** 2)) / 70))  # 70 = 8! / (4!)²
-    return min(found, default=math.inf)
+    return direction.reduction <= 10 * min(found)
 
 
 class _Place(NamedTuple):

@@ -441,51 +441,38 @@ Entries = tuple[Any, ...]
 
 
 def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
-    """Trace `jax.lax.sort`: stable, NaN last, by the first `num_keys` arrays."""
-    params = equation.params
-    axis = params["dimension"]
-    kinds = [variable.aval.dtype.kind for variable in equation.invars[: params["num_keys"]]]
-
-    shape = arrays[0].shape
+    """Trace `jax.lax.sort`: stable, NaN last, by the first array."""
+    axis, shape = equation.params["dimension"], arrays[0].shape
+    if equation.params["num_keys"] > 1:
+        raise Unsupported("sorts by several keys what depends on the state")
+    is_double = equation.invars[0].aval.dtype.kind == "f"
     rows = [np.moveaxis(a, axis, -1).reshape(-1, shape[axis]) for a in arrays]
     found = [np.empty(row.shape, dtype=object) for row in rows]
     for k in range(len(rows[0])):
-        entries = _sort_entries(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), kinds)
+        entries = _sort_entries(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), is_double)
         for to, column in zip(found, zip(*entries, strict=True), strict=True):
             to[k] = as_objects(column)
     moved = tuple(n for k, n in enumerate(shape) if k != axis)
     return [np.moveaxis(each.reshape(*moved, shape[axis]), -1, axis) for each in found]
 
 
-def _sort_entries(graph: Graph, entries: list[Entries], kinds: list[str]) -> list[Entries]:
+def _sort_entries(graph: Graph, entries: list[Entries], is_double: bool) -> list[Entries]:
     """Sort entries by exchanging neighbors."""
     n = len(entries)
     _check_size(n, MOST_SORTED, f"sorts {n} numbers that depend on the state")
     for front in range(n - 1):
         for k in reversed(range(front, n - 1)):
             one, other = entries[k], entries[k + 1]
-            swap = _is_behind(graph, kinds, one, other)
+            a, b = one[0], other[0]
+            # of doubles, a > b, or a is NaN and b is not
+            swap = (
+                less(graph, b, a)
+                if not is_double
+                else graph.apply("and", graph.apply("not", graph.apply("le", a, b)), graph.apply("eq", b, b))
+            )
             entries[k] = tuple(choose(graph, swap, b, a) for a, b in zip(one, other, strict=True))
             entries[k + 1] = tuple(choose(graph, swap, a, b) for a, b in zip(one, other, strict=True))
     return entries
-
-
-def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> Any:
-    """Return whether an entry comes after another by the first key in which they differ; their kinds are given."""
-    kind, a, b = kinds[0], one[0], other[0]
-    if kind == "f":  # a > b, or a is NaN and b is not
-        behind = graph.apply("and", graph.apply("not", graph.apply("le", a, b)), graph.apply("eq", b, b))
-    else:
-        behind = less(graph, b, a)
-    if len(kinds) == 1:
-        return behind
-    if kind == "f":
-        undefined = graph.apply("and", graph.apply("ne", a, a), graph.apply("ne", b, b))
-        same: Any = graph.apply("or", graph.apply("eq", a, b), undefined)
-    else:
-        same = equal(graph, a, b)
-    later = graph.apply("and", same, _is_behind(graph, kinds[1:], one[1:], other[1:]))
-    return graph.apply("or", behind, later)
 
 
 # Searching sorted arrays
