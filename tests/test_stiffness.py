@@ -17,7 +17,7 @@ import switchfit as sf
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import runs_of
-from switchfit.engine.stiffness import Choice, Watch
+from switchfit.engine.stiffness import Choice, Look, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.command_line import describe_steps
 from switchfit.problem.functions import use_float64
@@ -128,7 +128,7 @@ def test_the_look_at_eigenvalues_survives_a_model_that_is_undefined_beside_the_t
     def slopes(times, y):
         return np.where(y[:, :1] > 1.0, [np.nan, 0.0], [-1e6, 0.0])
 
-    watch.look(1e-3, slopes, 0.0, np.array([1.0, 0.0]), 1e-2)
+    watch.look(Look(1e-3, slopes, 0.0, np.array([1.0, 0.0]), 1e-2))
     assert watch.modes["m"].rates == [0.0]
 
 
@@ -139,7 +139,7 @@ def test_eigenvalues_are_those_of_the_vector_field():
         watch = Watch()
         watch.enter("m")
         y = size * np.array([1.0, -2.0, 0.5, 0.0])
-        watch.look(0.01, lambda t, y: np.pad(y[:, :3] @ A.T, [(0, 0), (0, 1)]), 0.0, y, 1e-2 * size)
+        watch.look(Look(0.01, lambda t, y: np.pad(y[:, :3] @ A.T, [(0, 0), (0, 1)]), 0.0, y, 1e-2 * size))
         (rate,) = watch.modes["m"].rates
         assert rate == pytest.approx(np.hypot(3.0, 400.0), rel=1e-5)
         assert watch.modes["m"].limited == [0.01 * rate]

@@ -35,7 +35,7 @@ from switchfit.engine.native.engine import NativeExperiment, native_experiment
 from switchfit.engine.native.program import AT
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Run, runs_of, take_implicit_steps
-from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
+from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, Look, TooManyStepsError, Watch
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.inspection import find_undefined
@@ -57,11 +57,10 @@ PACE = 1000
 MOST_PROJECTED = 1e15
 """Number of steps from which it does not matter how many they are: for an end of 1e308 they overflow."""
 
-STEPS_AT_ONCE = 256
-"""Steps that the compiled solver accepts in one call, at most."""
-
 STEPS_OF_BRANCH = 16
-"""The same in a mode with corners: steps behind the end of a branch are lost."""
+"""Steps that the compiled solver accepts in one call in a mode with corners: those behind the end of a branch are lost.
+In another mode, they are those between two looks of the watch.
+"""
 
 
 ROWS_BY_JAX = {True: 20_000, False: 200_000}
@@ -228,7 +227,7 @@ class _Solve:
         self, run: Run, structure: Structure, coarse: Mesh, settings: Settings, course: Course | None = None
     ) -> None:
         self._problem, self._structure, self._coarse, self._course = run.problem, run.structure, coarse, course
-        self._experiment, self._settings = run.experiment, settings
+        self._experiment, self._settings, self._watch = run.experiment, settings, settings.watch or Watch()
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
         self._whole = whole = run.build_arguments(coarse)
@@ -247,7 +246,7 @@ class _Solve:
 
     def __call__(self, tau: FloatArray, p: FloatArray) -> FloatArray:
         """Return the accepted times from t0 to tf, strictly increasing."""
-        structure, experiment, watch, self._p = self._structure, self._experiment, self._settings.watch, p
+        structure, experiment, self._p = self._structure, self._experiment, p
         ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
         inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
         steps, x = [ends[:1]], self._find_initial_state()
@@ -259,8 +258,7 @@ class _Solve:
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             name = structure.mode_names[mode]
             is_explicit = not structure.implicit[mode] and name not in self._settings.implicit
-            if watch is not None:
-                watch.enter(name, self._find_row_work(name, is_explicit))
+            self._watch.enter(name, self._find_row_work(name, is_explicit))
             if self._course is not None:
                 self._course.enter(mode, ends[i], x, 0.5 * (stops[0] + stops[1]))
             for start, end in pairwise(stops.tolist()):
@@ -269,9 +267,7 @@ class _Solve:
                         self._course.resume(start, x, 0.5 * (start + end))
                     accepted, x = self._follow(_Stretch(mode, start, end, x, is_explicit))
                     steps += accepted
-                    if watch is not None:
-                        ends_of_steps = np.concatenate([[start], *accepted])
-                        watch.modes[name].rows += _count_rows(ends_of_steps, self._coarse.times)
+                    self._watch.mode.rows += _count_rows(np.concatenate([[start], *accepted]), self._coarse.times)
         return np.concatenate(steps)
 
     def _find_initial_state(self) -> FloatArray:
@@ -282,10 +278,7 @@ class _Solve:
             x = native.initial_state(p)
         if not np.isfinite(x).all():
             named = read_parameters(self._structure, self._arguments, p)
-            # of an array of which some entries are read, these alone
-            shown = {name: named[name].ravel()[list(read)] for name, _, read in self._structure.parameters if read}
-            whole = {name: value for name, value in named.items() if value.size == np.size(shown.get(name, value))}
-            rounded = {name: np.round(value, 6).tolist() for name, value in (named | shown | whole).items()}
+            rounded = {name: np.round(value, 6).tolist() for name, value in named.items()}
             raise _report_infinite(f"initial_state at p = {rounded}", x)
         return x
 
@@ -332,7 +325,7 @@ class _Solve:
         """Return the accepted times after the start of a stretch, the state at its end, and where it leaves a branch,
         if it does: it ends there.
         """
-        native, course, watch, mode = self._native, self._course, self._settings.watch, stretch.mode
+        native, course, watch, mode = self._native, self._course, self._watch, stretch.mode
         if course is not None:
             # A branch that is not compiled yet goes on in Python, without running costs: the path alone is wanted from
             # this round.
@@ -344,7 +337,7 @@ class _Solve:
                     """Return the slope in a branch that is not in the library yet, without running costs."""
                     return np.append(course.evaluate(branch, t, y[:-1], stretch.middle), 0.0)
 
-                return self._take_steps(stretch, _PythonSteps(slope, stretch, self._tolerances), None, MOST_FOUND)
+                return self._take_steps(stretch, _PythonSteps(slope, stretch, self._tolerances), Watch(), MOST_FOUND)
             mode = place
         # Machine code has one method per mode: it serves where that is the method asked for.
         if native is not None and native.structure.implicit[mode] is not stretch.is_explicit:
@@ -352,19 +345,19 @@ class _Solve:
                 return self._take_steps(stretch, _NativeSteps(native, mode, stretch, self._p, self._tolerances), watch)
             if self._settings.most < MAX_STEPS:
                 raise self._report_stuck(stretch, stretch.start, stretch.x, None)
-            watch = None  # machine code has counted its steps
+            watch = Watch()  # machine code has counted its steps
         with use_float64(), use_compilation_cache():
             steps = _PythonSteps(self._build_slope(stretch, mode), stretch, self._tolerances)
             return self._take_steps(stretch, steps, watch)
 
     def _take_steps(
-        self, stretch: _Stretch, steps: _NativeSteps | _PythonSteps, watch: Watch | None, most_of_branch: float = np.inf
+        self, stretch: _Stretch, steps: _NativeSteps | _PythonSteps, watch: Watch, most_of_branch: float = np.inf
     ) -> tuple[FloatArray, FloatArray, Crossing | None]:
         """Do what `_solve` does by steps of one kind."""
         course, natively = self._course, isinstance(steps, _NativeSteps)
         accepted, x, reason = [stretch.start], stretch.x, None
         # Between two calls Python looks: for corners that the steps have passed, and for stiffness.
-        at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
+        at_once = watch.between if course is None else STEPS_OF_BRANCH
         while steps.is_running:
             if len(accepted) > most_of_branch:
                 raise BranchError
@@ -372,8 +365,7 @@ class _Solve:
             if len(accepted) >= 5 * PACE and _project_steps(accepted, stretch.end) > self._settings.most:
                 if natively and not np.isfinite(steps.y).all():
                     raise _NativeError
-                if watch is not None:
-                    watch.give_up(_project_steps(accepted, stretch.end))
+                watch.mode.projected = _project_steps(accepted, stretch.end)
                 reason = f"it needs more than {self._settings.most} steps"
                 break
             times, states = steps.advance(at_once)
@@ -387,11 +379,12 @@ class _Solve:
             x = steps.y[:-1].copy()
             # From time to time the watch estimates whether stability limits the explicit steps, from the last one of
             # them.
-            if watch is not None and watch.add(len(times)) and len(times) and stretch.is_explicit:
+            if watch.add(len(times)) and len(times) and stretch.is_explicit:
                 smallest = self._tolerances.atol / self._tolerances.rtol
-                watch.look(accepted[-1] - accepted[-2], steps.slopes, accepted[-1], steps.y, smallest)
+                step = accepted[-1] - accepted[-2]
+                watch.look(Look(step, steps.slopes, accepted[-1], steps.y.copy(), smallest))
                 if len(accepted) > PACE and watch.is_clear():
-                    watch.give_up(_project_steps(accepted, stretch.end))
+                    watch.mode.projected = _project_steps(accepted, stretch.end)
                     raise TooManyStepsError
         # Stuck, or at rest, beside a corner beyond which the field is undefined.
         if course is not None:

@@ -292,7 +292,7 @@ class JaxEngine:
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, reason: str = "") -> None:
         self._structure, self._arguments, self._mesh = structure, arguments, mesh
         self._reason = reason
-        self._compiled: set[tuple[Method, Matrix]] = set()
+        self._compiled: set[Any] = set()
         # The last simulation without tangents, since J and the trajectory are often requested at the same point.
         self._last: tuple[bytes, Simulation] | None = None
 
@@ -318,28 +318,28 @@ class JaxEngine:
         self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Method = "discrete-adjoint"
     ) -> Evaluation[FloatArray]:
         """Return J and its derivatives, by one of the methods of `derivatives`."""
-        compiled = (method, matrix) in self._compiled
-        with use_float64(), nullcontext() if compiled else use_compilation_cache():
-            given = self._on_device, tau, p, float(side)
-            found = derivatives(*given, structure=self._any_sequence, method=method, matrix=matrix)
-        self._compiled.add((method, matrix))
-        J, g, H = found
+        J, g, H = self._run(derivatives, tau, p, float(side), method=method, matrix=matrix)
         return Evaluation(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
+
+    def _run(self, program: Callable[..., Any], *given: Any, **settings: Any) -> Any:
+        """Return what a program yields for the experiment; only once it looks for it among the compiled ones."""
+        key = program, *settings.values()
+        with use_float64(), nullcontext() if key in self._compiled else use_compilation_cache():
+            found = program(self._on_device, *given, structure=self._any_sequence, **settings)
+        self._compiled.add(key)
+        return found
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
-        with use_float64(), use_compilation_cache():
-            given = self._on_device, tau, p, float(side), multipliers
-            found = derivatives(*given, structure=self._any_sequence, method="discrete-adjoint")
+        found = self._run(derivatives, tau, p, float(side), multipliers, method="discrete-adjoint")
         J, slope, H, c, A = map(np.array, found)
         return Evaluation(float(J), slope - multipliers @ A, H, c, A)
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
-        with use_float64(), use_compilation_cache():
-            found = differentiate_in_states(self._on_device, tau, p, multipliers, structure=self._any_sequence)
+        found = self._run(differentiate_in_states, tau, p, multipliers)
         layout, rows = self._cut_rows(tau)
         states, costates = (np.asarray(values)[rows] for values in found)
         return Costates.of_rows(self._structure, layout.first_row, layout.start[rows], states, costates)
@@ -359,8 +359,7 @@ class JaxEngine:
         key = np.concatenate([tau, p]).tobytes()
         if not tangents and self._last is not None and self._last[0] == key:
             return self._last[1]
-        with use_float64(), use_compilation_cache():
-            found = simulate_rows(self._on_device, tau, p, structure=self._any_sequence, tangents=tangents)
+        found = self._run(simulate_rows, tau, p, tangents=tangents)
         layout, rows = self._cut_rows(tau)
         J, late, values, derivatives = jax.tree.map(np.asarray, found)
         which = [k for k, sensor in enumerate(self._structure.measurements) if sensor.delay is not None]

@@ -64,8 +64,20 @@ Slopes = Callable[[FloatArray, FloatArray], FloatArray]
 """The vector field and the running cost (L, n + 1) at times (L,) and y (L, n + 1); NaN where they are not defined."""
 
 
-class _Look(NamedTuple):
-    """A state of an explicit solve at which the eigenvalues can be computed: the arguments of `Watch.look`."""
+class Look(NamedTuple):
+    """A state of an explicit solve at which the eigenvalues can be computed, if its mode takes many steps.
+
+    Attributes
+    ----------
+    step : float
+        Length of the last step.
+    slopes : Slopes
+        The running cost is left out.
+    t, y : float, (n + 1,)
+        The end of that step.
+    smallest : float
+        Smallest size of a state for the steps of the differences.
+    """
 
     step: float
     slopes: Slopes
@@ -85,7 +97,7 @@ class _ModeSteps:
     count: int = 0
     looked: int = 0
     projected: float = 0.0
-    looks: list[_Look] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
 
     @cached_property
     def rates(self) -> list[float]:
@@ -129,7 +141,7 @@ class Watch:
     Attributes
     ----------
     modes : dict of str to the steps of a mode
-    current : str
+    current, mode : str, the steps of a mode
         The mode that is being solved; "" before the first.
     """
 
@@ -138,7 +150,7 @@ class Watch:
     ) -> None:
         self.modes: dict[str, _ModeSteps] = {}
         self.most, self.between, self.refused = most or {}, between, refused
-        self.current = ""
+        self.current, self.mode = "", _ModeSteps()
 
     def find_stiff(self) -> dict[str, float]:
         """Return the stiff modes, and ``|lambda| h`` where stability limits the steps of each."""
@@ -162,8 +174,8 @@ class Watch:
 
     def enter(self, name: str, row_work: float = 1.0) -> None:
         """Begin the solve of a mode whose rows have this work, in additions, in an evaluation of (J, g, H)."""
-        self.current = name
-        self.modes.setdefault(name, _ModeSteps()).row_work = row_work
+        self.current, self.mode = name, self.modes.setdefault(name, _ModeSteps())
+        self.mode.row_work = row_work
 
     def add(self, accepted: int) -> bool:
         """Count steps in the current mode, and return whether it is time to `look`.
@@ -173,33 +185,20 @@ class Watch:
         TooManyStepsError
             If their work is more than the `most` of this mode.
         """
-        mode = self.modes[self.current]
+        mode = self.mode
         mode.count += accepted
         if mode.row_work * mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
         return mode.count - mode.looked >= self.between
 
-    def look(self, step: float, slopes: Slopes, t: float, y: FloatArray, smallest: float) -> None:
-        """Keep a state of the current mode, for its eigenvalues; they are computed only if it takes many steps.
-
-        Parameters
-        ----------
-        step : float
-            Length of the last step.
-        slopes : Slopes
-            The running cost is left out.
-        t, y : float, (n + 1,)
-            The end of that step.
-        smallest : float
-            Smallest size of a state for the steps of the differences.
-        """
-        mode = self.modes[self.current]
-        mode.looked = mode.count
-        mode.looks.append(_Look(step, slopes, t, y.copy(), smallest))
+    def look(self, there: Look) -> None:
+        """Keep a state of the current mode, for its eigenvalues."""
+        self.mode.looked = self.mode.count
+        self.mode.looks.append(there)
 
     def is_clear(self) -> bool:
         """Return whether the current mode is stiff, however its solve goes on, and may take implicit steps."""
-        looks = self.modes[self.current].looks
+        looks = self.mode.looks
         # 20 of at most 60 looks are more than a quarter of them.
         may_stop = len(looks) in range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
         if self.refused is None or self.current in self.refused or not may_stop:
@@ -207,10 +206,6 @@ class Watch:
         last = looks[-LOOKS_TO_STOP:]
         rates = _measure_rates(last)
         return all(rate * look.step > LIMITED for rate, look in zip(rates, last, strict=True))
-
-    def give_up(self, steps: float) -> None:
-        """Record the steps that the current mode, whose solve was given up, would have taken at its pace."""
-        self.modes[self.current].projected = steps
 
 
 class TooManyStepsError(Exception):
@@ -291,7 +286,7 @@ class Choice:
             log.info("%s.", text[0].upper() + text[1:])
 
 
-def _measure_rates(looks: Sequence[_Look]) -> list[float]:
+def _measure_rates(looks: Sequence[Look]) -> list[float]:
     """Return the largest ``|lambda|`` of a component that decays at each look; 0 if none does, or the model is
     undefined.
     """

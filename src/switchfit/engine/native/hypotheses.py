@@ -95,8 +95,8 @@ def divide_record(sizes: Sizes) -> dict[str, slice]:
 
 
 def measure_record(sizes: Sizes) -> int:
-    """Return the length of a record: a multiple of four doubles."""
-    return -(-divide_record(sizes)["H"].stop // 4) * 4
+    """Return the length of a record."""
+    return divide_record(sizes)["H"].stop
 
 
 def scratch_sizes(sizes: Sizes) -> dict[str, int]:
@@ -104,7 +104,7 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
     eliminated, and what the straight-line functions exchange.
     """
     n, D, width = sizes.n, sizes.D, sizes.width
-    lengths = {"rows": (D + 1) * width, "reduced": D, "shift": D, "g_after": width, "K": n + 1, "along": width}
+    lengths = {"rows": (D + 1) * width, "reduced": D, "K": n + 1, "along": width}
     lengths |= {"information": 1, "XZ": STAGES * n * width, "entries": STAGES * (1 + n + sizes.M) ** 2}
     return lengths | {"increments": STIFF.coupled * n, "newton": 2}
 
@@ -221,17 +221,12 @@ class HypothesisKernels(Kernels):
             d[k] = xp.minimum(xp.maximum(target, low[k]), high[k]) - moved[k]
         # The quadratic model at the new point: g+ = g + H d and J + g'd + d'H d / 2 = J + (g + g+)'d / 2; H stays.
         x = [graph.load("x", i) + (graph.loads("Z", D, i * width) * d).sum() for i in range(n)]
-        g = graph.load("g", 0, vector=True) + (graph.loads("H", D, vector=True) * d).sum()
-        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g)), *store_all("shift", 0, d)]
-        self.module.write_straight_line("shift", stores)
-
-        graph = Graph()
-        # A second function: J needs the entries of g+ one by one, and g+ is a vector until it has been stored.
-        d, g, after = (graph.loads(name, D) for name in ("shift", "g", "g_after"))
+        g = graph.loads("g", D)
+        after = np.array([g[i] + (graph.loads("H", D, i * width) * d).sum() for i in range(D)])
         J = graph.load("J", 0) + 0.5 * (d * (g + after)).sum()
-        moved, p = graph.loads("moved", D) + d, graph.loads("p", self.sizes.M) + d[N:]
-        stores = [("J", 0, J), *store_all("g", 0, after), *store_all("moved", 0, moved), *store_all("p", 0, p)]
-        self.module.write_straight_line("shift_back", stores)
+        stores = [("J", 0, J), *store_all("x", 0, x), *store_all("g", 0, after), *store_all("moved", 0, moved + d)]
+        p = graph.loads("p", self.sizes.M) + d[N:]
+        self.module.write_straight_line("shift", stores + store_all("p", 0, p))
 
 
 class HypothesisWriter(Writer):
@@ -428,7 +423,6 @@ class HypothesisWriter(Writer):
             score = self.load("double", found["score"])
             with self.when((recentres > 0) & score.equals(score)):  # the rows have been eliminated then
                 self.call("shift", found)
-                self.call("shift_back", found)
         return self.end()
 
     def write_following(self) -> str:
