@@ -524,18 +524,14 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     """
     runs = [runs_of(problem)[e] for problem in problems]
     solutions: list[FloatArray] = []
-    failure: NotIntegrableError | None = None
     stiffness: tuple[Stiffness, ...] = ()
     for run in runs:
-        try:
+        with suppress(NotIntegrableError):
             found, stiff = _solve_at(run, (run.problem.initial_theta,), Choice())
-        except NotIntegrableError as error:
-            failure = failure or error
-            continue
-        solutions += found
-        stiffness = merge_stiffness(stiffness, stiff)
-    if not solutions and failure is not None:
-        raise failure
+            solutions += found
+            stiffness = merge_stiffness(stiffness, stiff)
+    if not solutions:
+        solutions, stiffness = _solve_at(runs[0], (runs[0].problem.initial_theta,), Choice())  # it raises
     fewest = min(map(len, solutions))
     kept = [steps for steps in solutions if len(steps) <= MOST_TIMES * fewest + PACE]
     return runs[0].coarse.refine(kept, stiffness)

@@ -32,7 +32,7 @@ from switchfit.engine.jax import JaxEngine, derivatives
 from switchfit.engine.native.engine import NativeEngine, foreign_derivatives, reason_for_jax
 from switchfit.engine.native.hypotheses import NativeHypotheses, hypotheses_program
 from switchfit.engine.native.templates import Sizes
-from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Run, Simulation, Tangents
+from switchfit.engine.protocol import Costates, DenseEvaluation, Engine, Evaluation, Matrix, Run, Simulation, Tangents
 from switchfit.problem.corners import Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -51,8 +51,11 @@ LOST = "the trajectory cannot be followed through the corners of its modes at th
 
 REQUIRED = "engine='native' requires machine code, but {}. Leave engine out to evaluate with JAX."
 
-Build = Callable[[Structure], NativeEngine | JaxEngine]
-Evaluate = Callable[[Structure, FloatArray], Evaluation[FloatArray]]
+SmoothEngine = NativeEngine | JaxEngine
+"""Of a structure whose modes are smooth."""
+
+Build = Callable[[Structure], SmoothEngine]
+Evaluate = Callable[[Structure, FloatArray], DenseEvaluation]
 
 
 OWN = -2
@@ -77,7 +80,7 @@ class _Split(NamedTuple):
     path: Path
     corners: list[Corners]
     structure: Structure
-    engine: NativeEngine | JaxEngine
+    engine: SmoothEngine
     own: NDArray[np.intp]
     crossings: NDArray[np.intp]
     guarded: NDArray[np.intp]
@@ -138,7 +141,7 @@ class SplitEngine:
 
     def derivatives(
         self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Evaluate | None = None
-    ) -> Evaluation[FloatArray]:
+    ) -> DenseEvaluation:
         """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
         split, found = self._solve(tau, p, side)
         if split is None:
@@ -160,9 +163,7 @@ class SplitEngine:
             second = second + split.engine.constrained(*at, multipliers).hessian - found.hessian
         return Evaluation(own.cost, own.gradient @ T, T.T @ second @ T, row_errors=found.row_errors)
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
-    ) -> Evaluation[FloatArray]:
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> DenseEvaluation:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         split, found = self._solve(tau, p, side, len(multipliers))
         if split is None:
@@ -186,7 +187,7 @@ class SplitEngine:
         return self._plain.slopes(times, cells, states, p)
 
     @cached_property
-    def _plain(self) -> NativeEngine | JaxEngine:
+    def _plain(self) -> SmoothEngine:
         return self._build(self._structure)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
@@ -208,7 +209,7 @@ class SplitEngine:
         return replace(simulation, tangents=Tangents(*(values @ T for values in inner.tangents)))
 
     def _eliminate(
-        self, split: _Split, found: Evaluation[FloatArray], multipliers: FloatArray | float = 0.0
+        self, split: _Split, found: DenseEvaluation, multipliers: FloatArray | float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
         """Return T (N + K + M, N + M), and the multipliers of all constraints, those of the experiment given."""
         A, rows, times, D = found.jacobian, split.guards, split.guarded, len(found.gradient)
@@ -224,9 +225,7 @@ class SplitEngine:
         every[rows] = -np.linalg.solve(square.T, slope[times])
         return T, every
 
-    def _solve(
-        self, tau: FloatArray, p: FloatArray, side: float, m: int = 0
-    ) -> tuple[_Split | None, Evaluation[FloatArray]]:
+    def _solve(self, tau: FloatArray, p: FloatArray, side: float, m: int = 0) -> tuple[_Split | None, DenseEvaluation]:
         """Return the path at a theta, and J and the constraints with their derivatives there, and keep its times.
 
         If the trajectory cannot be followed, J and m constraints are NaN and there is no path.
@@ -248,7 +247,7 @@ class SplitEngine:
         D, row_errors = len(tau) + len(p), (np.inf,) if self._judges_rows else ()  # another mesh may do
         return None, _refuse(D, m, row_errors)
 
-    def _build_engine(self, structure: Structure) -> NativeEngine | JaxEngine:
+    def _build_engine(self, structure: Structure) -> SmoothEngine:
         engine = self._build(structure)
         if self._judges_rows:
             engine.judge_rows()
@@ -293,7 +292,7 @@ class SplitEngine:
 
     def _locate(
         self, split: _Split, tau: FloatArray, p: FloatArray, side: float
-    ) -> tuple[Evaluation[FloatArray] | None, FloatArray]:
+    ) -> tuple[DenseEvaluation | None, FloatArray]:
         """Find the times of the crossings by Newton's method from the last ones; the evaluation is None if there are
         none.
         """
@@ -357,7 +356,7 @@ class SplitEngine:
         return True
 
 
-def _refuse(D: int, m: int, row_errors: tuple[float, ...] = ()) -> Evaluation[FloatArray]:
+def _refuse(D: int, m: int, row_errors: tuple[float, ...] = ()) -> DenseEvaluation:
     """Return an evaluation without numbers, of D unknowns and with m constraints."""
     gradient, hessian, c, A = (np.full(shape, np.nan) for shape in (D, (D, D), m, (m, D)))
     return Evaluation(np.nan, gradient, hessian, c, A, row_errors)
@@ -369,9 +368,7 @@ class _PathFallback(JaxEngine):
     JAX would compile a program for each path, for seconds, to find that a derivative is not finite.
     """
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
-    ) -> Evaluation[FloatArray]:
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> DenseEvaluation:
         """Return an evaluation without numbers."""
         return _refuse(len(tau) + len(p), len(multipliers))
 
@@ -393,9 +390,7 @@ def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
     return build(base) if run.branches is None else SplitEngine(run, run.branches, base, arguments, mesh, build)
 
 
-def _engine_on(
-    run: Run, base: Structure, arguments: Arguments, mesh: Mesh, structure: Structure
-) -> NativeEngine | JaxEngine:
+def _engine_on(run: Run, base: Structure, arguments: Arguments, mesh: Mesh, structure: Structure) -> SmoothEngine:
     """Return the engine of a structure whose modes are smooth; the `base`, as users wrote it, tells why it is JAX."""
     asked = run.problem.engine
     reason = "engine='jax' is set" if asked == "jax" else reason_for_jax(structure, arguments)

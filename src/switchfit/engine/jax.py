@@ -21,20 +21,19 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.discretization import propagation
 from switchfit.discretization.mesh import Arguments, Mesh, Rows, build_rows
 from switchfit.discretization.model import Model, Piece, apply_weights
-from switchfit.discretization.propagation import (
-    Path,
-    add_point_costs,
-    compute_path_constraints,
-    compute_path_cost,
-    map_stages,
-    propagate,
-    see_samples,
-    switch_mode,
-    weigh_stages,
+from switchfit.engine.protocol import (
+    Costates,
+    DenseEvaluation,
+    Engine,
+    Evaluation,
+    Matrix,
+    Simulation,
+    Tangents,
+    finish_simulation,
 )
-from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, finish_simulation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure, pad_length
@@ -53,10 +52,10 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
 
     def simulate(theta: Array) -> tuple[Any, Any]:
         p = theta[N:]
-        path = propagate(model, theta[:N], p, side)
+        path = propagation.propagate(model, theta[:N], p, side)
         residuals, log_sigmas, information = [], [], []
         for k, sensor in enumerate(structure.measurements):
-            seen = see_samples(model, path, k, p)
+            seen = propagation.see_samples(model, path, k, p)
             residuals.append(jax.vmap(partial(model.sample_residual, k), in_axes=(0, 0, None))(*seen, p))
             information.append(jax.vmap(partial(model.sample_information, k), in_axes=(0, 0, None))(*seen, p))
             if sensor.sigma:
@@ -67,7 +66,10 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
             return [0.0 * r for r in found] if structure.is_rest(mode) else found
 
         points = path.stages, path.after, path.layout.end, p
-        cost, tracked = compute_path_cost(model, path, p), map_stages(model, path, track, path.stages)
+        cost, tracked = (
+            propagation.compute_path_cost(model, path, p),
+            propagation.map_stages(model, path, track, path.stages),
+        )
         return (cost, residuals, log_sigmas, tracked, points), (cost, path, points, information)
 
     derivatives, (cost, path, points, information) = jax.jacfwd(simulate, has_aux=True)(theta)
@@ -79,7 +81,7 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
         """Return the costs without residuals at theta + e, to first order in the points."""
         stages, after, end, p = jax.tree.map(lambda value, slope: value + slope @ e, points, points_d)
         moved = path._replace(stages=stages, after=after, layout=path.layout._replace(end=end))
-        return sum_other_costs(model, moved, weigh_stages(model, path.layout), p)
+        return sum_other_costs(model, moved, propagation.weigh_stages(model, path.layout), p)
 
     H = jax.hessian(add_other_costs)(jnp.zeros_like(theta))
     for r_d, weight in zip(residuals_d, information, strict=True):
@@ -87,23 +89,26 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
     for s_d in log_sigmas_d:  # Fisher information of normal noise: 2 for log sigma, 0 between sigma and the rest
         H = H + 2.0 * jnp.einsum("kqd,kqe->de", s_d, s_d)
     # A reference signal is a residual at each stage, of weight h b_j W.
-    hb = weigh_stages(model, path.layout).reshape(-1)
+    hb = propagation.weigh_stages(model, path.layout).reshape(-1)
     for r_d, W in zip(tracked_d, model.arguments.weights, strict=True):
         at_stages = r_d.reshape(-1, *r_d.shape[2:])
         H = H + jnp.einsum("sqd,s,sqe->de", at_stages, hb, jax.vmap(partial(apply_weights, W))(at_stages))
     return cost, gradient, H
 
 
-def sum_other_costs(model: Model, path: Path, weights: Array, p: Array) -> Array:
+def sum_other_costs(model: Model, path: propagation.Path, weights: Array, p: Array) -> Array:
     """Return the running costs, with weights of the stages (R, s), and the costs at transitions and at the end."""
     if not model.structure.running:
-        return add_point_costs(model, path, p)
+        return propagation.add_point_costs(model, path, p)
 
     def ell(mode: int, piece: Piece, t: Array, x: Array) -> Array:
         rates = [jnp.asarray(ell(t, x, model.parameters(p))).reshape(()) for ell in model.structure.running]
         return jnp.zeros(()) if model.structure.is_rest(mode) else sum(rates, jnp.zeros(()))
 
-    return add_point_costs(model, path, p) + (weights * map_stages(model, path, ell, path.stages)).sum()
+    return (
+        propagation.add_point_costs(model, path, p)
+        + (weights * propagation.map_stages(model, path, ell, path.stages)).sum()
+    )
 
 
 Method = Literal["forward", "discrete-adjoint"]
@@ -160,9 +165,9 @@ def derivatives(
 def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False) -> tuple[Array, Array]:
     """Return the cost, and the constraints (m,) if they are asked for."""
     N = model.structure.N
-    path, p = propagate(model, theta[:N], theta[N:], side), theta[N:]
-    c = compute_path_constraints(model, path, p) if constrained else jnp.zeros(0)
-    return compute_path_cost(model, path, p), c
+    path, p = propagation.propagate(model, theta[:N], theta[N:], side), theta[N:]
+    c = propagation.compute_path_constraints(model, path, p) if constrained else jnp.zeros(0)
+    return propagation.compute_path_cost(model, path, p), c
 
 
 def _differentiate(method: Method, function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
@@ -197,8 +202,10 @@ def differentiate_in_states(
     model = Model(structure, arguments._replace(samples=tuple(later)))
 
     def lagrangian(nudges: Array) -> tuple[Array, Array]:
-        path = propagate(model, tau, p, jnp.ones(()), nudges)
-        return compute_path_cost(model, path, p) + multipliers @ compute_path_constraints(model, path, p), path.before
+        path = propagation.propagate(model, tau, p, jnp.ones(()), nudges)
+        return propagation.compute_path_cost(model, path, p) + multipliers @ propagation.compute_path_constraints(
+            model, path, p
+        ), path.before
 
     rows = arguments.nodes.shape[0] - 1 + structure.N
     found = _try_backward(lagrangian, jnp.zeros((rows, structure.n)))
@@ -230,16 +237,16 @@ def simulate_rows(
         return jnp.concatenate([jnp.zeros(0), *(model.observe(h, t, x, p) for h, _ in structure.outputs)])
 
     def run(theta: Array) -> tuple[Any, Any]:
-        path = propagate(model, theta[:N], theta[N:], jnp.ones(()))
+        path = propagation.propagate(model, theta[:N], theta[N:], jnp.ones(()))
         return (path.before, path.after), path
 
     see_all = jax.vmap(see, in_axes=(0, 0, None))
     moving, path = jax.jacfwd(run, has_aux=True)(theta) if tangents else run(theta)
     times, opening = (path.layout.start, path.layout.end), path.layout.first_row[1:]
-    states, J = (path.before, path.after), compute_path_cost(model, path, p)
+    states, J = (path.before, path.after), propagation.compute_path_cost(model, path, p)
     rows = *states, *(see_all(*at, p) for at in zip(times, states, strict=True))
     late = [k for k, sensor in enumerate(structure.measurements) if sensor.delay is not None]
-    seen = [see_all(samples.time, x, p) for samples, x in (see_samples(model, path, k, p) for k in late)]
+    seen = [see_all(samples.time, x, p) for samples, x in (propagation.see_samples(model, path, k, p) for k in late)]
     if not tangents:
         return J, seen, rows, ()
 
@@ -248,7 +255,7 @@ def simulate_rows(
         for i in range(N):
             row = opening[i] - 1 + side
             piece = jax.tree.map(lambda a, row=row: a[row], path.pieces)
-            slope = switch_mode(model, i + side, partial(model.field, piece=piece), tau[i], values[row], p)
+            slope = propagation.switch_mode(model, i + side, partial(model.field, piece=piece), tau[i], values[row], p)
             moving = moving.at[row, :, i].add(-slope)
         return moving
 
@@ -316,7 +323,7 @@ class JaxEngine:
 
     def derivatives(
         self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Method = "discrete-adjoint"
-    ) -> Evaluation[FloatArray]:
+    ) -> DenseEvaluation:
         """Return J and its derivatives, by one of the methods of `derivatives`."""
         J, g, H = self._run(derivatives, tau, p, float(side), method=method, matrix=matrix)
         return Evaluation(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
@@ -329,9 +336,7 @@ class JaxEngine:
         self._compiled.add(key)
         return found
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
-    ) -> Evaluation[FloatArray]:
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> DenseEvaluation:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         found = self._run(derivatives, tau, p, float(side), multipliers, method="discrete-adjoint")
         J, slope, H, c, A = map(np.array, found)

@@ -115,6 +115,10 @@ class Evaluation(Generic[H_co]):
         return format_line(self, f"J = {self.cost:.9g}", f"{len(self.gradient)} unknowns")
 
 
+DenseEvaluation = Evaluation[FloatArray]
+"""With the Hessian as an array."""
+
+
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """One experiment row by row, R = cells + N rows in the order of time; up to tf where it is free.

@@ -146,6 +146,9 @@ def diagonal_scaling(matrix: Dense | Arrow, floor: FloatArray | float = 0.0) -> 
     return scaling
 
 
+Change = Callable[[FloatArray], FloatArray]
+"""Returns another matrix (d, d)."""
+
 STIFFENINGS = (1.0, 1e2, 1e4, 1e6)
 """By how much directions across the constraints expected to be active are made stiffer, in turn."""
 
@@ -235,7 +238,7 @@ class Dense(SymmetricMatrix):
             factor = CholeskyFactor.of_scaled(scaled, scaling) if qp.has_curvature(scaled) else None
             if factor is not None:
                 return self, factor
-        make_definite: Callable[[FloatArray], FloatArray] = make_absolute
+        make_definite: Change = make_absolute
         if reach is None:
             scaling = diagonal_scaling(self, floor)
             weight, rows = scaling[:, None] * scaling, normals / scaling
@@ -586,9 +589,7 @@ def null_space(normals: FloatArray) -> FloatArray:
     return np.asarray(right[np.count_nonzero(sizes > 1e-11) :].T)
 
 
-def _convex_on_face(
-    scaled: FloatArray, normals: FloatArray, make_definite: Callable[[FloatArray], FloatArray]
-) -> FloatArray:
+def _convex_on_face(scaled: FloatArray, normals: FloatArray, make_definite: Change) -> FloatArray:
     """Return a positive definite matrix that differs from a scaled one across the normals alone if that is enough."""
     across = algebra.unit_rows(normals)[0]
     across = across.T @ across

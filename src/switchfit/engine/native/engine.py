@@ -27,7 +27,16 @@ from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import PREFIX, layout_of, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, finish_simulation
+from switchfit.engine.protocol import (
+    Costates,
+    DenseEvaluation,
+    Engine,
+    Evaluation,
+    Matrix,
+    Simulation,
+    Tangents,
+    finish_simulation,
+)
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -217,7 +226,7 @@ class NativeExperiment:
 
     def __call__(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None
-    ) -> Evaluation[FloatArray]:
+    ) -> DenseEvaluation:
         """Return J, its gradient (D,) and its Hessian (D, D), NaN at order GRADIENT.
 
         With multipliers (m,) the constraints too, and the Hessian of ``J + multipliers . c``.
@@ -395,8 +404,14 @@ class NativeExperiment:
 
     def _evaluate(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
         """Evaluate J and, of a program with derivatives, those of ``J + multipliers . c``."""
-        self._prepare(p)
-        self._tau[:] = tau
+        self._own_p[:], self._tau[:] = p, tau
+        # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
+        # call.
+        self._program.reserve(self._size)
+        if self._memory is not self._program.memory:
+            self._memory = self._program.memory
+            self._divide(self._memory, self._lengths)
+            self._table[:] = [self._addresses[name] for name in self._pointers]
         self._find_first_cells(tau, side)
         if self._late:
             self._find_late_cells(p)
@@ -411,18 +426,6 @@ class NativeExperiment:
         # If the cost is not finite, it is returned without fallback: the caller rejects the point anyway.
         if check != check and math.isfinite(self._J.item(0)):
             raise FailedCheckError
-
-    def _prepare(self, p: FloatArray) -> None:
-        """Store p, and the addresses of the scratch space in the table."""
-        self._own_p[:] = p
-        # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
-        # call.
-        self._program.reserve(self._size)
-        if self._memory is self._program.memory:
-            return
-        self._memory = self._program.memory
-        self._divide(self._memory, self._lengths)
-        self._table[:] = [self._addresses[name] for name in self._pointers]
 
     def _divide(self, block: NDArray[Any], lengths: Mapping[str, int]) -> None:
         """Name consecutive parts of a block of memory. Finding an address takes as long as all the rest."""
@@ -528,14 +531,12 @@ class NativeEngine:
         """Return J alone."""
         return self._try(Order.COST, NativeExperiment.cost, self._fallback.cost, tau, p)
 
-    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> Evaluation[FloatArray]:
+    def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> DenseEvaluation:
         """Return J and its derivatives."""
         by_jax = partial(self._fallback.derivatives, matrix=matrix)
         return self._try(ORDERS[matrix], NativeExperiment.__call__, by_jax, tau, p, side)
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
-    ) -> Evaluation[FloatArray]:
+    def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> DenseEvaluation:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         given = tau, p, side, multipliers
         return self._try(self._second, NativeExperiment.__call__, self._fallback.constrained, *given)

@@ -28,20 +28,12 @@ from numpy.typing import NDArray
 from switchfit.discretization import rows
 from switchfit.discretization.mesh import Arguments
 from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine, times_vector
+from switchfit.engine.native import program
 from switchfit.engine.native.arrays import eliminate
 from switchfit.engine.native.engine import count_samples, get_address
 from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, as_vector, list_entries, store_all
 from switchfit.engine.native.llvm import Module, Program, Value, Variable
-from switchfit.engine.native.program import (
-    PREFIX,
-    Pointers,
-    Writer,
-    add_curvature,
-    compile_library,
-    solve_stages,
-    write_newton,
-    write_slope,
-)
+from switchfit.engine.native.program import Pointers, Writer
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
 from switchfit.engine.native.templates import COST_TO_GO, F_X, F, Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
@@ -111,6 +103,8 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
 
 class HypothesisKernels(Kernels):
     """Writes the straight-line functions of hypotheses; the order of derivatives is that of Gauss-Newton."""
+
+    adjoint = False
 
     def step(self, mode: int, stage: Template, costs: bool) -> list[tuple[int, int]]:
         """Write a step in a mode: state, tangents, running costs and the estimate of the error.
@@ -345,9 +339,9 @@ class HypothesisWriter(Writer):
             self.put((part + 1 >= parts).choose(end, inside), row, 1)
             for k in self.cases(mode, len(self.library.modes)):
                 if self.library.implicit[k]:
-                    solve_stages(self, f"newton_{k}", found)
+                    program.solve_stages(self, f"newton_{k}", found)
                 self.call(f"step_{k}", found)
-                add_curvature(self, curvatures[k], found, moving=False)
+                program.add_curvature(self, curvatures[k], found, moving=False)
         return self.end()
 
     def write_propagation(self) -> str:
@@ -496,18 +490,18 @@ class HypothesisWriter(Writer):
 
 def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
     """Return the machine code of hypotheses of a library, or the reason why it cannot be compiled."""
-    return compile_library(library, sizes, (Order.GAUSS_NEWTON,), _write, "No beam")
+    return program.compile_library(library, sizes, (Order.GAUSS_NEWTON,), _write)
 
 
 def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> Iterator[str]:
-    kernels = HypothesisKernels(library, sizes, order, module, goes_back=False)
+    kernels = HypothesisKernels(library, sizes, order, module)
     costs = bool(library.running or library.references)
     curvatures = []
     for mode in range(len(library.modes)):
         stage = kernels.templates.stage(mode, running=costs)
         chosen = kernels.step(mode, stage, costs)
         curvatures.append(kernels.share_curvature(f"curvature_{mode}", chosen, kernels.tableau(mode)))
-        write_slope(kernels, mode, stage)
+        program.write_slope(kernels, mode, stage)
     kernels.shift()
     kernels.move("move", 1.0, costs)
     kernels.move("hold", -1.0, costs)
@@ -515,7 +509,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     kernels.nodes()
     writer = HypothesisWriter(library, sizes, module)
     for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
-        module.add(write_newton(writer, f"newton_{mode}"))
+        module.add(program.write_newton(writer, f"newton_{mode}"))
     module.add(writer.write_steps(curvatures))
     module.add(writer.write_node())
     module.add(writer.write_score())
@@ -555,7 +549,7 @@ class NativeHypotheses:
 
     Parameters
     ----------
-    program : Program
+    code : Program
         Of `hypotheses_program`.
     sizes : Sizes
     arguments : Arguments
@@ -571,9 +565,9 @@ class NativeHypotheses:
     """
 
     def __init__(
-        self, program: Program, sizes: Sizes, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
+        self, code: Program, sizes: Sizes, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
     ) -> None:
-        self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
+        self._program, self._sizes, self._at = code, sizes, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
         self._shape = sizes.n, sizes.D, sizes.width
         # Row 0 is zero: the derivative of a time that does not move.
@@ -598,9 +592,9 @@ class NativeHypotheses:
             self._set_samples(k, first, *values)
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
-        prefix, kind = PREFIX[Order.GAUSS_NEWTON], ctypes.c_int64  # of numbers, and of addresses
-        self._propagate = program.function(f"{prefix}propagate", *[kind] * 13)
-        self._follow_order = program.function(f"{prefix}follow_order", *[kind] * 14)
+        prefix, kind = program.PREFIX[Order.GAUSS_NEWTON], ctypes.c_int64  # of numbers, and of addresses
+        self._propagate = code.function(f"{prefix}propagate", *[kind] * 13)
+        self._follow_order = code.function(f"{prefix}follow_order", *[kind] * 14)
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
         self._arrays |= {f"{name} {k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}

@@ -104,11 +104,12 @@ class Curvature(NamedTuple):
 class Kernels:
     """Writes the straight-line functions of a library into a module, with derivatives of an order."""
 
-    def __init__(
-        self, library: Structure, sizes: Sizes, order: Order, module: Module, *, goes_back: bool = True
-    ) -> None:
+    adjoint = True
+    """Whether derivatives are propagated backward, by a costate."""
+
+    def __init__(self, library: Structure, sizes: Sizes, order: Order, module: Module) -> None:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
-        self.goes_back = goes_back and order > Order.COST  # else the functions forward check that they are finite
+        self.goes_back = self.adjoint and order > Order.COST  # else the functions forward check that they are finite
         self.with_tangents = order > Order.GRADIENT  # the gradient takes the costate alone
         self.templates = Templates(library, sizes, order)
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)

@@ -701,28 +701,24 @@ def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     back to JAX as well, and the reason begins with "internal: ".
     """
     both = (Order.COST, second_order(library))
-    return compile_library(library, sizes, both if order in both else (order,), _write, "Evaluated by JAX")
+    return compile_library(library, sizes, both if order in both else (order,), _write)
 
 
 Write = Callable[[Structure, Sizes, Order, Module], Iterator[str]]
 """Writes functions of a library with derivatives of an order, in parts."""
 
 
-def compile_library(
-    library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
-) -> Program | str:
+def compile_library(library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write) -> Program | str:
     """Return the machine code that a function writes, or the reason why there is none, as `program_of` does.
 
-    The log has the reason too, behind what is so `otherwise`.
+    The log has the reason too.
     """
     with _one_at_a_time:
-        return _program_of(library, sizes, orders, write, otherwise)
+        return _program_of(library, sizes, orders, write)
 
 
 @lru_cache(maxsize=64)
-def _program_of(
-    library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
-) -> Program | str:
+def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write) -> Program | str:
     modules = [Module(sizes.width, PREFIX[order]) for order in orders]
     try:
         if sizes.D == 0:
@@ -732,10 +728,10 @@ def _program_of(
             program = compile_modules(chain.from_iterable(parts))
     except Unsupported as error:
         reason = str(error)
-        log.info("%s: %s.", otherwise, reason)
+        log.info("No machine code: %s.", reason)
     except Exception as error:
         reason = f"internal: {type(error).__name__}: {error}"
-        log.info("%s: %s.", otherwise, reason, exc_info=True)
+        log.info("No machine code: %s.", reason, exc_info=True)
     else:
         program.row_work = modules[-1].row_work
         program.pointers = {f"{each.prefix}{name}": given for each in modules for name, given in each.pointers.items()}
