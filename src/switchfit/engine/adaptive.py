@@ -267,7 +267,8 @@ class _Solve:
                         self._course.resume(start, x, 0.5 * (start + end))
                     accepted, x = self._follow(_Stretch(mode, start, end, x, is_explicit))
                     steps += accepted
-                    self._watch.mode.rows += _count_rows(np.concatenate([[start], *accepted]), self._coarse.times)
+                    if self._settings.watch is not None:
+                        self._watch.mode.rows += _count_rows(np.concatenate([[start], *accepted]), self._coarse.times)
         return np.concatenate(steps)
 
     def _find_initial_state(self) -> FloatArray:

@@ -218,8 +218,7 @@ def _step(oracle: Oracle, state: State) -> State:
 
 def _measure_anew(oracle: Oracle, state: State) -> State:
     """Return the state with constraints in new units; penalty and violation are reset."""
-    theta = state.point.theta
-    point = oracle.point(Trial.at(oracle.problem, theta), state.scale)
+    point = oracle.point(Trial.at(oracle.problem, state.point.theta), state.scale)
     if point is None:
         return state
     penalty = State.at(point).penalty

@@ -552,8 +552,7 @@ class NativeEngine:
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
-        given = times, cells, states, p
-        return self._try(Order.COST, NativeExperiment.slopes, self._fallback.slopes, *given)
+        return self._try(Order.COST, NativeExperiment.slopes, self._fallback.slopes, times, cells, states, p)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""

@@ -51,8 +51,11 @@ STAGES = len(EXPLICIT.b)
 Store = tuple[str, int, Node]
 Factors = Elimination | Routine | None
 """Those of the coupled equations of an implicit row; None for an explicit one."""
-Along = list[tuple[Node, list[Node]]]
+Along = list[tuple[Any, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
+
+NOTHING: tuple[Any, list[Node]] = (None, [])
+"""The derivative of a time that does not depend on theta."""
 
 JUMP_WEIGHT = 1e4
 """Error that counts as much as a jump of the state by 1 inside a row: even a small one spoils derivatives."""
@@ -396,7 +399,7 @@ class Kernels:
         size, at_once = len(chosen) + moving, len(tableau.b) if n * D * len(self.library.modes) <= SHORT else 1
         for j in range(at_once):
             second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
-            of_time = graph.constant(0.0), [graph.constant(0.0)] * D
+            of_time = NOTHING
             if moving:
                 # t_j' = start' + c_j h'; c_j comes from memory because a function for one stage is called for each of
                 # them.
@@ -405,7 +408,7 @@ class Kernels:
                 starts, ends = ([graph.load(name, d) for d in range(D)] for name in ("opens", "closes"))
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
-            sums = self._add_curvature(graph, sums, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
+            sums = self._add_curvature(graph, sums, second, [of_time, *self._directions(graph, "XZ", n, j * n)])
         self.module.write_straight_line(name, _store_changed_rows(H, sums))
         return at_once
 
@@ -594,12 +597,9 @@ class Kernels:
         if moving:
             g = g + g_t.item() * graph.load("moves", 0, vector=True)
         stores = [("g", 0, as_vector(graph, g))]
-        D = self.sizes.D
-        of_time = graph.constant(0.0), [graph.constant(0.0)] * D
-        if moving:
-            of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
-        H = [graph.load("H", d, vector=True) for d in range(D)]
-        along = [of_time, *self._state_directions(graph, "Z")]
+        H = [graph.load("H", d, vector=True) for d in range(self.sizes.D)]
+        of_time = self._directions(graph, "moves", 1) if moving else [NOTHING]
+        along = [*of_time, *self._directions(graph, "Z", self.sizes.n)]
         sums = self._add_curvature(graph, H, list_entries(second, with_time=moving), along)
         return stores + _store_changed_rows(H, sums)
 
@@ -628,12 +628,12 @@ class Kernels:
         stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
-    def _state_directions(self, graph: Graph, pointer: str, first: int = 0) -> Along:
-        """Load the derivative of each entry of x along theta."""
-        n, D, width = self.sizes.n, self.sizes.D, self.sizes.width
+    def _directions(self, graph: Graph, pointer: str, count: int, first: int = 0) -> Along:
+        """Load the derivatives along theta of some scalars."""
+        D, width = self.sizes.D, self.sizes.width
         return [
             (graph.load(pointer, k, vector=True), [graph.load(pointer, k * width + d) for d in range(D)])
-            for k in range(first, first + n)
+            for k in range(first, first + count)
         ]
 
     def _add_curvature(

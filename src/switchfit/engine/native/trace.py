@@ -174,12 +174,11 @@ def _is_search(equation: Any) -> bool:
 
     Operands after the array and the numbers are tangents, on which an index does not depend.
     """
-    if equation.params.get("name") != "_searchsorted_scan_impl" or len(equation.invars) < 2:
+    if equation.params.get("name") != "_searchsorted_scan_impl":
         return False
     table, query = (variable.aval for variable in equation.invars[:2])
-    sides = {"lt_to", "le_to"} & _find_primitives(equation.params["jaxpr"])
-    types = table.dtype == query.dtype == np.float64 and len(equation.outvars) == len(sides) == 1
-    return bool(types and table.ndim == 1 and equation.outvars[0].aval.shape == query.shape)
+    found = [(variable.aval.shape, query.dtype) for variable in equation.outvars]
+    return table.ndim == 1 and table.dtype == np.float64 and found == [(query.shape, table.dtype)]
 
 
 def _find_primitives(closed: Any) -> set[str]:
