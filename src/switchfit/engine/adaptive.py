@@ -583,5 +583,4 @@ def _solve_at(
             solutions = []  # again, with other steps in some mode
         elif failure is not None:
             raise failure
-    choice.report()
     return solutions, choice.stiffness

@@ -20,7 +20,6 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,8 +30,6 @@ import numpy as np
 
 from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.problem.data import FloatArray
-
-log = logging.getLogger("switchfit")
 
 STEPS_BETWEEN = 250
 """Accepted steps in a mode between two states at which its eigenvalues are computed."""
@@ -278,12 +275,6 @@ class Choice:
         for name in slower:
             self.refuse(name)
         return bool(slower)
-
-    def report(self) -> None:
-        """Log why modes take implicit steps."""
-        for each in self.stiffness:
-            text = str(each)
-            log.info("%s.", text[0].upper() + text[1:])
 
 
 def _measure_rates(looks: Sequence[Look]) -> list[float]:

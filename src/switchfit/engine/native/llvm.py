@@ -429,8 +429,6 @@ class Module:
             writer.value(node)
         self.work[name] = sum(_estimate_cost(node) * (1 + self.width // 4 if node.vector else 1) for node in nodes)
         for pointer, offset, node in stores:
-            if node.truth:
-                raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
             writer.used.add(pointer)
             writer.store(writer.value(node), writer.place(f"%{pointer}", offset, node))
         self.pointers[name] = tuple(sorted(writer.used))

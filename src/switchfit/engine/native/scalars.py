@@ -235,18 +235,11 @@ class Node:
 
 
 def _is_truth(op: str, args: tuple[Any, ...]) -> bool:
-    """Return whether an operation yields a truth value; raise TypeError if its arguments have the wrong type for it."""
-    operation = OPERATIONS.get(op)
-    if operation is None:
-        return op == "const" and isinstance(args[0], bool)
-    takes: list[bool] = [operation.takes_truth] * len(args)
-    gives: bool = operation.gives_truth
+    """Return whether an operation yields a truth value. LLVM checks that its arguments have the right types."""
     if op == "select":
-        gives = args[1].truth
-        takes = [True, gives, gives]
-    if any(a.truth is not each for a, each in zip(args, takes, strict=True)):
-        raise TypeError(f"{op} takes other types: truth values for doubles, or the other way round")
-    return gives
+        return args[1].truth
+    operation = OPERATIONS.get(op)
+    return op == "const" and isinstance(args[0], bool) if operation is None else operation.gives_truth
 
 
 class Graph:
