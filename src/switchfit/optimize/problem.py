@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, largest
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, largest, project_on_row
 from switchfit.optimize.qp import LinearConstraints
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
@@ -228,7 +228,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
         return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
     pinned[on_breakpoint] = True
-    return Trial.at(problem, snap_to_rows(problem, moved, pinned))
+    return Trial.at(problem, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
 
 
 def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: float = 16 * EPS) -> FloatArray:
@@ -258,3 +258,22 @@ def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: 
             break
     snapped = np.clip(snapped, constraints.lower, constraints.upper)
     return snapped if constraints.violation(snapped) <= constraints.violation(theta) else theta
+
+
+def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: BoolArray) -> FloatArray:
+    """Remove violations of the rows that are due to rounding, leaving pinned coordinates where they are.
+
+    Projections onto one violated row after the other, an ulp to its inside. What they cannot remove where many rows
+    meet at a vertex is left: it is of the size of rounding too.
+    """
+    repaired = theta.copy()
+    for _ in range(6):
+        for normal, bound in zip(constraints.A, constraints.b, strict=True):
+            inside = np.where(pinned, 0.0, normal)
+            violation, projected = project_on_row(repaired, normal, bound, inside)
+            if violation > 0.0:
+                repaired = projected
+        repaired = np.clip(repaired, constraints.lower, constraints.upper)
+        if constraints.violation(repaired) <= 0.0:
+            break
+    return min(repaired, theta, key=constraints.violation)
