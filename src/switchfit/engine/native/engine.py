@@ -180,12 +180,8 @@ class NativeExperiment:
         self._memory = np.zeros(0)  # the scratch space that the table points to, after the first call
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
-        of_late = "time", "cell", "segment"
-        self._late = [
-            (k, _find_delay(structure, arguments, sensor.delay), *(self._named[f"{name} {k}"] for name in of_late))
-            for k, sensor in enumerate(structure.measurements)
-            if sensor.delay is not None
-        ]
+        delays = {k: sensor.delay for k, sensor in enumerate(structure.measurements) if sensor.delay is not None}
+        self._delays = {k: _find_delay(structure, arguments, name) for k, name in delays.items()}
         self._size_of_states: FloatArray | None = None
         self._judged = -1
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
@@ -309,7 +305,7 @@ class NativeExperiment:
             rows = times[:-1], times[1:], *beside_rows("x", n), none, none
             tangents = Tangents(*beside_rows("Z", n, width), none, none) if derives else None
             simulation = Simulation(self._J.item(0), self.times, first_cell, *rows, tangents=tangents)
-            late = {k: self._named[f"seen {k}"].reshape(-1, 1 + n).copy() for k, *_ in self._late}
+            late = {k: self._named[f"seen {k}"].reshape(-1, 1 + n).copy() for k in self._delays}
             return simulation, of_rows("costate", cells + N if derives else 0, n), late
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
@@ -413,8 +409,7 @@ class NativeExperiment:
             self._divide(self._memory, self._lengths)
             self._table[:] = [self._addresses[name] for name in self._pointers]
         self._find_first_cells(tau, side)
-        if self._late:
-            self._find_late_cells(p)
+        self._find_late_cells(p)
         if multipliers is not None:
             self._multipliers[self._constraint_rows] = multipliers
         try:
@@ -436,19 +431,19 @@ class NativeExperiment:
 
     def _find_first_cells(self, tau: FloatArray, side: float) -> None:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.build_rows`."""
-        if len(tau):
-            nodes = self._inner_nodes
-            # A time on a node is past it on its right side, and not yet on its left.
-            begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
-            if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
-                jumps = list(self.structure.jumps)
-                begins[jumps] = nodes.searchsorted(tau[jumps], "right")
-                begins = np.maximum.accumulate(begins)
-            self._begins[:] = begins
+        nodes = self._inner_nodes
+        # A time on a node is past it on its right side, and not yet on its left.
+        begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
+        if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
+            jumps = list(self.structure.jumps)
+            begins[jumps] = nodes.searchsorted(tau[jumps], "right")
+            begins = np.maximum.accumulate(begins)
+        self._begins[:] = begins
 
     def _find_late_cells(self, p: FloatArray) -> None:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
-        for _, (place, value), times, cell, segment in self._late:
+        for k, (place, value) in self._delays.items():
+            times, cell, segment = (self._named[f"{name} {k}"] for name in ("time", "cell", "segment"))
             seen = times - (value if place is None else p[place])
             # start < t - delay <= end: a state at a node, or at a transition, is that of the row which ends there.
             cell[:] = np.clip(self.times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
@@ -643,13 +638,11 @@ def foreign_derivatives(
         given |= {f"{name} {k}": values for name, values in samples._asdict().items()}
         given |= {f"segment {k}": np.zeros(1, dtype=np.int64), f"seen {k}": np.zeros(1)}  # none is late
     buffers = [given[name] for name in layout.arguments]
-    lengths = layout.sums
     of_memory = sum(fixed + each * (cells + N) for fixed, each in layout.memory.values())
-    results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
+    results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(layout.sums.values()), of_memory)]
     # A batch is a loop: all of its entries use one scratch space, which stays in the CPU caches.
     totals = sequential_vmap(lambda *given: jax.ffi.ffi_call(name, results)(*given)[0])(*buffers)
-    parts = dict(zip(lengths, jnp.split(totals, np.cumsum([*lengths.values()])[:-1].tolist()), strict=True))
-    J, g, H = parts["J"], parts["g"], parts["H"]
+    _, J, g, H, *_ = jnp.split(totals, np.cumsum([*layout.sums.values()])[:-1].tolist())
     cost = J[0] + totals[-1]  # NaN if a finiteness check failed: the finisher of a batch then falls back to JAX
     gradient, hessian = g[own], H.reshape(D, width)[own[:, None], own]
     return cost, jnp.where(there, gradient, 0.0), jnp.where(there[:, None] & there[None], hessian, 0.0)
