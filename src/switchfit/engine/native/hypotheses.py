@@ -11,8 +11,7 @@ to g and its Gauss-Newton matrix to H at once, without a costate. Further pointe
     error       largest estimate of the error of a step so far, relative to the tolerances, which are the entries of
     tolerances  relative; size of a state at which the relative and the absolute error count the same; information of a
                 guard on the time of its transition
-    along       derivative of a guard along theta, a vector, and its information
-    shift       a change of the unknowns, (D,), and moved the sum of all changes so far
+    moved       the sum of all changes of the unknowns so far, (D,)
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization import rows
 from switchfit.discretization.mesh import Arguments
-from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine, times_vector
+from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine
 from switchfit.engine.native import program
 from switchfit.engine.native.arrays import eliminate
 from switchfit.engine.native.engine import count_samples, get_address
@@ -96,8 +95,8 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
     eliminated, and what the straight-line functions exchange.
     """
     n, D, width = sizes.n, sizes.D, sizes.width
-    lengths = {"rows": (D + 1) * width, "reduced": D, "K": n + 1, "along": width}
-    lengths |= {"information": 1, "XZ": STAGES * n * width, "entries": STAGES * (1 + n + sizes.M) ** 2}
+    lengths = {"rows": (D + 1) * width, "reduced": D, "K": n + 1}
+    lengths |= {"XZ": STAGES * n * width, "entries": STAGES * (1 + n + sizes.M) ** 2}
     return lengths | {"increments": STIFF.coupled * n, "newton": 2}
 
 
@@ -167,33 +166,14 @@ class HypothesisKernels(Kernels):
 
         Its sigma is a small time, given by `tolerances`, times the rate ``D_t c + D_x c f`` at which c changes.
         """
-        c, c_t, c_x, c_p = found[:4]
-        # Derivative of c along theta at a tau that moves: Z is that of x(tau-), after `move`.
-        along = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
-        along = as_vector(graph, (along + c_t * graph.load("moves", 0, vector=True)).item())
+        c, c_t, c_x, c_p = (np.ravel(each) for each in found[:4])
         # c changes by rate dtau: an error sigma_t of the time is one of rate sigma_t of c. J gets c^2 / (2 (rate
         # sigma_t)^2), in its own units.
-        rate = (times_vector(c_x, graph.loads("K", self.sizes.n)) + c_t).item()
+        rate = (c_x * graph.loads("K", self.sizes.n)).sum() + c_t.item()
         weight = graph.load("tolerances", 2) / (rate * rate + SMALLEST_RATE)
-        g = graph.load("g", 0, vector=True) + weight * c.item() * along
-        J = graph.load("J", 0) + 0.5 * weight * c.item() * c.item()
-        return [("along", 0, along), ("information", 0, weight), ("g", 0, as_vector(graph, g)), ("J", 0, J)]
-
-    def square(self) -> None:
-        """Write ``H += information along along'``."""
-        graph = Graph()
-        weight, along = graph.load("information", 0), graph.load("along", 0, vector=True)
-        rows = [graph.load("H", d, vector=True) + weight * graph.load("along", d) * along for d in range(self.sizes.D)]
-        self.module.write_straight_line("square", store_all("H", 0, rows))
-
-    def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
-        """Return stores that add a cost of (t, x, p), given with its derivatives, to J, g and H."""
-        cost, *derivatives = found
-        Z = graph.loads("Z", self.sizes.n, vector=True)
-        # `_scalar` leaves g_x to a costate, which hypotheses do not have: it is added by Z.
-        (pointer, offset, g), *rows = self._scalar(graph, derivatives, moving)
-        g = as_vector(graph, g + (derivatives[1] * Z).sum())
-        return [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
+        slopes = np.concatenate([c_t, c_x, c_p])
+        first = np.split(weight * c.item() * slopes, [1, 1 + self.sizes.n])
+        return self._cost(graph, [0.5 * weight * c * c, *first, weight * np.outer(slopes, slopes)], moving)
 
     def shift(self) -> None:
         """Write the change d of the point of linearisation to the minimum of the cost, inside its bounds: ``x += Z d``,
@@ -313,7 +293,7 @@ class HypothesisWriter(Writer):
 
         # Z += f_before dtau: from here to "hold", Z and g are those at the time of the birth, which moves.
         call(Column.BEFORE, library.modes, "slope_{}", "move")
-        call(Column.GUARD, library.guards, "guards_{}", "square")
+        call(Column.GUARD, library.guards, "guards_{}")
         call(Column.TRANSITION_COST, library.transition_costs, "transition_costs_{}")
         call(Column.RESET_MAP, library.reset_maps, "reset_{}")
         # Z -= f_after dtau at the state behind the reset map: back to derivatives at a fixed time. Without a reset map
@@ -505,7 +485,6 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     kernels.shift()
     kernels.move("move", 1.0, costs)
     kernels.move("hold", -1.0, costs)
-    kernels.square()
     kernels.nodes()
     writer = HypothesisWriter(library, sizes, module)
     for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):

@@ -331,8 +331,8 @@ class Kernels:
             factors = factors.load(graph)
         found = rows.adjoint(tableau, h, psi, pull, ell_x, factors)
         # A late sample ends a row of its own, which starts where the row around it does: `late` is its costate there.
-        before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
-        stores = store_all("psi", 0, before)
+        before = found.before + graph.loads("late", n) if self.has_late else found.before
+        stores = store_all("late" if late else "psi", 0, before)
         if not late:
             stores += store_all("costate", 0, before)
         g = graph.load("g", 0, vector=True) + self._along_p(graph, found.parameters)
@@ -492,12 +492,6 @@ class Kernels:
             stores.append(("closes", 0, as_vector(graph, self._along_p(graph, t_p))))
         self.module.write_straight_line(f"late_time_{k}", stores + graph.check())
 
-    def end_of_late(self) -> None:
-        """Write what a late sample adds to the costate at the start of the row that holds it."""
-        graph, n = Graph(), self.sizes.n
-        stores = store_all("late", 0, graph.loads("late", n) + graph.loads("psi", n))
-        self.module.write_straight_line("end_of_late", stores)
-
     def _write_node(
         self, name: str, add: Callable[..., Any], template: Template, moving: bool, *inputs: str, **lengths: int
     ) -> None:
@@ -591,9 +585,12 @@ class Kernels:
 
     def _scalar(self, graph: Graph, derivatives: Sequence[Objects], moving: bool) -> list[Store]:
         """Return stores that add the derivatives of a scalar, g_t, g_x, g_p and the second ones, to g and H."""
-        # g_x is left to the costate: the caller adds it to `jump`, and D_x of it reaches theta by the rows before.
-        g_t, _, g_p, second = derivatives
+        # g_x is left to the costate, if there is one: the caller adds it to `jump`, and D_x of it reaches theta by the
+        # rows before.
+        g_t, g_x, g_p, second = derivatives
         g = graph.load("g", 0, vector=True) + self._along_p(graph, g_p)
+        if not self.adjoint:
+            g = g + (g_x * graph.loads("Z", self.sizes.n, vector=True)).sum()
         if moving:
             g = g + g_t.item() * graph.load("moves", 0, vector=True)
         stores = [("g", 0, as_vector(graph, g))]
@@ -609,7 +606,8 @@ class Kernels:
         stores = [("J", 0, graph.load("J", 0) + cost.item())]
         if self.order == Order.COST:
             return stores
-        stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
+        if self.adjoint:
+            stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
     def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:

@@ -449,7 +449,7 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
         writer.copy(seen, time, 1)
         writer.copy(writer.at(seen, 1), given["x_after"], writer.sizes.n)
         # A late sample is forward and backward at once, as nothing follows it: psi = D_x l at its end, and what is left
-        # at its start waits in `late` for the backward step of the row around it.
+        # at its start is added to `late`, where it waits for the backward step of the row around it.
         at_end = {"x": given["x_after"], "Z": given["Z_after"], "J": found["J"], "time": time, "moves": given["closes"]}
         writer.zero(given["psi"], writer.sizes.n)
         writer.call(f"sample_{k}", given | at_end)
@@ -457,7 +457,6 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
             for m in writer.cases(mode, len(writer.library.modes)):
                 writer.call(f"backward_late_{m}", given)
                 add_curvature(writer, curvatures[m]["late"], given, moving=True)
-            writer.call("end_of_late", given)
     return writer.end()
 
 
@@ -801,8 +800,6 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
     # The same for all modes: written once.
     if order == Order.HESSIAN and mode == 0:
         kernels.length()
-    if order > Order.COST and late and mode == 0:
-        kernels.end_of_late()
     if order > Order.COST:
         kernels.judge_row(mode, stage, tableau)
     else:
