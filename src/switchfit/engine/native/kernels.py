@@ -678,7 +678,7 @@ def as_vector(graph: Graph, value: Any) -> Node:
     """Return a vector node, also if the value turned out to be a scalar zero."""
     if isinstance(value, Node) and value.vector:
         return value
-    return graph.zeros()
+    return graph.unit(-1)
 
 
 def store_all(pointer: str, offset: int, values: Any) -> list[Store]:

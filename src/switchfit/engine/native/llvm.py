@@ -505,8 +505,6 @@ class _Writer(Lines):
         if op == "unit":
             entries = (f"double {literal(float(k == args[0]))}" for k in range(self.module.width))
             return Value(self, kind, "<" + ", ".join(entries) + ">")
-        if op == "zeros":
-            return Value(self, kind, "zeroinitializer")
         if op == "table":
             return self._table(node.values)
         if op == "lookup":

@@ -289,12 +289,8 @@ class Graph:
         self.presume(self.apply("div", 1.0, self.apply("select", condition, 1.0, 0.0)))
 
     def unit(self, position: int) -> Node:
-        """Return the unit vector e_position."""
+        """Return the unit vector e_position, the vector of zeros for a position of none of the unknowns."""
         return self._node("unit", (position,), True)
-
-    def zeros(self) -> Node:
-        """Return the vector of zeros."""
-        return self._node("zeros", (), True)
 
     def apply(self, op: str, *given: Any) -> Node:
         """Return the node of an operation, which may be an existing or a simpler one."""
@@ -325,7 +321,7 @@ class Graph:
             if each.index in self._uncertain:
                 self.presumed[each.index] = each
                 continue
-            if each.index in self._finite or each.op in ("const", "load", "unit", "zeros") or each.truth:
+            if each.index in self._finite or each.op in ("const", "load", "unit") or each.truth:
                 continue
             self._finite.add(each.index)
             if each.op == "lookup":  # at an index, which is finite
@@ -438,17 +434,12 @@ def list_needed(outputs: Sequence[Node]) -> list[Node]:
     """Return all nodes that some outputs depend on, in order."""
     if not outputs:
         return []
-    graph = outputs[0].graph
-    wanted = np.zeros(len(graph.nodes), bool)
-    for node in outputs:
-        wanted[node.index] = True
+    nodes, wanted = outputs[0].graph.nodes, {node.index for node in outputs}
     # Arguments have lower indices: one pass backward finds all.
-    for node in reversed(graph.nodes):
-        if wanted[node.index]:
-            for a in node.args:
-                if isinstance(a, Node):
-                    wanted[a.index] = True
-    return [graph.nodes[k] for k in np.flatnonzero(wanted)]
+    for node in reversed(nodes):
+        if node.index in wanted:
+            wanted.update([a.index for a in node.args if isinstance(a, Node)])
+    return [nodes[k] for k in sorted(wanted)]
 
 
 class Template:
