@@ -24,7 +24,7 @@ from switchfit.discretization.mesh import Arguments, Mesh, Samples, build_rows
 from switchfit.discretization.model import AT_TRANSITIONS, read_parameters
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.llvm import Program
-from switchfit.engine.native.program import PREFIX, layout_of, program_of, second_order
+from switchfit.engine.native.program import layout_of, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.protocol import (
@@ -141,8 +141,8 @@ class NativeExperiment:
         self, program: Program, structure: Structure, arguments: Arguments, times: FloatArray, order: Order
     ) -> None:
         self.sizes = sizes = Sizes.of(structure, arguments)
-        self.order, self.times, self.row_work = order, times, program.row_work
-        self._program, self._prefix = program, PREFIX[order]
+        self.order, self.times, self.row_work = order, times, [*program.modules.values()][-1].row_work
+        self._program, self._module = program, program.modules[order]
         N, cells = sizes.N, len(times) - 1
         self._inner_nodes, self._cells = times[1:-1], cells
         self._channels = sum(channels for _, channels in structure.outputs)
@@ -382,7 +382,7 @@ class NativeExperiment:
 
     def _find(self, name: str, count: int) -> Any:
         """Return a function of the driver with a number of arguments: integers and addresses."""
-        return self._program.function(f"{self._prefix}{name}", *[ctypes.c_int64] * count)
+        return self._program.function(f"{self._module.prefix}{name}", *[ctypes.c_int64] * count)
 
     def _call(self, name: str, given: Mapping[str, FloatArray], p: FloatArray, count: int = 1) -> FloatArray:
         """Call a straight-line function at `count` points, with an array for each pointer that is not an argument.
@@ -392,7 +392,7 @@ class NativeExperiment:
         self._own_p[:] = p
         checks, arguments = np.zeros(count), [count]
         arrays = {CHECKED: checks, **given}
-        for key in self._program.pointers[f"{self._prefix}{name}"]:
+        for key in self._module.pointers[name]:
             array = arrays.get(key)
             arguments += (self._addresses[key], 0) if array is None else (get_address(array), array.strides[0])
         self._find(f"each_{name}", len(arguments))(*arguments)

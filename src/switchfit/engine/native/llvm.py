@@ -412,7 +412,7 @@ class Module:
         self.vector = f"<{width} x double>"
         self._functions: list[str] = []
         self._declared: dict[str, str] = {}
-        self._written: dict[str, str] = {}
+        self._written: list[str] = []
         self.work: dict[str, int] = {}
         self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
@@ -448,12 +448,11 @@ class Module:
 
         Its functions may call those taken before: `compile_modules` compiles one part while the next is written.
         """
-        written, self._functions = "\n".join(self._functions), []
-        declared, self._declared = self._declared, {}
-        called = {name: self._written[name] for name in _CALLED.findall(written) if name in self._written}
+        written, declared = "\n".join(self._functions), [*self._declared.values(), *self._written]
+        self._functions, self._declared = [], {}
         # A later module needs the declarations of those that it calls in earlier ones.
-        self._written |= {name: f"declare {header}" for header, name in _HEADER.findall(written)}
-        return "\n".join([*declared.values(), *called.values(), written])
+        self._written += [f"declare {header}" for header in _HEADER.findall(written)]
+        return "\n".join([*declared, written])
 
 
 def _estimate_cost(node: Node) -> int:
@@ -467,8 +466,7 @@ def _estimate_cost(node: Node) -> int:
     return LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
 
 
-_CALLED = re.compile(r"call \w+ @([\w.]+)\(")
-_HEADER = re.compile(r"^define (\w+ @([\w.]+)\(.*\))", re.MULTILINE)
+_HEADER = re.compile(r"^define (\w+ @[\w.]+\(.*\))", re.MULTILINE)
 
 
 class _Writer(Lines):
@@ -581,17 +579,14 @@ class Program:
     lock : held during a call, since ctypes releases the GIL
     memory : array of doubles
         Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.
-    row_work : list of int
-        That of the module with the highest derivatives.
-    pointers : dict
-        Names of the pointers that each straight-line function takes.
+    modules : dict of order to Module
+        Of whose text it is made; that with the highest derivatives is the last.
     """
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
         self.lock, self.memory = threading.Lock(), np.zeros(0)
-        self.row_work: list[int] = []
-        self.pointers: dict[str, tuple[str, ...]] = {}
+        self.modules: dict[Any, Module] = {}
         self._functions: dict[str, Any] = {}
 
     def reserve(self, size: int) -> None:

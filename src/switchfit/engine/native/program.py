@@ -718,12 +718,12 @@ def compile_library(library: Structure, sizes: Sizes, orders: tuple[Order, ...],
 
 @lru_cache(maxsize=64)
 def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write) -> Program | str:
-    modules = [Module(sizes.width, PREFIX[order]) for order in orders]
+    modules = {order: Module(sizes.width, PREFIX[order]) for order in orders}
     try:
         if sizes.D == 0:
             raise Unsupported("an experiment has no unknowns")
         with use_float64():
-            parts = (write(library, sizes, order, each) for order, each in zip(orders, modules, strict=True))
+            parts = (write(library, sizes, order, each) for order, each in modules.items())
             program = compile_modules(chain.from_iterable(parts))
     except Unsupported as error:
         reason = str(error)
@@ -732,8 +732,7 @@ def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...], wri
         reason = f"internal: {type(error).__name__}: {error}"
         log.info("No machine code: %s.", reason, exc_info=True)
     else:
-        program.row_work = modules[-1].row_work
-        program.pointers = {f"{each.prefix}{name}": given for each in modules for name, given in each.pointers.items()}
+        program.modules = modules
         return program
     return reason
 
