@@ -509,8 +509,8 @@ class ReferenceSignal:
             or more. The spline is broken at a time that is given twice, as at the transitions of a simulated
             trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
-            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation. Tables
-            of pandas, polars and xarray, and a `Log`, bring their names and units.
+            NaN marks a missing value, which is bridged by the interpolation. Tables of pandas, polars and xarray, and a
+            `Log`, bring their names and units.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
             Cut-off, in cycles per time unit of the experiment (Hz only if that is s), of a second-order Butterworth
@@ -573,8 +573,8 @@ class Measurements:
         ISO 8601, datetime, datetime64, columns of pandas, polars or xarray, `Log.dates`, or what `from_epoch` returns.
         They may be irregular.
     values : (K,) or (K, q) array_like
-        Samples; NaN marks a missing one, as does the mask of a masked array. Tables of pandas, polars and xarray, and
-        a `Log`, bring their names and units. For an `OnlineEstimator` there may be none yet: ``np.empty((0, q))``.
+        Samples; NaN marks a missing one. Tables of pandas, polars and xarray, and a `Log`, bring their names and units.
+        For an `OnlineEstimator` there may be none yet: ``np.empty((0, q))``.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         If left out, the whole state is measured. At a transition with a reset map, the sample is of the state
         just before the jump.
@@ -766,13 +766,13 @@ def _check_samples(
 ) -> tuple[Any, FloatArray]:
     """Return times (K,) and values (K,) or (K, q) as float64, checked against each other; dates remain dates.
 
-    With `breaks`, a time may occur twice; with `missing`, values may be NaN, and masked ones become NaN; without
+    With `breaks`, a time may occur twice; with `missing`, values may be NaN; without
     `columns`, the shape of the values must be (K,).
     """
     dates = read_dates(times, f"{what} times")
     form = "an array of numbers"
     times = as_array(times, f"{what} times", form=form, finite=True) if dates is None else _count_seconds(dates)
-    values = as_array(values, f"{what} values", form=form, missing=missing, finite=not missing)
+    values = as_array(values, f"{what} values", form=form, finite=not missing)
     if values.ndim not in ((1, 2) if columns else (1,)) or times.shape != values.shape[:1]:
         raise ValueError(
             f"{what} needs times of shape (K,) and values of shape (K,){' or (K, q)' if columns else ''}; "
