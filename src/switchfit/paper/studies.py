@@ -15,7 +15,6 @@ import numpy as np
 
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.fit.evaluator import evaluate
-from switchfit.fit.result import inverse_on
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, PAGE, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, tidy
 from switchfit.problem.data import FloatArray
@@ -28,8 +27,6 @@ LEVELS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 QUICK_LEVELS = (0.0, 0.1, 0.25, 0.5)
 NOISE_RUNS, QUICK_NOISE_RUNS = 500, 50
 PERCENTILES = (5, 25, 50, 75, 95)
-#: Two-sided 95 % point of the normal distribution.
-NORMAL = 1.959963984540054
 TIMES = np.arange(HORIZON + 1)
 #: Standard deviation of positions (m) of which a sample or another may tell mu, and the longest horizon (s) of these.
 SIGMA, LONGEST = 0.1, 30.0
@@ -61,14 +58,14 @@ def compute_noise(quick: bool, say: Say) -> Found:
                 seed=level,
             )
             noise_free = np.array(rows[0]["median"] if rows else TRUTH)
-            rows.append(_level(vehicle.complete(study), sigma, noise_free))
+            rows.append(_level(vehicle.complete(study), noise_free))
         found["ways"][method] = rows
     found["samples"] = _sample_sets()
     return found
 
 
-def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
-    """Return percentiles of the estimates, errors and coverage at one level of noise."""
+def _level(study: MonteCarlo, noise_free: FloatArray) -> Found:
+    """Return percentiles of the estimates and errors at one level of noise."""
     theta = study.theta[study.success]
     normalised = study.errors / TRUTH
     return {
@@ -78,23 +75,7 @@ def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
         "mean_size": np.mean(np.abs(normalised), axis=0).tolist(),
         "rms": np.sqrt(np.mean(normalised**2, axis=0)).tolist(),
         "rms_from_noise_free": np.sqrt(np.mean(((theta - noise_free) / TRUTH) ** 2, axis=0)).tolist(),
-        "coverage": _coverage(study, sigma).tolist() if sigma > 0 else [None] * 3,
     }
-
-
-def _coverage(study: MonteCarlo, sigma: float) -> FloatArray:
-    """Return the part of the 95 % intervals that contain the truth: (3,).
-
-    A reference signal has no noise model. A plausible one treats the integral as a sum over samples one second apart:
-    J / sigma² times 1/s is then a negative log-likelihood, and the covariance is sigma² (1 s) H⁻¹.
-    """
-    if study.sigma_known is not None:
-        return study.coverage()
-    inside = []
-    for theta, hessian in zip(study.theta[study.success], study.hessian[study.success], strict=True):
-        errors = sigma * np.sqrt(np.diag(inverse_on(np.eye(3), hessian)))
-        inside.append(np.abs(theta - TRUTH) <= NORMAL * errors)
-    return np.mean(inside, axis=0)
 
 
 def _sample_sets() -> list[Found]:
@@ -116,39 +97,27 @@ def _sample_sets() -> list[Found]:
 
 
 def draw_noise(found: Found) -> dict[str, Figure]:
-    """Draw figure 5, with the standard deviation on a second axis, and the coverage below."""
-    figure = vehicle.new_figure(PAGE, 4.6)
-    axes = figure.subplots(2, 3, sharex=True, height_ratios=(1.6, 1.0))
+    """Draw figure 5, with the standard deviation on a second axis."""
+    figure = vehicle.new_figure(PAGE, 3.0)
     variance = np.array(found["sigma"]) ** 2
     line: dict[str, Any] = {"markersize": 3, "linewidth": 1}
     looks = {
         FILTERED: {**line, "color": DARK, "linestyle": "--", "marker": "s"},
         DIRECT: {**line, "color": BLUE, "linestyle": "-", "marker": "o"},
     }
-    for k, name in enumerate(NAMES):
-        errors, coverage = axes[:, k]
+    for k, (ax, name) in enumerate(zip(figure.subplots(1, 3), NAMES, strict=True)):
         for method, levels in found["ways"].items():
-            look = looks[method]
+            look, colour = looks[method], looks[method]["color"]
             bands = 100 * np.array([level["percentiles"][k] for level in levels]).T
-            if method == DIRECT:
-                shade: dict[str, Any] = {"color": look["color"], "alpha": 0.3, "linewidth": 0}
-                errors.fill_between(variance, bands[0], bands[4], label=f"5 to 95 %, {method}", **shade)
-            else:
-                errors.plot(variance, bands[0], ":", color=look["color"], linewidth=1.2, label=f"5 and 95 %, {method}")
-                errors.plot(variance, bands[4], ":", color=look["color"], linewidth=1.2)
-            errors.plot(variance, bands[2], **look, label=f"median, {method}")
-            inside = [100 * level["coverage"][k] for level in levels[1:]]
-            coverage.plot(variance[1:], inside, **look)
-        errors.axhline(0.0, color=RED, linewidth=0.8)
-        coverage.axhline(95.0, color=RED, linewidth=0.8)
-        coverage.set_ylim(60, 101)
-        tidy(errors, "", f"normalised error of {SYMBOLS[name]} (%)", letter=f"({'abc'[k]})")
-        tidy(coverage, "noise variance (m²)", f"coverage, {SYMBOLS[name]} (%)")
-        above = errors.secondary_xaxis("top", functions=(lambda v: np.sqrt(np.maximum(v, 0.0)), np.square))
+            ax.fill_between(variance, bands[0], bands[4], color=colour, alpha=0.2, label=f"5 to 95 %, {method}")
+            ax.plot(variance, bands[2], **look, label=f"median, {method}")
+        ax.axhline(0.0, color=RED, linewidth=0.8)
+        tidy(ax, "noise variance (m²)", f"normalised error of {SYMBOLS[name]} (%)", letter=f"({'abc'[k]})")
+        above = ax.secondary_xaxis("top", functions=(lambda v: np.sqrt(np.maximum(v, 0.0)), np.square))
         above.set_ticks([0.1, 0.2, 0.3, 0.4, 0.5])
         above.tick_params(labelsize=7)
         above.set_xlabel("standard deviation (m)", fontsize=8)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
+    handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=7)
     return {"fig5-noise": figure}
 
@@ -164,9 +133,6 @@ NOISE_LINES = """
 * at variance {variance:g} m² with the samples fitted directly (%) | not done | {direct_last_size}
 | {direct_last[converged]} of {runs} converged; rms error of the filtered fit is {ratio} times as large
 * Fig. 5: rms normalised error from the noise-free estimate (%) | not printed | {from_noise_free} | from the truth {rms}
-* coverage of 95 % intervals, filtered (%) | not done | {coverage}
-| tau_1, tau_2, mu at sigma = {levels} m; covariance sigma² (1 s) H⁻¹
-* coverage of 95 % intervals, direct (%) | not done | {direct_coverage} | tau_1, tau_2, mu at the same levels
 """
 
 SAMPLES_LINE = """
@@ -178,7 +144,6 @@ SAMPLES_LINE = """
 def list_noise(found: Found) -> list[Row]:
     """Return the lines of the table."""
     sigma, values = found["sigma"], {"runs": found["runs"], "variance": found["sigma"][-1] ** 2}
-    shown = [1, len(sigma) // 2, -1]  # the first level with noise, the middle one and the last
     for prefix, method, digits in (("", FILTERED, "+.4f"), ("direct_", DIRECT, ".0e")):
         levels = found["ways"][method]
         quarter, last = levels[sigma.index(0.25)], levels[-1]
@@ -187,7 +152,6 @@ def list_noise(found: Found) -> list[Row]:
             f"{prefix}last": last,
             f"{prefix}last_size": _list(np.multiply(100, last["mean_size"]), ".2f"),
             f"{prefix}quarter_size": _list(np.multiply(100, quarter["mean_size"]), ".2f"),
-            f"{prefix}coverage": "; ".join(_list(np.multiply(100, levels[k]["coverage"]), ".0f") for k in shown),
         }
     filtered, direct = values["last"], values["direct_last"]
     rows = vehicle.fill_rows(
@@ -196,7 +160,6 @@ def list_noise(found: Found) -> list[Row]:
         ratio=_list(np.divide(filtered["rms"], direct["rms"]), ".2f"),
         from_noise_free=_list(np.multiply(100, filtered["rms_from_noise_free"]), ".2f"),
         rms=_list(np.multiply(100, filtered["rms"]), ".2f"),
-        levels=_list([sigma[k] for k in shown], "g"),
         **values,
     )
     return rows + [row for line in found["samples"] for row in vehicle.fill_rows(SAMPLES_LINE, sigma=SIGMA, **line)]
