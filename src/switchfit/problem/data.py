@@ -230,9 +230,6 @@ class PiecewisePolynomial:
     knots: FloatArray
     coefficients: FloatArray
 
-    def __repr__(self) -> str:
-        return format_line(self, f"{len(self.knots)} knots", f"{self.channels} channels")
-
     def __post_init__(self) -> None:
         if not np.isfinite(self.coefficients).all():
             raise ValueError(OVERFLOW)

@@ -279,7 +279,7 @@ class Problem:
 
         See Also
         --------
-        Problem.without_runs
+        HybridSystem, Experiment
 
         Examples
         --------
@@ -612,47 +612,6 @@ class Problem:
         times = np.broadcast_to(self.experiments[e].initial_times, (*theta.shape[:-1], len(where))).copy()
         times[..., where >= 0] = theta[..., where[where >= 0]]
         return times
-
-    def without_runs(self, *names: str) -> Problem:
-        """Return the problem without some of its experiments, and without the parameters that these alone use.
-
-        Parameters
-        ----------
-        *names : str
-            Names of experiments; run1, run2, ... where they have none.
-
-        Raises
-        ------
-        ValueError
-            If there is no such experiment, or none would be left.
-
-        See Also
-        --------
-        Experiment
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> two = sf.Problem(problem.system, problem.experiments * 2, problem.parameters)
-        >>> two.theta_names, two.without_runs("run2").theta_names
-        (('run1.tau_1', 'run2.tau_1', 'k'), ('tau_1', 'k'))
-        """
-        known = self.run_names
-        for name in names:
-            if name not in known:
-                raise ValueError(f"there is no experiment {shorten(name)}; there are {join_names(known)}.")
-        kept = [e for e, name in enumerate(known) if name not in names]
-        if not kept:
-            raise ValueError("without these experiments none is left.")
-        used: list[set[str]] = []
-        for experiment, structure in zip(self.experiments, self.structures, strict=True):
-            used.append({experiment.parameter_map.get(name, name) for name, _, _ in structure.parameters})
-        lost = set().union(*used) - set().union(*(used[e] for e in kept))
-        parameters = {name: parameter for name, parameter in self.parameters.items() if name not in lost}
-        return replace(self, experiments=[self.experiments[e] for e in kept], parameters=parameters)
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
         """Return all transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones
