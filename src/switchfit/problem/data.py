@@ -317,6 +317,18 @@ def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePo
     return fit_spline(grid, filtered)
 
 
+def _interpolate(given: Any, values: FloatArray, lowpass_hz: float | None) -> PiecewisePolynomial:
+    """Return the signal of samples (K,) and (K, q), broken at times that are given twice, and filtered if asked for."""
+    # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
+    times = _count_seconds(given) if isinstance(given, Dates) else given
+    cuts = np.flatnonzero(np.diff(times) == 0) + 1
+    pieces = zip(np.split(times, cuts), np.split(values, cuts), strict=True)
+    parts = [fit_bridged_spline(part_times, part) for part_times, part in pieces]
+    knots = np.concatenate([part.knots[:-1] for part in parts] + [times[-1:]])
+    signal = PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
+    return signal if lowpass_hz is None or isinstance(given, Dates) else filter_lowpass(signal, lowpass_hz)
+
+
 @dataclass(frozen=True, eq=False)
 class Input:
     """A known input ``u(t)``, given by samples; the modes are then functions ``f(t, x, p, u)``.
@@ -438,8 +450,8 @@ class ReferenceSignal:
 
     Parameters
     ----------
-    signal : PiecewisePolynomial
-        y_m, with q channels.
+    signal : PiecewisePolynomial or None
+        y_m, with q channels; None: that of the samples.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         If left out, the whole state is compared.
     weights : (q,) or (q, q) array_like, optional
@@ -468,7 +480,7 @@ class ReferenceSignal:
     1
     """
 
-    signal: PiecewisePolynomial
+    signal: Any
     observe: Observe | None = None
     weights: Any = None
     names: Sequence[str] | None = None
@@ -480,6 +492,8 @@ class ReferenceSignal:
         return format_line(self, join_first(self.names or ()), format_count(self.signal.channels, "channel"))
 
     def __post_init__(self) -> None:
+        if self.signal is None and self.samples is not None:
+            set_fields(self, signal=_interpolate(*self.samples, self.lowpass_hz))
         form = "made by sf.ReferenceSignal.from_samples(times, values, ...)"
         as_instance(self.signal, "signal of a ReferenceSignal", PiecewisePolynomial, form)
         _check_channels(self, self.signal.channels, None, None)
@@ -539,20 +553,9 @@ class ReferenceSignal:
         """
         found = find_labels(values)
         given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
-        table = values.reshape(len(given), -1)
-        # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
-        times = _count_seconds(given) if isinstance(given, Dates) else given
-        cuts = np.flatnonzero(np.diff(times) == 0) + 1
-        pieces = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
-        parts = [fit_bridged_spline(part_times, part) for part_times, part in pieces]
-        knots = np.concatenate([part.knots[:-1] for part in parts] + [times[-1:]])
-        signal = PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
-        if lowpass_hz is not None:
-            lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
-            if given is times:
-                signal = filter_lowpass(signal, lowpass_hz)
+        cutoff = None if lowpass_hz is None else as_positive(lowpass_hz, "lowpass_hz")
         names, units = (found[0] if names is None else names), (found[1] if units is None else units)
-        return cls(signal, observe, weights, names, (given, table), lowpass_hz, units)
+        return cls(None, observe, weights, names, (given, values.reshape(len(given), -1)), cutoff, units)
 
 
 @dataclass(frozen=True, eq=False)
@@ -732,23 +735,8 @@ def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any
     if not has_dates(item):
         return item
     what = what or f"times of {type(item).__name__}"
-    if isinstance(item, ReferenceSignal) and item.samples is not None:
-        return replace_samples(item, origin.to_numbers(item.samples[0], time_unit, what), item.samples[1])
     own = {each.name: count_from(getattr(item, each.name), origin, time_unit, what) for each in fields(item)}
-    return replace(item, **own)
-
-
-def replace_samples(item: ReferenceSignal, times: FloatArray, values: FloatArray) -> ReferenceSignal:
-    """Return a reference signal that is made again from other samples.
-
-    Parameters
-    ----------
-    item : ReferenceSignal
-    times : (K,)
-    values : (K, q)
-    """
-    own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
-    return ReferenceSignal.from_samples(times, values, **own)
+    return replace(item, **own | ({"signal": None} if isinstance(item, ReferenceSignal) else {}))
 
 
 def _check_samples(
