@@ -128,15 +128,6 @@ def two_cubics(times):
     return np.stack([CUBIC(times), OTHER(times)], axis=1)
 
 
-def test_missing_values_are_bridged_by_their_own_channel():
-    """Gaps at different times, inside and at both ends; a cubic comes back whole."""
-    values = two_cubics(IRREGULAR)
-    values[[0, 3, 4], 0] = np.nan
-    values[[2, 4, 8], 1] = np.nan
-    signal = sf.ReferenceSignal.from_samples(IRREGULAR, values).signal
-    np.testing.assert_allclose(signal(DENSE), two_cubics(DENSE), rtol=0, atol=1e-12)
-
-
 def test_a_time_given_twice_breaks_the_signal():
     """A cubic up to t = 0.9 and another one from there, with neither of them bent near the break."""
     before, after = IRREGULAR[:5], IRREGULAR[4:]

@@ -314,7 +314,7 @@ def test_what_is_wrong_is_said(make, arguments, message):
     [
         (skid_steer(forces_from_input=True), 3, r"must have 4 channels, F1, F2, F3, F4 \(N\); it has 3"),
         (bicycle(), 1, r"must have 2 channels, delta \(rad\), F_x \(N\); it has 1"),
-        (lugre(), 2, r"must have one channel, force or position; it has 2"),
+        (lugre(), 2, r"must have 1 channels, force or position; it has 2"),
     ],
 )
 def test_an_input_with_other_channels_is_refused(system, channels, message):

@@ -1,7 +1,7 @@
 """Many fits: against the noise of the data, and from starts anywhere.
 
-Figure 5: error of the estimates against the noise of 1 Hz positions, filtered as in the paper or fitted directly; and
-which of the samples tell mu.
+Figure 5: error of the estimates against the noise of 1 Hz positions, filtered as in the paper; and which of the
+samples tell mu.
 
 Estimates from starts anywhere within the bounds, which according to the paper would generally agree.
 """
@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.batch.simulated import MonteCarlo, monte_carlo
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, PAGE, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, tidy
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.choice import estimate, was_interrupted
 
@@ -30,44 +29,28 @@ PERCENTILES = (5, 25, 50, 75, 95)
 TIMES = np.arange(HORIZON + 1)
 #: Standard deviation of positions (m) of which a sample or another may tell mu, and the longest horizon (s) of these.
 SIGMA, LONGEST = 0.1, 30.0
-FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
-
-
-def build_problem(method: str, sigma: float) -> Problem:
-    """Return the problem of one of the methods to fit the same samples; a reference signal has no sigma."""
-    path = vehicle.simulate_drive(step=1.0)
-    if method == FILTERED:
-        return vehicle.stick_slip(vehicle.gps_reference(TIMES, vehicle.positions_at(path, TIMES)))
-    return vehicle.fit_positions(path, TIMES, vehicle.START, sigma or 1.0, HORIZON)
 
 
 def compute_noise(quick: bool, say: Say) -> Found:
-    """Run a Monte Carlo study at every level of noise, with both methods, from the paper's start."""
+    """Run a Monte Carlo study at every level of noise, from the paper's start."""
     levels, runs = (QUICK_LEVELS, QUICK_NOISE_RUNS) if quick else (LEVELS, NOISE_RUNS)
-    found: Found = {"sigma": list(levels), "runs": runs, "ways": {}}
-    for method in (FILTERED, DIRECT):
-        rows: list[Found] = []
-        for level, sigma in enumerate(levels):
-            say(f"{method}: sigma {sigma:g} m")
-            study = monte_carlo(
-                build_problem(method, sigma),
-                1 if sigma == 0 else runs,
-                theta=TRUTH,
-                start=vehicle.START,
-                noise=sigma,
-                seed=level,
-            )
-            noise_free = np.array(rows[0]["median"] if rows else TRUTH)
-            rows.append(_level(vehicle.complete(study), noise_free))
-        found["ways"][method] = rows
-    found["samples"] = _sample_sets()
-    return found
+    exact = vehicle.positions_at(vehicle.simulate_drive(step=1.0), TIMES)
+    rows: list[Found] = []
+    for level, sigma in enumerate(levels):
+        say(f"sigma {sigma:g} m")
+        rng, theta = np.random.default_rng(level), []
+        for _ in range(runs if sigma else 1):
+            noisy = exact + sigma * rng.standard_normal(exact.shape)
+            fit = vehicle.complete(fit_locally(vehicle.stick_slip(vehicle.gps_reference(TIMES, noisy))))
+            if fit.status.successful:
+                theta.append(fit.theta)
+        rows.append(_level(np.array(theta), np.array(rows[0]["median"] if rows else TRUTH)))
+    return {"sigma": list(levels), "runs": runs, "levels": rows, "samples": _sample_sets()}
 
 
-def _level(study: MonteCarlo, noise_free: FloatArray) -> Found:
-    """Return percentiles of the estimates and errors at one level of noise."""
-    theta = study.theta[study.success]
-    normalised = study.errors / TRUTH
+def _level(theta: FloatArray, noise_free: FloatArray) -> Found:
+    """Return percentiles of the errors of estimates (R, 3) at one level of noise."""
+    normalised = theta / TRUTH - 1
     return {
         "converged": len(theta),
         "median": np.median(theta, axis=0).tolist(),
@@ -100,17 +83,11 @@ def draw_noise(found: Found) -> dict[str, Figure]:
     """Draw figure 5, with the standard deviation on a second axis."""
     figure = vehicle.new_figure(PAGE, 3.0)
     variance = np.array(found["sigma"]) ** 2
-    line: dict[str, Any] = {"markersize": 3, "linewidth": 1}
-    looks = {
-        FILTERED: {**line, "color": DARK, "linestyle": "--", "marker": "s"},
-        DIRECT: {**line, "color": BLUE, "linestyle": "-", "marker": "o"},
-    }
     for k, (ax, name) in enumerate(zip(figure.subplots(1, 3), NAMES, strict=True)):
-        for method, levels in found["ways"].items():
-            look, colour = looks[method], looks[method]["color"]
-            bands = 100 * np.array([level["percentiles"][k] for level in levels]).T
-            ax.fill_between(variance, bands[0], bands[4], color=colour, alpha=0.2, label=f"5 to 95 %, {method}")
-            ax.plot(variance, bands[2], **look, label=f"median, {method}")
+        bands = 100 * np.array([level["percentiles"][k] for level in found["levels"]]).T
+        for low, high, label in ((0, 4, "5 to 95 %"), (1, 3, "25 to 75 %")):
+            ax.fill_between(variance, bands[low], bands[high], color=BLUE, alpha=0.3, linewidth=0, label=label)
+        ax.plot(variance, bands[2], "-o", color=DARK, markersize=3, linewidth=1, label="median")
         ax.axhline(0.0, color=RED, linewidth=0.8)
         tidy(ax, "noise variance (m²)", f"normalised error of {SYMBOLS[name]} (%)", letter=f"({'abc'[k]})")
         above = ax.secondary_xaxis("top", functions=(lambda v: np.sqrt(np.maximum(v, 0.0)), np.square))
@@ -118,20 +95,17 @@ def draw_noise(found: Found) -> dict[str, Figure]:
         above.tick_params(labelsize=7)
         above.set_xlabel("standard deviation (m)", fontsize=8)
     handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=7)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
     return {"fig5-noise": figure}
 
 
 NOISE_LINES = """
 * Fig. 5: error without noise | zero | bias of {bias} (tau_1 s, tau_2 s, mu)
-| from interpolating 1 Hz positions and filtering them at {lowpass:g} Hz; the samples fitted directly give {direct_bias}
+| from interpolating 1 Hz positions and filtering them at {lowpass:g} Hz
 * Fig. 5: mean normalised error at variance {variance:g} m² (%), from the truth
 | degrades gracefully; mu is the most sensitive | tau_1, tau_2, mu: {last_size}
 | {runs} runs a level, {last[converged]} converged
 * Fig. 5: the same at standard deviation 0.25 m, the other reading of the paper's unit (%) | | {quarter_size}
-| samples fitted directly: {direct_quarter_size}
-* at variance {variance:g} m² with the samples fitted directly (%) | not done | {direct_last_size}
-| {direct_last[converged]} of {runs} converged; rms error of the filtered fit is {ratio} times as large
 * Fig. 5: rms normalised error from the noise-free estimate (%) | not printed | {from_noise_free} | from the truth {rms}
 """
 
@@ -143,24 +117,19 @@ SAMPLES_LINE = """
 
 def list_noise(found: Found) -> list[Row]:
     """Return the lines of the table."""
-    sigma, values = found["sigma"], {"runs": found["runs"], "variance": found["sigma"][-1] ** 2}
-    for prefix, method, digits in (("", FILTERED, "+.4f"), ("direct_", DIRECT, ".0e")):
-        levels = found["ways"][method]
-        quarter, last = levels[sigma.index(0.25)], levels[-1]
-        values |= {
-            f"{prefix}bias": _list(np.subtract(levels[0]["median"], TRUTH), digits),
-            f"{prefix}last": last,
-            f"{prefix}last_size": _list(np.multiply(100, last["mean_size"]), ".2f"),
-            f"{prefix}quarter_size": _list(np.multiply(100, quarter["mean_size"]), ".2f"),
-        }
-    filtered, direct = values["last"], values["direct_last"]
+    sigma, levels = found["sigma"], found["levels"]
+    quarter, last = levels[sigma.index(0.25)], levels[-1]
     rows = vehicle.fill_rows(
         NOISE_LINES,
+        runs=found["runs"],
+        variance=sigma[-1] ** 2,
         lowpass=vehicle.LOWPASS_HZ,
-        ratio=_list(np.divide(filtered["rms"], direct["rms"]), ".2f"),
-        from_noise_free=_list(np.multiply(100, filtered["rms_from_noise_free"]), ".2f"),
-        rms=_list(np.multiply(100, filtered["rms"]), ".2f"),
-        **values,
+        last=last,
+        bias=_list(np.subtract(levels[0]["median"], TRUTH), "+.4f"),
+        last_size=_list(np.multiply(100, last["mean_size"]), ".2f"),
+        quarter_size=_list(np.multiply(100, quarter["mean_size"]), ".2f"),
+        from_noise_free=_list(np.multiply(100, last["rms_from_noise_free"]), ".2f"),
+        rms=_list(np.multiply(100, last["rms"]), ".2f"),
     )
     return rows + [row for line in found["samples"] for row in vehicle.fill_rows(SAMPLES_LINE, sigma=SIGMA, **line)]
 

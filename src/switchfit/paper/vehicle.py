@@ -201,40 +201,32 @@ def gps_reference(times: FloatArray, positions: FloatArray) -> ReferenceSignal:
     return ReferenceSignal.from_samples(times, positions, observe=position, lowpass_hz=LOWPASS_HZ, names=("X", "Y"))
 
 
-def complete(study: Any) -> Any:
-    """Return the study itself; raise KeyboardInterrupt if it was stopped before its end."""
-    if len(study) < study.requested:
+def complete(fit: Estimate) -> Estimate:
+    """Return the fit itself; raise KeyboardInterrupt if it was stopped before its end."""
+    if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    return study
+    return fit
 
 
-def fit_resticks(
-    reference: ReferenceSignal, start: tuple[float, ...], positions: FloatArray, *, stick_force: float = 15.0
-) -> dict[str, Any]:
-    """Fit stick-slip, continuous and with a reset at re-stick; positions are those at each second, (K, 2)."""
-    found: dict[str, Any] = {}
-    restick: Restick
-    for restick in ("continuous", "reset"):
-        problem = stick_slip(reference, start, stick_force=stick_force, restick=restick)
-        fit = fit_locally(problem)
-        path = fit.trajectory
-        off = positions_at(path, np.arange(float(len(positions)))) - positions
-        found[restick] = {
-            **summary(fit),
-            "initial": curve(simulate(problem)).tolist(),
-            "path": curve(path).tolist(),
-            "times": path.times.round(4).tolist(),
-            "yaw": path.states[:, 5].round(5).tolist(),
-            "rms_position_error": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-        }
-    return found
+def fit_log(reference: ReferenceSignal, start: tuple[float, ...], exact: FloatArray, **settings: Any) -> Found:
+    """Fit (18) to a log whose exact positions at each second are (K, 2); the settings are those of `stick_slip`."""
+    problem = stick_slip(reference, start, **settings)
+    fit = fit_locally(problem)
+    path = fit.trajectory
+    off = positions_at(path, np.arange(float(len(exact)))) - exact
+    return {
+        **summary(fit),
+        "initial": curve(simulate(problem)).tolist(),
+        "path": curve(path).tolist(),
+        "times": path.times.round(4).tolist(),
+        "yaw": path.states[:, 5].round(5).tolist(),
+        "rms_position_error": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+    }
 
 
 def summary(fit: Estimate) -> dict[str, Any]:
     """Return the result of a fit, with the second-order sufficient conditions, as plain numbers."""
-    if fit.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
-    smallest = certify(fit, None).smallest_eigenvalue
+    smallest = certify(complete(fit), None).smallest_eigenvalue
     return {
         "theta": dict(zip(fit.theta_names, fit.theta.tolist(), strict=True)),
         "cost": fit.cost,

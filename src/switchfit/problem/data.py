@@ -270,25 +270,6 @@ def fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 
-def fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
-    """Return the spline through all samples; missing ones are interpolated first, by a spline of their channel.
-
-    Parameters
-    ----------
-    times : (K,)
-    values : (K, q)
-        NaN where a sample is missing.
-    """
-    filled = values.copy()
-    for channel in filled.T:
-        known = np.isfinite(channel)
-        if known.sum() < 4:
-            raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
-        if not known.all():
-            channel[~known] = fit_spline(times[known], channel[known][:, None])(times[~known])[:, 0]
-    return fit_spline(times, filled)
-
-
 def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
     """Filter a signal by a second-order Butterworth filter, forward and backward, on a grid of ten points per period of
     the cut-off.
@@ -322,8 +303,10 @@ def _interpolate(given: Any, values: FloatArray, lowpass_hz: float | None) -> Pi
     # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
     times = _count_seconds(given) if isinstance(given, Dates) else given
     cuts = np.flatnonzero(np.diff(times) == 0) + 1
-    pieces = zip(np.split(times, cuts), np.split(values, cuts), strict=True)
-    parts = [fit_bridged_spline(part_times, part) for part_times, part in pieces]
+    pieces = np.split(times, cuts)
+    if (shortest := min(map(len, pieces))) < 4:
+        raise ValueError(f"ReferenceSignal needs four samples or more in each part; got {shortest}.")
+    parts = [fit_spline(*piece) for piece in zip(pieces, np.split(values, cuts), strict=True)]
     knots = np.concatenate([part.knots[:-1] for part in parts] + [times[-1:]])
     signal = PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
     return signal if lowpass_hz is None or isinstance(given, Dates) else filter_lowpass(signal, lowpass_hz)
@@ -520,8 +503,8 @@ class ReferenceSignal:
             or more. The spline is broken at a time that is given twice, as at the transitions of a simulated
             trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
-            NaN marks a missing value, which is bridged by the interpolation. Tables of pandas, polars and xarray, and a
-            `Log`, bring their names and units.
+            Leave out times at which a value is missing. Tables of pandas, polars and xarray, and a `Log`, bring their
+            names and units.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
             Cut-off, in cycles per time unit of the experiment (Hz only if that is s), of a second-order Butterworth
@@ -533,7 +516,7 @@ class ReferenceSignal:
         Raises
         ------
         ValueError
-            For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive or far
+            For bad times or values, fewer than four samples in a part, or a cut-off that is not positive or far
             above the sampling rate.
         TypeError
             If times are neither numbers nor dates, or values, weights or the cut-off are not numbers.
@@ -552,7 +535,7 @@ class ReferenceSignal:
         array([[0.841471]])
         """
         found = find_labels(values)
-        given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
+        given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True)
         cutoff = None if lowpass_hz is None else as_positive(lowpass_hz, "lowpass_hz")
         names, units = (found[0] if names is None else names), (found[1] if units is None else units)
         return cls(None, observe, weights, names, (given, values.reshape(len(given), -1)), cutoff, units)

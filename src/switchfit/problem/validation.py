@@ -73,7 +73,12 @@ def find_labels(value: Any) -> tuple[tuple[str, ...] | None, tuple[str, ...] | N
     these. Units are in ``attrs["units"]`` of the table or the column, a string or a mapping from names to units; they
     are None where no unit is given.
     """
-    channels = _list_channels(value)
+    channels = list_columns(value)
+    if channels is None and is_of_library(value, *LIBRARIES):
+        channels = [(getattr(value, "name", None), value)]
+        if getattr(value, "ndim", 1) == 2:
+            channels = [(label.item(), value) for label in value.coords.get(value.dims[1], ())]
+    channels = channels or []
     names = [name for name, _ in channels]
     proper = all(isinstance(name, str) and name.strip() for name in names) and len(set(names)) == len(names)
     units = tuple(_find_unit(column, name) or _find_unit(value, name) for name, column in channels)
@@ -85,19 +90,6 @@ def _find_unit(value: Any, name: Any) -> str:
     units = attributes.get("units", "") if isinstance(attributes, Mapping) else ""
     unit = units.get(name, "") if isinstance(units, Mapping) else units
     return unit if isinstance(unit, str) else ""
-
-
-def _list_channels(value: Any) -> list[tuple[Any, Any]]:
-    """Return the name of each channel, and its column; none for what is no table, column or labelled array."""
-    columns = list_columns(value)
-    if columns is not None:
-        return columns
-    if not is_of_library(value, *LIBRARIES):
-        return []
-    if getattr(value, "ndim", 1) != 2:
-        return [(getattr(value, "name", None), value)]
-    labels = value.coords.get(value.dims[1], ()) if hasattr(value, "dims") else ()
-    return [(label.item(), value) for label in labels]
 
 
 FloatArray = NDArray[np.float64]
