@@ -287,7 +287,7 @@ WRONG = [
     (skid_steer, {"m_w": -2.5}, "m_w must be 0 or more; got -2.5"),
     (skid_steer, {"c_1": np.nan}, "c_1 must be finite; got nan"),
     (skid_steer, {"m_b": "70 kg"}, "m_b must be a number or the name of a parameter; got the name '70 kg'"),
-    (skid_steer, {"m_w": sf.Parameter(2.5)}, "m_w must be a number, or the name of a parameter; got Parameter"),
+    (skid_steer, {"m_w": sf.Parameter(2.5)}, "m_w must be a number; got Parameter"),
     (skid_steer, {"initial_state": [0.0] * 5}, "initial_state must have 6 entries, X, dX, Y, dY, theta, d"),
     (bicycle, {"initial_state": [0.0] * 6}, "initial_state must have a positive v_x, "),
     (bicycle, {"modes": "drift"}, "modes must be different ones of grip, front_slide"),
