@@ -296,7 +296,7 @@ WRONG = [
     (differential_drive, {"speeds": "commanded", "delay": -1.0}, "delay must be 0 or more; got -1.0"),
     (differential_drive, {"y_l": 0.4, "y_r": 0.4}, "y_l, on the left, must be larger than y_r; got 0"),
     (differential_drive, {"turn_slip": 2.0}, "turn_slip must be from 0 to 1; got 2.0"),
-    (rolling_body, {"radius": None}, "radius must be a number, or the name of a parameter"),
+    (rolling_body, {"radius": None}, "radius must be a number; got None"),
     (lugre, {"sigma_1": -1}, "sigma_1 must be 0 or more; got -1"),
     (magic_formula, {"wheel_radius": 0.0}, "wheel_radius must be positive; got 0"),
     (magic_formula, {"height": -0.1}, "height must be 0 or more; got -0.1"),

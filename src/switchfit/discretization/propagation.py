@@ -110,7 +110,7 @@ class Path(NamedTuple):
     pieces : Piece with origin (R,) and coefficients (R, 4, S)
     before, after : (R, n), state at the start and at the end of each row
     times : (R, s), of the stages of each row
-    stages, slopes : (R, s, n), states X_j and slopes K_j there
+    stages : (R, s, n), states X_j there
     """
 
     layout: Rows
@@ -119,7 +119,6 @@ class Path(NamedTuple):
     after: Array
     times: Array
     stages: Array
-    slopes: Array
 
     def at_transition(self, i: int) -> tuple[Array, Array]:
         """Return tau_i and x(tau_i-), before the reset map, of transition i (from 0): (), (n,)."""
@@ -155,7 +154,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | N
     def through(mode: int) -> Callable[..., tuple[Array, ...]]:
         def row(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
             after, found = step(model.tableaus[mode], model.field(mode, piece), start, end, x, p)
-            return after, *found
+            return after, found.times, found.states
 
         return row
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
-from itertools import repeat
+from itertools import pairwise, repeat
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -41,9 +41,10 @@ def check_parameters(parameters: Any) -> dict[str, Parameter]:
     """Return the parameters of a problem by their names."""
     if not isinstance(parameters, Mapping | None):
         raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
-    given = {} if parameters is None else parameters
-    names = [as_name(name, "parameter names", "strings") for name in given]
-    return {name: as_parameter(given[name], f"parameter {shorten(name)}") for name in names}
+    return {
+        as_name(name, "parameter names", "strings"): as_parameter(value, f"parameter {shorten(name)}")
+        for name, value in (parameters or {}).items()
+    }
 
 
 def check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
@@ -352,9 +353,8 @@ class Problem:
             prefix_runs(self.experiments), self.structures, self.experiments, strict=True
         ):
             # of the user's transitions: those of the structure have the jumps in between
-            for i in np.flatnonzero(drop_jumps(experiment, [g is not None for g in structure.guards])).tolist():
-                before, after = experiment.mode_sequence[i : i + 2]
-                names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
+            pairs = zip(pairwise(experiment.mode_sequence), drop_jumps(experiment, structure.guards), strict=False)
+            names += [f"{prefix}guard of tau_{i} ({a} -> {b})" for i, ((a, b), guard) in enumerate(pairs, 1) if guard]
             names += [f"{prefix}terminal constraint {k + 1}" for k in range(structure.terminal_constraint_count)]
         return tuple(names)
 
