@@ -57,7 +57,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.flatten_util import ravel_pytree
 
 from switchfit.discretization.mesh import Arguments, Samples, find_row_ending_cell
 from switchfit.discretization.model import Field, Model, Piece
@@ -494,18 +493,16 @@ def step_linear(rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -
 
     `given` has the time-dependent arguments of `rate` at the s stages; h < 0 steps backward.
     """
-    flat, unravel = ravel_pytree(y)
-    a, b, _, _ = EXPLICIT
+    states: list[Any] = []
+    slopes: list[Any] = []
 
-    def slope(given: Any, y: Array) -> Array:
-        return ravel_pytree(rate(given, unravel(y)))[0]
+    def follow(weights: Any) -> Any:
+        return jax.tree.map(lambda y, *K: y + h * combine(weights, K), y, *slopes)
 
-    slopes: list[Array] = []
-    for j in range(len(b)):
-        at_stage = jax.tree.map(lambda g, j=j: g[j], given)
-        slopes.append(slope(at_stage, flat + h * combine(a[j], slopes)))
-    K = jnp.stack(slopes)
-    return jax.vmap(unravel)(flat[None] + h * (a @ K)), unravel(flat + h * (b @ K))
+    for j, row in enumerate(EXPLICIT.a):
+        states.append(follow(row))
+        slopes.append(rate(pick(given, j), states[-1]))
+    return jax.tree.map(lambda *each: jnp.stack(each), *states), follow(EXPLICIT.b)
 
 
 Function = Callable[[Array, Array, Array], Array]
