@@ -17,7 +17,7 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, PAGE, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, tidy
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.choice import estimate, was_interrupted
 
@@ -72,7 +72,8 @@ def _sample_sets() -> list[Found]:
     found: list[Found] = []
     for label, tf, times in sets:
         theta = TRUTH if tf > end else (TRUTH[0], TRUTH[2])
-        hessian = evaluate(vehicle.fit_positions(path, times, theta, SIGMA, tf)).hessian
+        data = Measurements(times, vehicle.positions_at(path, times), vehicle.position, sigma=SIGMA)
+        hessian = evaluate(vehicle.stick_slip(data, theta, tf=tf)).hessian
         inside = int(np.sum((times > begin) & (times <= end)))
         errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
         found.append({"label": label, "samples": len(times), "in_slip": inside, "mu": float(errors[-1])})

@@ -183,13 +183,6 @@ def positions_at(path: Trajectory, times: FloatArray) -> FloatArray:
     return path.states[nodes][:, [0, 2]]
 
 
-def fit_positions(path: Trajectory, times: FloatArray, theta: tuple[float, ...], sigma: float, tf: float) -> Problem:
-    """Return the estimation problem of equation (18) with positions along a trajectory as measurements."""
-    return stick_slip(
-        Measurements(times, positions_at(path, times), position, sigma=sigma, names=("X", "Y")), theta, tf=tf
-    )
-
-
 def curve(path: Trajectory) -> FloatArray:
     """Return positions (K, 2) along a trajectory, a tenth of a second or less apart, for figures."""
     at = np.linspace(path.times[0], path.times[-1], 151)

@@ -241,9 +241,9 @@ class _Constants(Walk):
     def _evaluate(self, equation: Any, given: list[Any]) -> Sequence[Any]:
         """Return the results of an operation of known numbers that may make an index."""
         fold, kind = FOLDED.get(equation.primitive.name), getattr(equation.outvars[0].aval.dtype, "kind", "O")
-        return (
-            [None] * len(equation.outvars) if fold is None or kind not in "iub" else [fold(*given, **equation.params)]
-        )
+        if fold is None or kind not in "iub":
+            return [None] * len(equation.outvars)
+        return [fold(*given, **equation.params)]
 
     def _check_precision(self, equation: Any, origin: Any) -> None:
         """Raise ValueError if an operation computes in less than double precision."""
