@@ -503,8 +503,8 @@ class ReferenceSignal:
             or more. The spline is broken at a time that is given twice, as at the transitions of a simulated
             trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
-            Leave out times at which a value is missing. Tables of pandas, polars and xarray, and a `Log`, bring their
-            names and units.
+            Times at which a value is NaN, which marks a missing one, are left out. Tables of pandas, polars and xarray,
+            and a `Log`, bring their names and units.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
             Cut-off, in cycles per time unit of the experiment (Hz only if that is s), of a second-order Butterworth
@@ -535,10 +535,12 @@ class ReferenceSignal:
         array([[0.841471]])
         """
         found = find_labels(values)
-        given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True)
+        given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
+        table = values.reshape(len(given), -1)
+        known = ~np.isnan(table).any(axis=1)
         cutoff = None if lowpass_hz is None else as_positive(lowpass_hz, "lowpass_hz")
         names, units = (found[0] if names is None else names), (found[1] if units is None else units)
-        return cls(None, observe, weights, names, (given, values.reshape(len(given), -1)), cutoff, units)
+        return cls(None, observe, weights, names, (given[known], table[known]), cutoff, units)
 
 
 @dataclass(frozen=True, eq=False)
