@@ -2,12 +2,13 @@
 
 import json
 from pathlib import Path
-from unittest.mock import MagicMock, Mock
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import switchfit as sf
 from switchfit.cli import app
 from switchfit.paper import PARTS, Part, algorithms, run, studies, table, tyres
 from switchfit.paper.vehicle import NAMES, TRUTH, Row, wheel_speeds
@@ -108,52 +109,28 @@ def test_drawing_shows_all_wheels():
 def test_error_grows_with_noise_and_is_largest_for_mu(monkeypatch):
     monkeypatch.setattr(studies, "QUICK_LEVELS", (0.0, 0.05, 0.25, 0.5))
     found = found_by("noise")
-    filtered, direct = found["ways"][studies.FILTERED], found["ways"][studies.DIRECT]
-    for levels in (filtered, direct):
-        rms = np.array([level["rms"] for level in levels])
-        assert np.all(np.diff(rms, axis=0) > 0)
-        assert np.all(rms[1:, 2] > rms[1:, :2].max(axis=1))
-        coverage = np.array([level["coverage"] for level in levels[1:]])
-        assert np.all(coverage > 0.8)
-        assert all(level["converged"] > 0.9 * found["runs"] for level in levels[1:])
-    # Without noise the samples hold the truth, their interpolation does not.
-    assert max(direct[0]["rms"]) < 1e-7
-    assert max(filtered[0]["rms"]) > 1e-4
-    assert np.mean(np.divide(filtered[-1]["rms"], direct[-1]["rms"])) > 1.0
+    levels = found["levels"]
+    rms = np.array([level["rms"] for level in levels])
+    assert np.all(np.diff(rms, axis=0) > 0)
+    assert np.all(rms[1:, 2] > rms[1:, :2].max(axis=1))
+    assert all(level["converged"] > 0.9 * found["runs"] for level in levels[1:])
+    assert max(rms[0]) > 1e-4, "interpolated samples do not hold the truth"
+    # Samples after the slip say more of mu than the four in it.
+    mu = {line["label"]: line["mu"] for line in found["samples"]}
+    assert max(mu["0 to 15 s"], mu["0 to 15 s without those in slip"]) < 0.5 * mu["0 to 10 s"]
 
 
 @pytest.mark.slow
-def test_trials_converge_in_fewer_than_fifteen_iterations_and_a_reset_explains_them_better(monkeypatch):
+def test_trials_converge_in_fewer_than_fifteen_iterations(monkeypatch):
     monkeypatch.setattr(tyres, "TRIALS", tyres.TRIALS[2:4])
     found = found_by("trials")
     assert [trial["force"] for trial in found["trials"]] == [12.0, 15.0]
     for trial in found["trials"]:
-        for fit in trial["fits"].values():
-            assert fit["iterations"] < 15
-            assert fit["gradient_norm"] < 1e-7
-            assert fit["sufficient"]
-            assert 0.6 < fit["theta"]["mu"] < 0.85
-        assert trial["fits"]["reset"]["cost"] < 0.25 * trial["fits"]["continuous"]["cost"]
-
-
-@pytest.mark.slow
-def test_a_longer_horizon_is_more_accurate_but_does_not_always_widen_the_region_of_starts(monkeypatch):
-    monkeypatch.setattr(studies, "QUICK_ENDS", (8.0, 15.0, 26.0))
-    found = found_by("horizon")
-    levels = found["horizons"]
-    assert levels[0]["names"] == ["tau_1", "mu"]
-    assert all(level["names"] == list(NAMES) for level in levels[1:])
-    errors = np.array([level["standard_errors"] for level in levels[1:]])
-    assert np.all(np.diff(errors, axis=0) < 0)
-    for level in levels:
-        ratio = np.array(level["rms_errors"]) / level["standard_errors"]
-        assert np.all((ratio > 0.6) & (ratio < 1.7))
-    # Samples after the slip say more of mu than the four in it.
-    mu = {line["label"]: line["mu"] for line in found["samples"]}
-    assert max(mu["0 to 15 s"], mu["0 to 15 s without those in slip"]) < 0.5 * mu["0 to 10 s"]
-    arrived = [level["arrived"] for level in levels[1:]]
-    assert arrived[1] < arrived[0]
-    assert min(arrived) > 0.2
+        fit = trial["fit"]
+        assert fit["iterations"] < 15
+        assert fit["gradient_norm"] < 1e-7
+        assert fit["sufficient"]
+        assert 0.6 < fit["theta"]["mu"] < 0.85
 
 
 def test_an_interrupted_run_goes_on_with_what_is_missing_and_one_part_alone_leaves_the_others(tmp_path, monkeypatch):
@@ -179,7 +156,7 @@ def test_an_interrupted_run_goes_on_with_what_is_missing_and_one_part_alone_leav
 
 
 def test_interrupted_study_is_not_taken_for_a_result(monkeypatch):
-    monkeypatch.setattr(studies, "monte_carlo", MagicMock(return_value=MagicMock(requested=5, __len__=lambda study: 3)))
+    monkeypatch.setattr(studies, "fit_locally", Mock(return_value=Mock(status=sf.Status.INTERRUPTED)))
     with pytest.raises(KeyboardInterrupt):
         studies.compute_noise(True, lambda text: None)
 

@@ -350,16 +350,6 @@ def test_rows_beside_transitions_are_halved_too():
         assert tau - fine[fine < tau][-1] <= 0.5 * before * (1 + 1e-12)
 
 
-def test_runs_are_set_aside_by_name():
-    problem = two_runs()
-    rest = problem.without_runs("room1")
-    assert rest.theta_names == ("tau_1", "k", "power_0")
-    with pytest.raises(ValueError, match="there is no experiment 'room7'; there are room0, room1"):
-        problem.without_runs("room7")
-    with pytest.raises(ValueError, match="none is left"):
-        problem.without_runs("room0", "room1")
-
-
 def test_a_fit_that_goes_on_is_no_search(monkeypatch):
     """It ends where it would have ended: that nothing is lower elsewhere, only a search can say."""
     nothing = lambda theta: End(theta, np.inf, 1)  # noqa: E731

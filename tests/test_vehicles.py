@@ -287,7 +287,7 @@ WRONG = [
     (skid_steer, {"m_w": -2.5}, "m_w must be 0 or more; got -2.5"),
     (skid_steer, {"c_1": np.nan}, "c_1 must be finite; got nan"),
     (skid_steer, {"m_b": "70 kg"}, "m_b must be a number or the name of a parameter; got the name '70 kg'"),
-    (skid_steer, {"m_w": sf.Parameter(2.5)}, "m_w must be a number, or the name of a parameter; got Parameter"),
+    (skid_steer, {"m_w": sf.Parameter(2.5)}, "m_w must be a number; got Parameter"),
     (skid_steer, {"initial_state": [0.0] * 5}, "initial_state must have 6 entries, X, dX, Y, dY, theta, d"),
     (bicycle, {"initial_state": [0.0] * 6}, "initial_state must have a positive v_x, "),
     (bicycle, {"modes": "drift"}, "modes must be different ones of grip, front_slide"),
@@ -296,7 +296,7 @@ WRONG = [
     (differential_drive, {"speeds": "commanded", "delay": -1.0}, "delay must be 0 or more; got -1.0"),
     (differential_drive, {"y_l": 0.4, "y_r": 0.4}, "y_l, on the left, must be larger than y_r; got 0"),
     (differential_drive, {"turn_slip": 2.0}, "turn_slip must be from 0 to 1; got 2.0"),
-    (rolling_body, {"radius": None}, "radius must be a number, or the name of a parameter"),
+    (rolling_body, {"radius": None}, "radius must be a number; got None"),
     (lugre, {"sigma_1": -1}, "sigma_1 must be 0 or more; got -1"),
     (magic_formula, {"wheel_radius": 0.0}, "wheel_radius must be positive; got 0"),
     (magic_formula, {"height": -0.1}, "height must be 0 or more; got -0.1"),
@@ -314,7 +314,7 @@ def test_what_is_wrong_is_said(make, arguments, message):
     [
         (skid_steer(forces_from_input=True), 3, r"must have 4 channels, F1, F2, F3, F4 \(N\); it has 3"),
         (bicycle(), 1, r"must have 2 channels, delta \(rad\), F_x \(N\); it has 1"),
-        (lugre(), 2, r"must have one channel, force or position; it has 2"),
+        (lugre(), 2, r"must have 1 channels, force or position; it has 2"),
     ],
 )
 def test_an_input_with_other_channels_is_refused(system, channels, message):

@@ -14,7 +14,7 @@ from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, runs_of
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, replace_samples
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.dates import Origin, read_date_text
 from switchfit.problem.experiment import count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
@@ -291,7 +291,7 @@ def replace_values(problem: Problem, values: Mapping[tuple[int, int], FloatArray
             data[e][k] = replace(item, values=np.where(np.isnan(item.values), np.nan, own))
         else:
             times, measured = item.samples
-            data[e][k] = replace_samples(item, times, np.where(np.isnan(measured), np.nan, own))
+            data[e][k] = replace(item, signal=None, samples=(times, np.where(np.isnan(measured), np.nan, own)))
     runs = [replace(run, data=items) for run, items in zip(problem.experiments, data, strict=True)]
     return replace(problem, experiments=runs)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.problem.validation import as_finite, as_not_negative, as_positive, as_sequence, join_names, shorten
+from switchfit.problem.validation import as_finite, as_not_negative, as_positive, as_sequence, join_names
 
 Constant = float | str
 """A number that stays, or the name of a parameter of the problem, which may be estimated."""
@@ -43,11 +43,9 @@ def check_constants(
             if not value.isidentifier():
                 raise ValueError(f"{name} must be a number or the name of a parameter; got the name {value!r}.")
             found[name] = value
-            continue
-        if not isinstance(value, (float, int, np.integer, np.floating)) or isinstance(value, bool):
-            raise TypeError(f"{name} must be a number, or the name of a parameter; got {shorten(value)}.")
-        check = as_positive if name in positive else as_not_negative if name in not_negative else as_finite
-        found[name] = check(value, name)
+        else:
+            check = as_positive if name in positive else as_not_negative if name in not_negative else as_finite
+            found[name] = check(value, name)
     return found
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, Constants, Values, check_constants, check_length, is_absent
+from switchfit.models.constants import Constant, Constants, Values, check_constants, check_length, is_absent, read_input
 from switchfit.problem.system import HybridSystem
 
 
@@ -285,8 +285,6 @@ def _bend(constants: Constants, direction: int, t: Any, x: Any, p: Any, u: Any) 
     level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # G(v)
     dz = v - direction * c["sigma_0"] * v * z / level
     friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v
-    if (count := jnp.size(u)) != 1:
-        raise ValueError(f"the input of the Experiment must have one channel, force or position; it has {count}.")
-    force = jnp.reshape(u, ())
+    (force,) = read_input(jnp.ravel(u), ("force or position",))
     pull = force if constants["k"] == 0.0 else c["k"] * (force - position)
     return jnp.stack([v, (pull - friction) / c["m"], dz])

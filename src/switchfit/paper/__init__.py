@@ -49,7 +49,6 @@ PARTS: Mapping[str, Part] = {
     "noise": Part("Measurement noise (Fig. 5)", studies.compute_noise, studies.draw_noise, studies.list_noise),
     "trials": Part("Trials (Fig. 6)", tyres.compute_trials, tyres.draw_trials, tyres.list_trials),
     "starts": Part("Starts", studies.compute_starts, list_rows=studies.list_starts),
-    "horizon": Part("Horizon", studies.compute_horizons, studies.draw_horizons, studies.list_horizons),
 }
 RESULTS, TABLE = "results.json", "table.md"
 

@@ -1,13 +1,9 @@
-"""Many fits: against the noise of the data, from starts anywhere, and on horizons of other lengths.
+"""Many fits: against the noise of the data, and from starts anywhere.
 
-Figure 5: error of the estimates against the noise of 1 Hz positions, filtered as in the paper or fitted directly.
+Figure 5: error of the estimates against the noise of 1 Hz positions, filtered as in the paper; and which of the
+samples tell mu.
 
 Estimates from starts anywhere within the bounds, which according to the paper would generally agree.
-
-Effect of the end of the horizon, which the paper leaves for further analysis: on accuracy, on conditioning, and on the
-region of starts from which the optimum is reached. A horizon that ends during slip has no second transition: only tau_1
-and mu are estimated. The start of the horizon does not matter as long as the state there is known: nothing in stick
-depends on the unknowns.
 """
 
 from __future__ import annotations
@@ -17,14 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.batch.simulated import MonteCarlo, monte_carlo
-from switchfit.batch.starts import multistart
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
-from switchfit.fit.result import inverse_on
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, PAGE, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, tidy
-from switchfit.problem.data import FloatArray, ReferenceSignal
-from switchfit.problem.problem import Problem
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.choice import estimate, was_interrupted
 
@@ -33,46 +26,31 @@ LEVELS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 QUICK_LEVELS = (0.0, 0.1, 0.25, 0.5)
 NOISE_RUNS, QUICK_NOISE_RUNS = 500, 50
 PERCENTILES = (5, 25, 50, 75, 95)
-#: Two-sided 95 % point of the normal distribution.
-NORMAL = 1.959963984540054
 TIMES = np.arange(HORIZON + 1)
-FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
-
-
-def build_problem(method: str, sigma: float) -> Problem:
-    """Return the problem of one of the methods to fit the same samples; a reference signal has no sigma."""
-    path = vehicle.simulate_drive(step=1.0)
-    if method == FILTERED:
-        return vehicle.stick_slip(vehicle.gps_reference(TIMES, vehicle.positions_at(path, TIMES)))
-    return vehicle.fit_positions(path, TIMES, vehicle.START, sigma or 1.0, HORIZON)
+#: Standard deviation of positions (m) of which a sample or another may tell mu, and the longest horizon (s) of these.
+SIGMA, LONGEST = 0.1, 30.0
 
 
 def compute_noise(quick: bool, say: Say) -> Found:
-    """Run a Monte Carlo study at every level of noise, with both methods, from the paper's start."""
+    """Run a Monte Carlo study at every level of noise, from the paper's start."""
     levels, runs = (QUICK_LEVELS, QUICK_NOISE_RUNS) if quick else (LEVELS, NOISE_RUNS)
-    found: Found = {"sigma": list(levels), "runs": runs, "ways": {}}
-    for method in (FILTERED, DIRECT):
-        rows: list[Found] = []
-        for level, sigma in enumerate(levels):
-            say(f"{method}: sigma {sigma:g} m")
-            study = monte_carlo(
-                build_problem(method, sigma),
-                1 if sigma == 0 else runs,
-                theta=TRUTH,
-                start=vehicle.START,
-                noise=sigma,
-                seed=level,
-            )
-            noise_free = np.array(rows[0]["median"] if rows else TRUTH)
-            rows.append(_level(vehicle.complete(study), sigma, noise_free))
-        found["ways"][method] = rows
-    return found
+    exact = vehicle.positions_at(vehicle.simulate_drive(step=1.0), TIMES)
+    rows: list[Found] = []
+    for level, sigma in enumerate(levels):
+        say(f"sigma {sigma:g} m")
+        rng, theta = np.random.default_rng(level), []
+        for _ in range(runs if sigma else 1):
+            noisy = exact + sigma * rng.standard_normal(exact.shape)
+            fit = vehicle.complete(fit_locally(vehicle.stick_slip(vehicle.gps_reference(TIMES, noisy))))
+            if fit.status.successful:
+                theta.append(fit.theta)
+        rows.append(_level(np.array(theta), np.array(rows[0]["median"] if rows else TRUTH)))
+    return {"sigma": list(levels), "runs": runs, "levels": rows, "samples": _sample_sets()}
 
 
-def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
-    """Return percentiles of the estimates, errors and coverage at one level of noise."""
-    theta = study.theta[study.success]
-    normalised = study.errors / TRUTH
+def _level(theta: FloatArray, noise_free: FloatArray) -> Found:
+    """Return percentiles of the errors of estimates (R, 3) at one level of noise."""
+    normalised = theta / TRUTH - 1
     return {
         "converged": len(theta),
         "median": np.median(theta, axis=0).tolist(),
@@ -80,104 +58,81 @@ def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
         "mean_size": np.mean(np.abs(normalised), axis=0).tolist(),
         "rms": np.sqrt(np.mean(normalised**2, axis=0)).tolist(),
         "rms_from_noise_free": np.sqrt(np.mean(((theta - noise_free) / TRUTH) ** 2, axis=0)).tolist(),
-        "coverage": _coverage(study, sigma).tolist() if sigma > 0 else [None] * 3,
     }
 
 
-def _coverage(study: MonteCarlo, sigma: float) -> FloatArray:
-    """Return the part of the 95 % intervals that contain the truth: (3,).
-
-    A reference signal has no noise model. A plausible one treats the integral as a sum over samples one second apart:
-    J / sigma² times 1/s is then a negative log-likelihood, and the covariance is sigma² (1 s) H⁻¹.
-    """
-    if study.sigma_known is not None:
-        return study.coverage()
-    inside = []
-    for theta, hessian in zip(study.theta[study.success], study.hessian[study.success], strict=True):
-        errors = sigma * np.sqrt(np.diag(inverse_on(np.eye(3), hessian)))
-        inside.append(np.abs(theta - TRUTH) <= NORMAL * errors)
-    return np.mean(inside, axis=0)
+def _sample_sets() -> list[Found]:
+    """Return the standard error of mu from 1 Hz positions over several horizons, and without positions in slip."""
+    path = vehicle.simulate_drive(tf=LONGEST)
+    begin, end = TRUTH[:2]
+    sets = [(f"0 to {tf:g} s", tf, np.arange(tf + 1)) for tf in (end, 11.0, 12.0, 13.0, HORIZON, 20.0, LONGEST)]
+    seconds = np.arange(HORIZON + 1)
+    outside = seconds[(seconds <= begin) | (seconds > end)]
+    sets.append((f"0 to {HORIZON:g} s without those in slip", HORIZON, outside))
+    found: list[Found] = []
+    for label, tf, times in sets:
+        theta = TRUTH if tf > end else (TRUTH[0], TRUTH[2])
+        data = Measurements(times, vehicle.positions_at(path, times), vehicle.position, sigma=SIGMA)
+        hessian = evaluate(vehicle.stick_slip(data, theta, tf=tf)).hessian
+        inside = int(np.sum((times > begin) & (times <= end)))
+        errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
+        found.append({"label": label, "samples": len(times), "in_slip": inside, "mu": float(errors[-1])})
+    return found
 
 
 def draw_noise(found: Found) -> dict[str, Figure]:
-    """Draw figure 5, with the standard deviation on a second axis, and the coverage below."""
-    figure = vehicle.new_figure(PAGE, 4.6)
-    axes = figure.subplots(2, 3, sharex=True, height_ratios=(1.6, 1.0))
+    """Draw figure 5, with the standard deviation on a second axis."""
+    figure = vehicle.new_figure(PAGE, 3.0)
     variance = np.array(found["sigma"]) ** 2
-    line: dict[str, Any] = {"markersize": 3, "linewidth": 1}
-    looks = {
-        FILTERED: {**line, "color": DARK, "linestyle": "--", "marker": "s"},
-        DIRECT: {**line, "color": BLUE, "linestyle": "-", "marker": "o"},
-    }
-    for k, name in enumerate(NAMES):
-        errors, coverage = axes[:, k]
-        for method, levels in found["ways"].items():
-            look = looks[method]
-            bands = 100 * np.array([level["percentiles"][k] for level in levels]).T
-            if method == DIRECT:
-                shade: dict[str, Any] = {"color": look["color"], "alpha": 0.3, "linewidth": 0}
-                errors.fill_between(variance, bands[0], bands[4], label=f"5 to 95 %, {method}", **shade)
-            else:
-                errors.plot(variance, bands[0], ":", color=look["color"], linewidth=1.2, label=f"5 and 95 %, {method}")
-                errors.plot(variance, bands[4], ":", color=look["color"], linewidth=1.2)
-            errors.plot(variance, bands[2], **look, label=f"median, {method}")
-            inside = [100 * level["coverage"][k] for level in levels[1:]]
-            coverage.plot(variance[1:], inside, **look)
-        errors.axhline(0.0, color=RED, linewidth=0.8)
-        coverage.axhline(95.0, color=RED, linewidth=0.8)
-        coverage.set_ylim(60, 101)
-        tidy(errors, "", f"normalised error of {SYMBOLS[name]} (%)", letter=f"({'abc'[k]})")
-        tidy(coverage, "noise variance (m²)", f"coverage, {SYMBOLS[name]} (%)")
-        above = errors.secondary_xaxis("top", functions=(lambda v: np.sqrt(np.maximum(v, 0.0)), np.square))
+    for k, (ax, name) in enumerate(zip(figure.subplots(1, 3), NAMES, strict=True)):
+        bands = 100 * np.array([level["percentiles"][k] for level in found["levels"]]).T
+        for low, high, label in ((0, 4, "5 to 95 %"), (1, 3, "25 to 75 %")):
+            ax.fill_between(variance, bands[low], bands[high], color=BLUE, alpha=0.3, linewidth=0, label=label)
+        ax.plot(variance, bands[2], "-o", color=DARK, markersize=3, linewidth=1, label="median")
+        ax.axhline(0.0, color=RED, linewidth=0.8)
+        tidy(ax, "noise variance (m²)", f"normalised error of {SYMBOLS[name]} (%)", letter=f"({'abc'[k]})")
+        above = ax.secondary_xaxis("top", functions=(lambda v: np.sqrt(np.maximum(v, 0.0)), np.square))
         above.set_ticks([0.1, 0.2, 0.3, 0.4, 0.5])
         above.tick_params(labelsize=7)
         above.set_xlabel("standard deviation (m)", fontsize=8)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=7)
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
     return {"fig5-noise": figure}
 
 
 NOISE_LINES = """
 * Fig. 5: error without noise | zero | bias of {bias} (tau_1 s, tau_2 s, mu)
-| from interpolating 1 Hz positions and filtering them at {lowpass:g} Hz; the samples fitted directly give {direct_bias}
+| from interpolating 1 Hz positions and filtering them at {lowpass:g} Hz
 * Fig. 5: mean normalised error at variance {variance:g} m² (%), from the truth
 | degrades gracefully; mu is the most sensitive | tau_1, tau_2, mu: {last_size}
 | {runs} runs a level, {last[converged]} converged
 * Fig. 5: the same at standard deviation 0.25 m, the other reading of the paper's unit (%) | | {quarter_size}
-| samples fitted directly: {direct_quarter_size}
-* at variance {variance:g} m² with the samples fitted directly (%) | not done | {direct_last_size}
-| {direct_last[converged]} of {runs} converged; rms error of the filtered fit is {ratio} times as large
 * Fig. 5: rms normalised error from the noise-free estimate (%) | not printed | {from_noise_free} | from the truth {rms}
-* coverage of 95 % intervals, filtered (%) | not done | {coverage}
-| tau_1, tau_2, mu at sigma = {levels} m; covariance sigma² (1 s) H⁻¹
-* coverage of 95 % intervals, direct (%) | not done | {direct_coverage} | tau_1, tau_2, mu at the same levels
+"""
+
+SAMPLES_LINE = """
+* V-A 3: standard error of mu, 1 Hz positions {label} | effectively only four measurements affect it | {mu:.4f}
+| {samples} samples, {in_slip} of them in slip; sigma {sigma:g} m
 """
 
 
 def list_noise(found: Found) -> list[Row]:
     """Return the lines of the table."""
-    sigma, values = found["sigma"], {"runs": found["runs"], "variance": found["sigma"][-1] ** 2}
-    shown = [1, len(sigma) // 2, -1]  # the first level with noise, the middle one and the last
-    for prefix, method, digits in (("", FILTERED, "+.4f"), ("direct_", DIRECT, ".0e")):
-        levels = found["ways"][method]
-        quarter, last = levels[sigma.index(0.25)], levels[-1]
-        values |= {
-            f"{prefix}bias": _list(np.subtract(levels[0]["median"], TRUTH), digits),
-            f"{prefix}last": last,
-            f"{prefix}last_size": _list(np.multiply(100, last["mean_size"]), ".2f"),
-            f"{prefix}quarter_size": _list(np.multiply(100, quarter["mean_size"]), ".2f"),
-            f"{prefix}coverage": "; ".join(_list(np.multiply(100, levels[k]["coverage"]), ".0f") for k in shown),
-        }
-    filtered, direct = values["last"], values["direct_last"]
-    return vehicle.fill_rows(
+    sigma, levels = found["sigma"], found["levels"]
+    quarter, last = levels[sigma.index(0.25)], levels[-1]
+    rows = vehicle.fill_rows(
         NOISE_LINES,
+        runs=found["runs"],
+        variance=sigma[-1] ** 2,
         lowpass=vehicle.LOWPASS_HZ,
-        ratio=_list(np.divide(filtered["rms"], direct["rms"]), ".2f"),
-        from_noise_free=_list(np.multiply(100, filtered["rms_from_noise_free"]), ".2f"),
-        rms=_list(np.multiply(100, filtered["rms"]), ".2f"),
-        levels=_list([sigma[k] for k in shown], "g"),
-        **values,
+        last=last,
+        bias=_list(np.subtract(levels[0]["median"], TRUTH), "+.4f"),
+        last_size=_list(np.multiply(100, last["mean_size"]), ".2f"),
+        quarter_size=_list(np.multiply(100, quarter["mean_size"]), ".2f"),
+        from_noise_free=_list(np.multiply(100, last["rms_from_noise_free"]), ".2f"),
+        rms=_list(np.multiply(100, last["rms"]), ".2f"),
     )
+    return rows + [row for line in found["samples"] for row in vehicle.fill_rows(SAMPLES_LINE, sigma=SIGMA, **line)]
 
 
 def _list(values: Any, form: str) -> str:
@@ -257,130 +212,3 @@ def _name(end: Found) -> str:
 def _rest(ends: list[Found]) -> str:
     text = "tau uniform in 0 to 15 s, mu in its bounds; (tau_1, tau_2, mu)"
     return text + (f"; {sum(end['count'] for end in ends)} elsewhere" if ends else "")
-
-
-#: Ends of the horizon (s); slip lasts from 6 to 10 s.
-ENDS = (7.0, 8.0, 9.0, 10.0, 10.5, 11.0, 12.0, 13.0, 15.0, 18.0, 22.0, 26.0, 30.0)
-QUICK_ENDS = (8.0, 10.5, 15.0, 26.0)
-HORIZON_RUNS, QUICK_HORIZON_RUNS = 400, 32
-HORIZON_STARTS, QUICK_HORIZON_STARTS = 512, 32
-#: Noise of the positions (m), ten per second.
-SIGMA, RATE = 0.1, 10
-#: Largest relative distance to the truth at which an estimate counts as the optimum.
-NEAR = 1e-4
-
-
-def compute_horizons(quick: bool, say: Say) -> Found:
-    """Fit the same problem on horizons of different lengths."""
-    runs, starts = (QUICK_HORIZON_RUNS, QUICK_HORIZON_STARTS) if quick else (HORIZON_RUNS, HORIZON_STARTS)
-    found: Found = {"runs": runs, "starts": starts, "horizons": []}
-    for tf in QUICK_ENDS if quick else ENDS:
-        say(f"0 to {tf:g} s")
-        found["horizons"].append(_horizon(tf, runs, starts))
-    found["samples"] = _sample_sets()
-    return found
-
-
-def _sample_sets() -> list[Found]:
-    """Return the standard error of mu from 1 Hz positions over several horizons, and without positions in slip."""
-    path = vehicle.simulate_drive(tf=ENDS[-1])
-    begin, end = TRUTH[:2]
-    sets = [(f"0 to {tf:g} s", tf, np.arange(tf + 1)) for tf in (end, 11.0, 12.0, 13.0, HORIZON, 20.0, 30.0)]
-    seconds = np.arange(HORIZON + 1)
-    outside = seconds[(seconds <= begin) | (seconds > end)]
-    sets.append((f"0 to {HORIZON:g} s without those in slip", HORIZON, outside))
-    found: list[Found] = []
-    for label, tf, times in sets:
-        theta = TRUTH if tf > end else (TRUTH[0], TRUTH[2])
-        hessian = evaluate(vehicle.fit_positions(path, times, theta, SIGMA, tf)).hessian
-        inside = int(np.sum((times > begin) & (times <= end)))
-        errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
-        found.append({"label": label, "samples": len(times), "in_slip": inside, "mu": float(errors[-1])})
-    return found
-
-
-def _horizon(tf: float, runs: int, starts: int) -> Found:
-    """Return accuracy and conditioning with noisy positions; convergence of the noise-free fit of Fig. 4 from many
-    starts.
-    """
-    path = vehicle.simulate_drive(tf=max(tf, HORIZON))
-    times = np.arange(round(RATE * tf) + 1) / RATE
-    names = NAMES if tf > TRUTH[1] else (NAMES[0], NAMES[2])
-    truth = tuple(TRUTH[NAMES.index(name)] for name in names)
-    noisy = vehicle.fit_positions(path, times, truth, SIGMA, tf)
-    hessian, seed = evaluate(noisy).hessian, round(10 * tf)
-    study = vehicle.complete(monte_carlo(noisy, runs, theta=truth, seed=seed))
-    here = slice(0, np.searchsorted(path.times, tf - 1e-9) + 1)  # without the second of two nodes at tf
-    exact = vehicle.stick_slip(ReferenceSignal.from_samples(path.times[here], path.states[here]), truth, tf=tf)
-    search = vehicle.complete(multistart(exact, _spread_starts(len(names), tf, starts)))
-    arrived = search.success & np.all(np.abs(search.theta / truth - 1) < NEAR, axis=1)
-    return {
-        "tf": tf,
-        "names": list(names),
-        "standard_errors": (np.sqrt(np.diag(np.linalg.inv(hessian))) / truth).tolist(),
-        "rms_errors": (np.sqrt(np.mean(study.errors**2, axis=0)) / truth).tolist(),
-        "condition": float(np.linalg.cond(hessian * np.outer(truth, truth))),
-        "arrived": float(np.mean(arrived)),
-    }
-
-
-def _spread_starts(d: int, tf: float, count: int) -> FloatArray:
-    """Return ordered transition times all over the horizon and mu from 0.2 to 2, from a Sobol sequence."""
-    from scipy.stats import qmc  # imported here, since that takes long
-
-    cube = qmc.Sobol(d, seed=0).random(count)
-    times = np.sort(tf * (0.005 + 0.99 * cube[:, :-1]), axis=1)
-    times[:, 1:] = np.maximum(times[:, 1:], times[:, :-1] + 1e-3)
-    return np.column_stack([times, 0.2 + 1.8 * cube[:, -1]])
-
-
-def draw_horizons(found: Found) -> dict[str, Figure]:
-    """Draw accuracy, conditioning and region of convergence against the end of the horizon."""
-    figure = vehicle.new_figure(vehicle.COLUMN, 5.6)
-    accuracy, conditioning, region = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
-    levels = found["horizons"]
-    for name, colour, marker in zip(NAMES, (RED, BLUE, DARK), ("o", "s", "^"), strict=True):
-        here = [(level, level["names"].index(name)) for level in levels if name in level["names"]]
-        x = [level["tf"] for level, _ in here]
-        predicted, seen = ([100 * level[key][k] for level, k in here] for key in ("standard_errors", "rms_errors"))
-        accuracy.semilogy(x, predicted, "-", color=colour, linewidth=1.1, label=f"{SYMBOLS[name]}, standard error")
-        accuracy.semilogy(x, seen, marker, color=colour, markersize=3.5, label=f"{SYMBOLS[name]}, Monte Carlo")
-    line: dict[str, Any] = {"color": DARK, "marker": "o", "markersize": 3, "linewidth": 1.1}
-    x = [level["tf"] for level in levels]
-    conditioning.semilogy(x, [level["condition"] for level in levels], **line)
-    region.plot(x, [100 * level["arrived"] for level in levels], **line)
-    region.set_ylim(0, 102)
-    for ax in (accuracy, conditioning, region):
-        ax.axvspan(*TRUTH[:2], color="#f9dfbf", linewidth=0)
-        ax.axvline(HORIZON, color="#999999", linestyle=":", linewidth=0.9)
-    accuracy.annotate("slip", (8.0, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=7)
-    accuracy.annotate("paper", (HORIZON, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=7)
-    tidy(accuracy, "", "error (%)")
-    tidy(conditioning, "", "condition number")
-    tidy(region, "end of the horizon (s)", "starts that reach\nthe optimum (%)")
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=6)
-    return {"horizon": figure}
-
-
-HORIZON_LINE = """
-* Horizon 0 to {tf:g} s | left for further analysis
-| {errors}; condition number {condition:.0f}; {share:.0f} % of starts reach the optimum
-| {rate} Hz positions, sigma {sigma:g} m; {runs} runs, {starts} starts
-"""
-
-SAMPLES_LINE = """
-* V-A 3: standard error of mu, 1 Hz positions {label} | effectively only four measurements affect it | {mu:.4f}
-| {samples} samples, {in_slip} of them in slip; sigma {sigma:g} m
-"""
-
-
-def list_horizons(found: Found) -> list[Row]:
-    """Return the lines of the table."""
-    lines, settings = [], {"rate": RATE, "sigma": SIGMA, "runs": found["runs"], "starts": found["starts"]}
-    for level in found["horizons"]:
-        errors = [f"{name} {100 * e:.2g} %" for name, e in zip(level["names"], level["rms_errors"], strict=True)]
-        own = {"errors": ", ".join(errors), "share": 100 * level["arrived"]}
-        lines += vehicle.fill_rows(HORIZON_LINE, **settings, **own, **level)
-    for line in found["samples"]:
-        lines += vehicle.fill_rows(SAMPLES_LINE, sigma=SIGMA, **line)
-    return lines

@@ -34,12 +34,16 @@ def compute_magic(quick: bool, say: Say) -> Found:
     say("simulating the vehicle on tyres")
     speeds = vehicle.wheel_speeds()
     positions, path = vehicle.log_on_tyres(SECONDS, speeds)
+    reference = vehicle.gps_reference(SECONDS, positions)
     found: Found = {
         "times": path.times[::5].round(4).tolist(),
         "yaw": path.states[::5, 5].round(5).tolist(),
         "path": vehicle.curve(path).tolist(),
         "samples": positions.tolist(),
-        "fits": vehicle.fit_resticks(vehicle.gps_reference(SECONDS, positions), START, positions),
+        "fits": {
+            restick: vehicle.fit_log(reference, START, positions, restick=restick)
+            for restick in ("continuous", "reset")
+        },
     }
     found["ramps"] = _ramps(say)
     found.update(_coefficients(speeds, say))
@@ -161,7 +165,7 @@ LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 def compute_trials(quick: bool, say: Say) -> Found:
-    """Fit five logs, each with both restick models."""
+    """Fit five logs."""
     found: Found = {"trials": []}
     for number, (force, differential) in enumerate(TRIALS, start=1):
         say(f"trial {number}")
@@ -172,7 +176,7 @@ def compute_trials(quick: bool, say: Say) -> Found:
             "force": force,
             "samples": samples.tolist(),
             "filtered": reference.signal(np.linspace(0.0, 15.0, 151)).round(4).tolist(),
-            "fits": vehicle.fit_resticks(reference, START, clean, stick_force=force),
+            "fit": vehicle.fit_log(reference, START, clean, stick_force=force),
         }
         found["trials"].append(trial)
     return found
@@ -180,31 +184,20 @@ def compute_trials(quick: bool, say: Say) -> Found:
 
 def draw_trials(found: Found) -> dict[str, Figure]:
     """Draw figure 6: raw points, filtered curve, initial and optimal trajectory of each trial, shifted along X."""
-    return {
-        "fig6-trials": _paths(found, "continuous"),
-        "fig6-trials-reset": _paths(found, "reset"),
-    }
-
-
-def _paths(found: Found, restick: str) -> Figure:
     figure = vehicle.new_figure(2 * vehicle.COLUMN, 3.9)
     ax = figure.subplots()
     for k, trial in enumerate(found["trials"]):
-        shift, fit = np.array([SHIFT * k, 0.0]), trial["fits"][restick]
-        for path, (label, look) in zip(
-            (fit["initial"], trial["filtered"], fit["path"], trial["samples"]), LOOKS, strict=True
-        ):
+        shift, fit = np.array([SHIFT * k, 0.0]), trial["fit"]
+        paths = fit["initial"], trial["filtered"], fit["path"], trial["samples"]
+        for path, (label, look) in zip(paths, LOOKS, strict=True):
             ax.plot(*(np.array(path) + shift).T, label="" if k else label, **look)
-        theta = fit["theta"]
-        found_there = f"({theta['tau_1']:.2f}, {theta['tau_2']:.2f}) s\n$\\mu$ = {theta['mu']:.3f}"
-        place: dict[str, Any] = {"xy": (shift[0] + 8.0, -2.5), "ha": "center", "va": "top"}
-        ax.annotate(f"Trial {k + 1}\n$\\tau$ = {found_there}", fontsize=6.5, **place)
+        text = "Trial {}\n$\\tau$ = ({tau_1:.2f}, {tau_2:.2f}) s\n$\\mu$ = {mu:.3f}".format(k + 1, **fit["theta"])
+        ax.annotate(text, (shift[0] + 8.0, -2.5), ha="center", va="top", fontsize=6.5)
     ax.set_ylim(bottom=-15)
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=7)
-    model = "with reset at re-stick" if restick == "reset" else "as printed"
-    ax.set_title(f"Simulated logs (Magic Formula vehicle), equation (18) {model}", fontsize=8, loc="left")
-    vehicle.tidy(ax, f"X (m), each trial shifted by {SHIFT:g} m", "Y (m)")
-    return figure
+    ax.set_title("Simulated logs (Magic Formula vehicle), equation (18) as printed", fontsize=8, loc="left")
+    tidy(ax, f"X (m), each trial shifted by {SHIFT:g} m", "Y (m)")
+    return {"fig6-trials": figure}
 
 
 TRIAL_LINE = """
@@ -213,31 +206,16 @@ TRIAL_LINE = """
 | {iterations} iterations, ‖DJ‖ = {gradient_norm:.0e}, smallest eigenvalue of D²J {smallest_eigenvalue:.3g}
 """
 
-TRIALS_LINES = """
+TRIALS_LINE = """
 * Fig. 6 (simulated logs): all trials converge to ‖DJ‖ < 1e-7 in fewer than 15 iterations | yes
 | {answer}: at most {most} iterations, ‖DJ‖ at most {largest:.0e}
-* Re-stick (simulated logs): cost J as printed, and with a reset map | not done | {costs} | {remark}
 """
-
-BETTER = (
-    "the reset explains every log better: rms distance to the noise-free log {:.2f} m as printed, {:.2f} m with it, at "
-    "as many unknowns"
-)
 
 
 def list_trials(found: Found) -> list[Row]:
     """Return the lines of the table."""
-    literal, reset = ([trial["fits"][kind] for trial in found["trials"]] for kind in ("continuous", "reset"))
-    lines = [row for k, fit in enumerate(literal, start=1) for row in vehicle.fill_rows(TRIAL_LINE, number=k, **fit)]
-    most, largest = (max(fit[name] for fit in literal) for name in ("iterations", "gradient_norm"))
-    costs = [(a["cost"], b["cost"]) for a, b in zip(literal, reset, strict=True)]
-    distances = (np.mean([fit["rms_position_error"] for fit in fits]) for fits in (literal, reset))
-    better = all(b < a for a, b in costs)
-    return lines + vehicle.fill_rows(
-        TRIALS_LINES,
-        answer="yes" if most < 15 and largest < 1e-7 else "no",
-        most=most,
-        largest=largest,
-        costs="; ".join(f"{a:.2f}, {b:.3f}" for a, b in costs),
-        remark=BETTER.format(*distances) if better else "the reset does not explain every log better",
-    )
+    fits = [trial["fit"] for trial in found["trials"]]
+    lines = [row for k, fit in enumerate(fits, start=1) for row in vehicle.fill_rows(TRIAL_LINE, number=k, **fit)]
+    most, largest = (max(fit[name] for fit in fits) for name in ("iterations", "gradient_norm"))
+    answer = "yes" if most < 15 and largest < 1e-7 else "no"
+    return lines + vehicle.fill_rows(TRIALS_LINE, answer=answer, most=most, largest=largest)

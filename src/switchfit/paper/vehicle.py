@@ -183,13 +183,6 @@ def positions_at(path: Trajectory, times: FloatArray) -> FloatArray:
     return path.states[nodes][:, [0, 2]]
 
 
-def fit_positions(path: Trajectory, times: FloatArray, theta: tuple[float, ...], sigma: float, tf: float) -> Problem:
-    """Return the estimation problem of equation (18) with positions along a trajectory as measurements."""
-    return stick_slip(
-        Measurements(times, positions_at(path, times), position, sigma=sigma, names=("X", "Y")), theta, tf=tf
-    )
-
-
 def curve(path: Trajectory) -> FloatArray:
     """Return positions (K, 2) along a trajectory, a tenth of a second or less apart, for figures."""
     at = np.linspace(path.times[0], path.times[-1], 151)
@@ -201,40 +194,32 @@ def gps_reference(times: FloatArray, positions: FloatArray) -> ReferenceSignal:
     return ReferenceSignal.from_samples(times, positions, observe=position, lowpass_hz=LOWPASS_HZ, names=("X", "Y"))
 
 
-def complete(study: Any) -> Any:
-    """Return the study itself; raise KeyboardInterrupt if it was stopped before its end."""
-    if len(study) < study.requested:
+def complete(fit: Estimate) -> Estimate:
+    """Return the fit itself; raise KeyboardInterrupt if it was stopped before its end."""
+    if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    return study
+    return fit
 
 
-def fit_resticks(
-    reference: ReferenceSignal, start: tuple[float, ...], positions: FloatArray, *, stick_force: float = 15.0
-) -> dict[str, Any]:
-    """Fit stick-slip, continuous and with a reset at re-stick; positions are those at each second, (K, 2)."""
-    found: dict[str, Any] = {}
-    restick: Restick
-    for restick in ("continuous", "reset"):
-        problem = stick_slip(reference, start, stick_force=stick_force, restick=restick)
-        fit = fit_locally(problem)
-        path = fit.trajectory
-        off = positions_at(path, np.arange(float(len(positions)))) - positions
-        found[restick] = {
-            **summary(fit),
-            "initial": curve(simulate(problem)).tolist(),
-            "path": curve(path).tolist(),
-            "times": path.times.round(4).tolist(),
-            "yaw": path.states[:, 5].round(5).tolist(),
-            "rms_position_error": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-        }
-    return found
+def fit_log(reference: ReferenceSignal, start: tuple[float, ...], exact: FloatArray, **settings: Any) -> Found:
+    """Fit (18) to a log whose exact positions at each second are (K, 2); the settings are those of `stick_slip`."""
+    problem = stick_slip(reference, start, **settings)
+    fit = fit_locally(problem)
+    path = fit.trajectory
+    off = positions_at(path, np.arange(float(len(exact)))) - exact
+    return {
+        **summary(fit),
+        "initial": curve(simulate(problem)).tolist(),
+        "path": curve(path).tolist(),
+        "times": path.times.round(4).tolist(),
+        "yaw": path.states[:, 5].round(5).tolist(),
+        "rms_position_error": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+    }
 
 
 def summary(fit: Estimate) -> dict[str, Any]:
     """Return the result of a fit, with the second-order sufficient conditions, as plain numbers."""
-    if fit.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
-    smallest = certify(fit, None).smallest_eigenvalue
+    smallest = certify(complete(fit), None).smallest_eigenvalue
     return {
         "theta": dict(zip(fit.theta_names, fit.theta.tolist(), strict=True)),
         "cost": fit.cost,
@@ -280,11 +265,6 @@ def draw_vehicle(found: Found) -> dict[str, Figure]:
     ax.plot([0, 0.7], [0, 0], **dash)
     ax.text(0.47, 0.08, r"$\theta$", fontsize=9)
     ax.plot(0, 0, "o", color=DARK, markersize=3)
-    ax.text(-0.03, -0.05, "(X, Y)", fontsize=7, ha="right")
-    ax.plot([0, a], [0, 0], color=DARK, linewidth=1.5, transform=turn)
-    ax.plot([a, a], [0, b], color=DARK, linewidth=1.5, transform=turn)
-    ax.text(a / 2 - 0.02, 0.02, f"{a:g} m", **words)
-    ax.text(a + 0.04, 0.55 * b, f"{b:g} m", fontsize=6.5, va="center", transform=turn, rotation=HEADING)
     ax.plot([], [], color=RED, label="drive forces in slip")
     ax.plot([], [], color=BLUE, label="friction against a turn to the left (slip)")
     ax.set(xlim=(-0.7, 0.85), ylim=(-0.75, 0.62), xlabel="X (m)", ylabel="Y (m)")

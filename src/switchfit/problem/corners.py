@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -160,20 +160,6 @@ def _has_corners(jaxpr: Any) -> bool:
     return any(equation.primitive.name in CORNERS for each in every for equation in each.eqns)
 
 
-class End(NamedTuple):
-    """An end of a branch, whose function of (t, x, p) is positive inside and zero at the end.
-
-    Attributes
-    ----------
-    corner : int
-    side : int
-        The side of the corner behind it.
-    """
-
-    corner: int
-    side: int
-
-
 class Corners:
     """The corners of a mode, and its branches.
 
@@ -246,10 +232,12 @@ class Corners:
 
         return self._derive(("beyond", corner), sides, evaluate)
 
-    def list_ends(self, sides: Sides) -> list[End]:
-        """Return the ends of a branch."""
-        ends = [[End(k, -side)] if side else [End(k, -1), End(k, 1)] for k, side in enumerate(sides)]
-        return [end for each in ends for end in each]
+    def list_ends(self, sides: Sides) -> list[tuple[int, int]]:
+        """Return the corner at each end of a branch, and its side behind the end.
+
+        The function of an end, of (t, x, p), is positive inside and zero at the end.
+        """
+        return [(k, behind) for k, side in enumerate(sides) for behind in ((-side,) if side else (-1, 1))]
 
     def ends(self, sides: Sides) -> Function:
         """Return the functions of all ends of a branch, (ends,)."""

@@ -230,9 +230,6 @@ class PiecewisePolynomial:
     knots: FloatArray
     coefficients: FloatArray
 
-    def __repr__(self) -> str:
-        return format_line(self, f"{len(self.knots)} knots", f"{self.channels} channels")
-
     def __post_init__(self) -> None:
         if not np.isfinite(self.coefficients).all():
             raise ValueError(OVERFLOW)
@@ -273,25 +270,6 @@ def fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
     return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
 
 
-def fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
-    """Return the spline through all samples; missing ones are interpolated first, by a spline of their channel.
-
-    Parameters
-    ----------
-    times : (K,)
-    values : (K, q)
-        NaN where a sample is missing.
-    """
-    filled = values.copy()
-    for channel in filled.T:
-        known = np.isfinite(channel)
-        if known.sum() < 4:
-            raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
-        if not known.all():
-            channel[~known] = fit_spline(times[known], channel[known][:, None])(times[~known])[:, 0]
-    return fit_spline(times, filled)
-
-
 def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
     """Filter a signal by a second-order Butterworth filter, forward and backward, on a grid of ten points per period of
     the cut-off.
@@ -318,6 +296,20 @@ def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePo
     padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
     filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
     return fit_spline(grid, filtered)
+
+
+def _interpolate(given: Any, values: FloatArray, lowpass_hz: float | None) -> PiecewisePolynomial:
+    """Return the signal of samples (K,) and (K, q), broken at times that are given twice, and filtered if asked for."""
+    # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
+    times = _count_seconds(given) if isinstance(given, Dates) else given
+    cuts = np.flatnonzero(np.diff(times) == 0) + 1
+    pieces = np.split(times, cuts)
+    if (shortest := min(map(len, pieces))) < 4:
+        raise ValueError(f"ReferenceSignal needs four samples or more in each part; got {shortest}.")
+    parts = [fit_spline(*piece) for piece in zip(pieces, np.split(values, cuts), strict=True)]
+    knots = np.concatenate([part.knots[:-1] for part in parts] + [times[-1:]])
+    signal = PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
+    return signal if lowpass_hz is None or isinstance(given, Dates) else filter_lowpass(signal, lowpass_hz)
 
 
 @dataclass(frozen=True, eq=False)
@@ -441,8 +433,8 @@ class ReferenceSignal:
 
     Parameters
     ----------
-    signal : PiecewisePolynomial
-        y_m, with q channels.
+    signal : PiecewisePolynomial or None
+        y_m, with q channels; None: that of the samples.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         If left out, the whole state is compared.
     weights : (q,) or (q, q) array_like, optional
@@ -471,7 +463,7 @@ class ReferenceSignal:
     1
     """
 
-    signal: PiecewisePolynomial
+    signal: Any
     observe: Observe | None = None
     weights: Any = None
     names: Sequence[str] | None = None
@@ -483,6 +475,8 @@ class ReferenceSignal:
         return format_line(self, join_first(self.names or ()), format_count(self.signal.channels, "channel"))
 
     def __post_init__(self) -> None:
+        if self.signal is None and self.samples is not None:
+            set_fields(self, signal=_interpolate(*self.samples, self.lowpass_hz))
         form = "made by sf.ReferenceSignal.from_samples(times, values, ...)"
         as_instance(self.signal, "signal of a ReferenceSignal", PiecewisePolynomial, form)
         _check_channels(self, self.signal.channels, None, None)
@@ -509,8 +503,8 @@ class ReferenceSignal:
             or more. The spline is broken at a time that is given twice, as at the transitions of a simulated
             trajectory; each part then needs four samples.
         values : (K,) or (K, q) array_like
-            NaN marks a missing value, as does the mask of a masked array; it is bridged by the interpolation. Tables
-            of pandas, polars and xarray, and a `Log`, bring their names and units.
+            Times at which a value is NaN, which marks a missing one, are left out. Tables of pandas, polars and xarray,
+            and a `Log`, bring their names and units.
         observe : callable ``h(t, x, p) -> (q,)``, optional
         lowpass_hz : float, optional
             Cut-off, in cycles per time unit of the experiment (Hz only if that is s), of a second-order Butterworth
@@ -522,7 +516,7 @@ class ReferenceSignal:
         Raises
         ------
         ValueError
-            For bad times or values, fewer than four samples in a channel, or a cut-off that is not positive or far
+            For bad times or values, fewer than four samples in a part, or a cut-off that is not positive or far
             above the sampling rate.
         TypeError
             If times are neither numbers nor dates, or values, weights or the cut-off are not numbers.
@@ -543,19 +537,10 @@ class ReferenceSignal:
         found = find_labels(values)
         given, values = _check_samples(times, values, "ReferenceSignal", at_least=4, breaks=True, missing=True)
         table = values.reshape(len(given), -1)
-        # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
-        times = _count_seconds(given) if isinstance(given, Dates) else given
-        cuts = np.flatnonzero(np.diff(times) == 0) + 1
-        pieces = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
-        parts = [fit_bridged_spline(part_times, part) for part_times, part in pieces]
-        knots = np.concatenate([part.knots[:-1] for part in parts] + [times[-1:]])
-        signal = PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
-        if lowpass_hz is not None:
-            lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
-            if given is times:
-                signal = filter_lowpass(signal, lowpass_hz)
+        known = ~np.isnan(table).any(axis=1)
+        cutoff = None if lowpass_hz is None else as_positive(lowpass_hz, "lowpass_hz")
         names, units = (found[0] if names is None else names), (found[1] if units is None else units)
-        return cls(signal, observe, weights, names, (given, table), lowpass_hz, units)
+        return cls(None, observe, weights, names, (given[known], table[known]), cutoff, units)
 
 
 @dataclass(frozen=True, eq=False)
@@ -573,8 +558,8 @@ class Measurements:
         ISO 8601, datetime, datetime64, columns of pandas, polars or xarray, `Log.dates`, or what `from_epoch` returns.
         They may be irregular.
     values : (K,) or (K, q) array_like
-        Samples; NaN marks a missing one, as does the mask of a masked array. Tables of pandas, polars and xarray, and
-        a `Log`, bring their names and units. For an `OnlineEstimator` there may be none yet: ``np.empty((0, q))``.
+        Samples; NaN marks a missing one. Tables of pandas, polars and xarray, and a `Log`, bring their names and units.
+        For an `OnlineEstimator` there may be none yet: ``np.empty((0, q))``.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         If left out, the whole state is measured. At a transition with a reset map, the sample is of the state
         just before the jump.
@@ -735,23 +720,8 @@ def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any
     if not has_dates(item):
         return item
     what = what or f"times of {type(item).__name__}"
-    if isinstance(item, ReferenceSignal) and item.samples is not None:
-        return replace_samples(item, origin.to_numbers(item.samples[0], time_unit, what), item.samples[1])
     own = {each.name: count_from(getattr(item, each.name), origin, time_unit, what) for each in fields(item)}
-    return replace(item, **own)
-
-
-def replace_samples(item: ReferenceSignal, times: FloatArray, values: FloatArray) -> ReferenceSignal:
-    """Return a reference signal that is made again from other samples.
-
-    Parameters
-    ----------
-    item : ReferenceSignal
-    times : (K,)
-    values : (K, q)
-    """
-    own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
-    return ReferenceSignal.from_samples(times, values, **own)
+    return replace(item, **own | ({"signal": None} if isinstance(item, ReferenceSignal) else {}))
 
 
 def _check_samples(
@@ -766,13 +736,13 @@ def _check_samples(
 ) -> tuple[Any, FloatArray]:
     """Return times (K,) and values (K,) or (K, q) as float64, checked against each other; dates remain dates.
 
-    With `breaks`, a time may occur twice; with `missing`, values may be NaN, and masked ones become NaN; without
+    With `breaks`, a time may occur twice; with `missing`, values may be NaN; without
     `columns`, the shape of the values must be (K,).
     """
     dates = read_dates(times, f"{what} times")
     form = "an array of numbers"
     times = as_array(times, f"{what} times", form=form, finite=True) if dates is None else _count_seconds(dates)
-    values = as_array(values, f"{what} values", form=form, missing=missing, finite=not missing)
+    values = as_array(values, f"{what} values", form=form, finite=not missing)
     if values.ndim not in ((1, 2) if columns else (1,)) or times.shape != values.shape[:1]:
         raise ValueError(
             f"{what} needs times of shape (K,) and values of shape (K,){' or (K, q)' if columns else ''}; "

@@ -258,7 +258,6 @@ class Experiment:
         set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
         set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_times()
-        self._check_jumps()
         self._check_data_inside()
         if self.inputs is not None:
             self.inputs.signal(t0, self.end)
@@ -380,6 +379,11 @@ class Experiment:
             what = "tf" if i > len(self.transition_times) else f"transition time {i}"
             _require_single(tau, what)
             require_time_unit(tau, what, self.time_unit)
+            if not tau.fixed and np.any(self.jump_times == tau.value):
+                raise ValueError(
+                    f"the guess of {what} is {show_time(self, float(tau.value))}, the time of a jump. The two keep "
+                    "their order: give a guess a little before or after the jump."
+                )
         if len({tau.scale for tau in self._own_times if not tau.fixed}) > 1:
             raise ValueError(
                 "transition times that are estimated, and a free tf, must be on one scale; got "
@@ -387,42 +391,19 @@ class Experiment:
             )
         knots = self.ends_of_modes(self.initial_times)
         if np.any(np.diff(knots) <= 0):
-            raise ValueError(
-                f"transition_times must increase strictly inside (t0, tf) = ({show_time(self, self.t0)}, "
-                f"{show_time(self, knots[-1])}); got {self._show_times(knots[1:-1])}."
-            )
-
-    def _show_times(self, times: FloatArray) -> str:
-        return f"[{join_names(show_time(self, time) for time in times)}]"
-
-    def _check_jumps(self) -> None:
-        acts, last = self.jump_times, self.t0 + self.initial_length
-        outside = (acts < self.t0) | (acts >= last)
-        if outside.any():
-            raise ValueError(
-                f"A Jump must lie in [t0, tf) = [{show_time(self, self.t0)}, {show_time(self, last)}); got "
-                f"{self._show_times(acts[outside])}. Leave it out, or move t0 or tf."
-            )
-        for i, tau in enumerate(self._own_times, start=1):
-            if not tau.fixed and np.any(acts == tau.value):
-                raise ValueError(
-                    f"Transition time {i} is guessed at {show_time(self, float(tau.value))}, the time of a jump. "
-                    "The two keep their order: give a guess a little before or after the jump."
-                )
+            first, *times, last = (show_time(self, time) for time in knots)
+            horizon, got = f"({first}, {last})", join_names(times)
+            raise ValueError(f"transition_times must increase strictly inside (t0, tf) = {horizon}; got [{got}].")
 
     def _check_data_inside(self) -> None:
+        acts, last = self.jump_times, self.t0 + self.initial_length
+        self._require_inside("Jump time", acts, (acts < self.t0) | (acts >= last), last, ", the end left out")
         for item in self.data:
             if isinstance(item, Measurements) and not isinstance(item.delay, str):  # else its bounds decide
-                times, last = item.seen_times, self.earliest_end
-                outside = (times < self.t0) | (times > last)
-                if outside.any():
-                    late = f" less the delay of {item.delay:g}" if item.delay else ""
-                    bound = ", the lower bound of tf" if self.has_free_tf else ""
-                    raise ValueError(
-                        f"Measurements times{late} must lie inside [t0, tf] = [{show_time(self, self.t0)}, "
-                        f"{show_time(self, last)}{bound}]; {outside.sum()} of {len(times)} do not, the first is "
-                        f"{show_time(self, times[outside][0])}."
-                    )
+                late = f" less the delay of {item.delay:g}" if item.delay else ""
+                times, bound = item.seen_times, ", the lower bound of tf" if self.has_free_tf else ""
+                outside = (times < self.t0) | (times > self.earliest_end)
+                self._require_inside(f"Measurements times{late}", times, outside, self.earliest_end, bound)
             elif isinstance(item, ReferenceSignal):
                 first, last = item.signal.knots[[0, -1]]
                 if first > self.t0 or last < self.end:
@@ -432,6 +413,15 @@ class Experiment:
                         f"{show_time(self, self.end)}{bound}); this one is known from {show_time(self, first)} to "
                         f"{show_time(self, last)}. Give t0 and tf inside that, or a longer signal."
                     )
+
+    def _require_inside(
+        self, what: str, times: FloatArray, outside: NDArray[np.bool_], last: float, bound: str = ""
+    ) -> None:
+        if outside.any():
+            raise ValueError(
+                f"{what} must lie inside [t0, tf] = [{show_time(self, self.t0)}, {show_time(self, last)}{bound}]; "
+                f"{outside.sum()} of {len(times)} do not, the first is {show_time(self, times[outside][0])}."
+            )
 
     @property
     def earliest_end(self) -> float:

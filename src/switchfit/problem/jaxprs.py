@@ -3,8 +3,8 @@
 Numbers that are known in a traced function: those that lost digits, and indices that are out of range.
 
 By default JAX computes in 32 bits, so that ``K = jnp.array(0.1)`` is 0.10000000149011612: a fit with it solves another
-problem. Constants that a function reads, and numbers computed from them, have to pass
-`switchfit.problem.validation.refuse_single_precision`; values that depend on t, x or p must not be cast at all.
+problem. Constants that a function reads have to pass `switchfit.problem.validation.refuse_single_precision`, and
+nothing may be computed in 32 bits.
 
 JAX raises no error for indices out of range: ``x[2]`` of two states is the last state, and ``x.at[2].set(0.0)`` changes
 nothing. The fit is then that of another model.
@@ -172,8 +172,9 @@ PUBLIC = (
 KEEPING = frozenset(
     {"slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "rev", "gather", "stack", "copy"}
     | {"dynamic_slice", "expand_dims", "select_n", "split", "unstack", "stop_gradient", "pad", "tile", "copy_p"}
+    | {"neg", "abs", "max", "min"}
 )
-"""Operations that only move entries."""
+"""Operations that only move entries, or are exact in any precision."""
 
 PROMISED = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
 """Mode of ``x[index]``; the other modes say what an index out of range means."""
@@ -211,18 +212,18 @@ def refuse_wrong_constants(closed: Any, what: str) -> None:
     closed : jaxpr of the function
     what : str, such as "mode 'slip'"
     """
-    every = (equation for jaxpr in list_jaxprs(closed.jaxpr) for equation in jaxpr.eqns)
-    has_short = any(_is_short(atom) for equation in every for atom in (*equation.invars, *equation.outvars))
-    _Constants(what, has_short).run(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
+    _Constants(what).run(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
 
 
 class _Constants(Walk):
-    """Follows known numbers, and None for unknown ones; `has_short`: some are of less than double precision."""
+    """Follows known numbers, and None for unknown ones, and checks them."""
 
-    def __init__(self, what: str, has_short: bool) -> None:
-        self._what, self._has_short = what, has_short
+    def __init__(self, what: str) -> None:
+        self._what = what
 
     def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
+        for number in given:
+            refuse_single_precision(number, f"a constant of {self._what}{_locate(origin)}")
         inner = find_inner_jaxprs(equation)
         results: Sequence[Any] = [None] * len(equation.outvars)
         for jaxpr in inner:
@@ -230,37 +231,28 @@ class _Constants(Walk):
                 results = self.enter(equation, jaxpr, given, origin)
             else:
                 self.enter(equation, jaxpr, [None] * len(getattr(jaxpr, "jaxpr", jaxpr).invars), origin)
-        if not inner and all(operand is not None for operand in given):
-            results = self._evaluate(equation, given)
-        if self._has_short:
-            self._check_precision(equation, given, results, _locate(origin))
+        if not inner:
+            self._check_precision(equation, origin)
+            if all(operand is not None for operand in given):
+                results = self._evaluate(equation, given)
         self._check_indices(equation, given, origin)
         return results
 
     def _evaluate(self, equation: Any, given: list[Any]) -> Sequence[Any]:
-        """Return the results of an operation of known numbers: of all if some are short, else of those of indices."""
-        fold = FOLDED.get(equation.primitive.name)
-        if fold is not None and getattr(equation.outvars[0].aval.dtype, "kind", "O") in "iub":
-            return [fold(*given, **equation.params)]
-        if not self._has_short or equation.effects:
+        """Return the results of an operation of known numbers that may make an index."""
+        fold, kind = FOLDED.get(equation.primitive.name), getattr(equation.outvars[0].aval.dtype, "kind", "O")
+        if fold is None or kind not in "iub":
             return [None] * len(equation.outvars)
-        with jax.ensure_compile_time_eval():
-            return evaluate(equation, given)
+        return [fold(*given, **equation.params)]
 
-    def _check_precision(self, equation: Any, given: list[Any], results: Sequence[Any], where: str) -> None:
-        """Raise ValueError if a known number of an operation lost digits, or an unknown one is cast."""
-        for number in given:
-            refuse_single_precision(number, f"a constant of {self._what}{where}")
-        if equation.primitive.name in KEEPING:
-            return
-        for variable, result in zip(equation.outvars, results, strict=True):
-            if result is not None:
-                refuse_single_precision(result, f"a constant of {self._what}{where}")
-            elif _is_short(variable) and not find_inner_jaxprs(equation):
-                raise ValueError(
-                    f"{self._what} computes in {variable.aval.dtype}{where} with numbers that depend on t, x or p, and "
-                    "so loses half of their digits: its arguments are float64, do not cast them."
-                )
+    def _check_precision(self, equation: Any, origin: Any) -> None:
+        """Raise ValueError if an operation computes in less than double precision."""
+        short = [variable.aval.dtype for variable in equation.outvars if _is_short(variable)]
+        if short and equation.primitive.name not in KEEPING:
+            raise ValueError(
+                f"{self._what} computes in {short[0]}{_locate(origin)}, and so loses half of all digits: its arguments "
+                "are float64, do not cast them, and write constants as numbers or NumPy arrays."
+            )
 
     def _check_indices(self, equation: Any, given: list[Any], origin: Any) -> None:
         """Raise ValueError for a known index of an operation that is out of range."""

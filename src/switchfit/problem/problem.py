@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
-from itertools import repeat
+from itertools import pairwise, repeat
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -41,9 +41,10 @@ def check_parameters(parameters: Any) -> dict[str, Parameter]:
     """Return the parameters of a problem by their names."""
     if not isinstance(parameters, Mapping | None):
         raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
-    given = {} if parameters is None else parameters
-    names = [as_name(name, "parameter names", "strings") for name in given]
-    return {name: as_parameter(given[name], f"parameter {shorten(name)}") for name in names}
+    return {
+        as_name(name, "parameter names", "strings"): as_parameter(value, f"parameter {shorten(name)}")
+        for name, value in (parameters or {}).items()
+    }
 
 
 def check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
@@ -279,7 +280,7 @@ class Problem:
 
         See Also
         --------
-        Problem.without_runs
+        HybridSystem, Experiment
 
         Examples
         --------
@@ -352,9 +353,8 @@ class Problem:
             prefix_runs(self.experiments), self.structures, self.experiments, strict=True
         ):
             # of the user's transitions: those of the structure have the jumps in between
-            for i in np.flatnonzero(drop_jumps(experiment, [g is not None for g in structure.guards])).tolist():
-                before, after = experiment.mode_sequence[i : i + 2]
-                names.append(f"{prefix}guard of tau_{i + 1} ({before} -> {after})")
+            pairs = zip(pairwise(experiment.mode_sequence), drop_jumps(experiment, structure.guards), strict=False)
+            names += [f"{prefix}guard of tau_{i} ({a} -> {b})" for i, ((a, b), guard) in enumerate(pairs, 1) if guard]
             names += [f"{prefix}terminal constraint {k + 1}" for k in range(structure.terminal_constraint_count)]
         return tuple(names)
 
@@ -612,47 +612,6 @@ class Problem:
         times = np.broadcast_to(self.experiments[e].initial_times, (*theta.shape[:-1], len(where))).copy()
         times[..., where >= 0] = theta[..., where[where >= 0]]
         return times
-
-    def without_runs(self, *names: str) -> Problem:
-        """Return the problem without some of its experiments, and without the parameters that these alone use.
-
-        Parameters
-        ----------
-        *names : str
-            Names of experiments; run1, run2, ... where they have none.
-
-        Raises
-        ------
-        ValueError
-            If there is no such experiment, or none would be left.
-
-        See Also
-        --------
-        Experiment
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> two = sf.Problem(problem.system, problem.experiments * 2, problem.parameters)
-        >>> two.theta_names, two.without_runs("run2").theta_names
-        (('run1.tau_1', 'run2.tau_1', 'k'), ('tau_1', 'k'))
-        """
-        known = self.run_names
-        for name in names:
-            if name not in known:
-                raise ValueError(f"there is no experiment {shorten(name)}; there are {join_names(known)}.")
-        kept = [e for e, name in enumerate(known) if name not in names]
-        if not kept:
-            raise ValueError("without these experiments none is left.")
-        used: list[set[str]] = []
-        for experiment, structure in zip(self.experiments, self.structures, strict=True):
-            used.append({experiment.parameter_map.get(name, name) for name, _, _ in structure.parameters})
-        lost = set().union(*used) - set().union(*(used[e] for e in kept))
-        parameters = {name: parameter for name, parameter in self.parameters.items() if name not in lost}
-        return replace(self, experiments=[self.experiments[e] for e in kept], parameters=parameters)
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
         """Return all transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones

@@ -10,7 +10,7 @@ required form and the value that was given (shortened, `shorten`).
   complex numbers, text, dates and `None` are not numbers here, although NumPy would convert most of them.
 - Numbers of less than double precision are refused if their values as doubles show that they have lost digits
   (`refuse_single_precision`).
-- Masked entries are missing samples, NaN, where missing samples are allowed; elsewhere they are refused.
+- Masked arrays with masked entries are refused: a missing sample is NaN.
 
 Problem files are validated with pydantic, Python calls are not. pydantic does not handle arrays, precision, masks or
 dates, so that every field would need a validator of its own, like the functions below; its errors are tables about a
@@ -73,7 +73,12 @@ def find_labels(value: Any) -> tuple[tuple[str, ...] | None, tuple[str, ...] | N
     these. Units are in ``attrs["units"]`` of the table or the column, a string or a mapping from names to units; they
     are None where no unit is given.
     """
-    channels = _list_channels(value)
+    channels = list_columns(value)
+    if channels is None and is_of_library(value, *LIBRARIES):
+        channels = [(getattr(value, "name", None), value)]
+        if getattr(value, "ndim", 1) == 2:
+            channels = [(label.item(), value) for label in value.coords.get(value.dims[1], ())]
+    channels = channels or []
     names = [name for name, _ in channels]
     proper = all(isinstance(name, str) and name.strip() for name in names) and len(set(names)) == len(names)
     units = tuple(_find_unit(column, name) or _find_unit(value, name) for name, column in channels)
@@ -85,19 +90,6 @@ def _find_unit(value: Any, name: Any) -> str:
     units = attributes.get("units", "") if isinstance(attributes, Mapping) else ""
     unit = units.get(name, "") if isinstance(units, Mapping) else units
     return unit if isinstance(unit, str) else ""
-
-
-def _list_channels(value: Any) -> list[tuple[Any, Any]]:
-    """Return the name of each channel, and its column; none for what is no table, column or labelled array."""
-    columns = list_columns(value)
-    if columns is not None:
-        return columns
-    if not is_of_library(value, *LIBRARIES):
-        return []
-    if getattr(value, "ndim", 1) != 2:
-        return [(getattr(value, "name", None), value)]
-    labels = value.coords.get(value.dims[1], ()) if hasattr(value, "dims") else ()
-    return [(label.item(), value) for label in labels]
 
 
 FloatArray = NDArray[np.float64]
@@ -125,31 +117,17 @@ _DATES = (datetime.date, datetime.time, datetime.timedelta)
 # --- what messages show -----------------------------------------------------------------------------------------------
 
 
-class _Short(reprlib.Repr):
-    """Representations of bounded length, computed in bounded time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = self.maxdict = 6
-        self.maxlevel = 4
-        self.maxstring = self.maxother = 60
-
-    def repr_ndarray(self, x: Any, level: int) -> str:
-        array = np.asarray(x)
-        if array.size <= 8:
-            return self.repr1(array.tolist(), level)
-        return f"an array of shape {array.shape} ({array.dtype})"
-
-    repr_ArrayImpl = repr_MaskedArray = repr_ndarray  # noqa: N815  # reprlib calls repr_<name of the type>
-
-
-_SHORT = _Short()
+_SHORT = reprlib.Repr()
+"""Representations of bounded length, computed in bounded time."""
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxset = _SHORT.maxfrozenset = _SHORT.maxdeque = _SHORT.maxdict = 6
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 4, 60, 60
 
 
 def shorten(value: Any) -> str:
     """Return any value as text for a message: at most `LONGEST` characters."""
     try:
-        text = " ".join(_SHORT.repr(value).split())
+        is_small = hasattr(value, "tolist") and np.size(value) <= 8
+        text = " ".join(_SHORT.repr(value.tolist() if is_small else value).split())
     except Exception:  # a faulty __repr__
         text = f"an object of type {type(value).__name__}"
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
@@ -167,7 +145,7 @@ class _WrongEntryError(Exception):
     """An entry of an argument is not a number: the entry, the type of the error to raise, and why."""
 
 
-def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False, finite: bool = False) -> FloatArray:
+def as_array(value: Any, what: str, *, form: str = ARRAY, finite: bool = False) -> FloatArray:
     """Return `value` as a new float64 array of any shape.
 
     Parameters
@@ -177,8 +155,6 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False,
         Name of the argument, for messages.
     form : str, optional
         Its required form, for messages.
-    missing : bool, optional
-        Whether masked entries become NaN; otherwise they are refused.
     finite : bool, optional
         Whether NaN and infinities are refused.
 
@@ -192,7 +168,7 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False,
     """
     try:
         is_double = type(value) is float or (type(value) is np.ndarray and value.dtype == np.float64)
-        exact = value if is_double else _read_exactly(value, what, missing)
+        exact = value if is_double else _read_exactly(value, what)
     except _WrongEntryError as wrong:
         entry, error, why = wrong.args
         inside = "" if entry is value else f", in which {shorten(entry)} is not a number"
@@ -287,7 +263,7 @@ def as_index(value: Any, what: str, size: int) -> int:
         raise ValueError(f"{what} must lie in 0..{size - 1}; got {shorten(value)}.") from None
 
 
-def _read_exactly(value: Any, what: str, missing: bool, depth: int = 0) -> Any:
+def _read_exactly(value: Any, what: str, depth: int = 0) -> Any:
     """Return a number, an array or nested lists that `numpy.array` converts to float64 without changing a number."""
     if type(value) in _EXACT:
         return value
@@ -295,15 +271,13 @@ def _read_exactly(value: Any, what: str, missing: bool, depth: int = 0) -> Any:
         raise _WrongEntryError(value, ValueError, f", which is nested more than {MOST_DIMENSIONS} deep")
     table = list_columns(value)
     if table is not None:  # its columns may differ in type
-        columns = [_read_exactly(column, what, missing, depth + 1) for _, column in table]
+        columns = [_read_exactly(column, what, depth + 1) for _, column in table]
         return np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
     if hasattr(value, "__array__") and not isinstance(value, type):
-        return _read_array_exactly(value, what, missing, depth)
+        return _read_array_exactly(value, what, depth)
     if isinstance(value, Sequence) and not isinstance(value, (*_TEXT, memoryview)):
-        kinds = set(map(type, value))
-        if kinds <= _EXACT:
-            return list(value)
-        return [_read_exactly(entry, what, missing, depth + 1) for entry in value]
+        is_exact = set(map(type, value)) <= _EXACT
+        return list(value) if is_exact else [_read_exactly(entry, what, depth + 1) for entry in value]
     if isinstance(value, (numbers.Real, Decimal)) and not isinstance(value, bool):
         try:
             return float(value)
@@ -316,38 +290,26 @@ def _read_exactly(value: Any, what: str, missing: bool, depth: int = 0) -> Any:
     raise _WrongEntryError(value, ValueError if isinstance(value, _TEXT) else TypeError, why)
 
 
-def _read_array_exactly(value: Any, what: str, missing: bool, depth: int) -> Any:
+def _read_array_exactly(value: Any, what: str, depth: int) -> Any:
     """Return an array, or another object with a dtype, as an array of integers or doubles."""
+    if np.any(np.ma.getmask(value)):
+        raise _WrongEntryError(
+            value, ValueError, ", a masked array: fill in what is masked, with NaN where it is missing"
+        )
     try:
         is_pandas = is_of_library(value, "pandas")
-        array = _read_pandas(value) if is_pandas else np.asarray(np.ma.getdata(np.asanyarray(value)))
+        array = value.to_numpy(na_value=np.nan) if is_pandas else np.asarray(value)
     except Exception as error:
         raise _WrongEntryError(value, TypeError, f", which NumPy cannot read ({type(error).__name__})") from None
     if array.dtype.kind in "Mm":
         raise _WrongEntryError(value, TypeError, NO_DATES)
     if array.dtype.kind == "O":
-        array = _read_exactly(array.tolist(), what, missing, depth + 1)
-    elif is_low_precision(array.dtype):
+        return _read_exactly(array.tolist(), what, depth + 1)
+    if is_low_precision(array.dtype):
         refuse_single_precision(array, what)
-        array = array.astype(np.float64)
     elif array.dtype.kind not in "iuf":
         raise _WrongEntryError(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
-    mask = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else np.False_
-    if np.any(mask) and not missing:
-        why = f", a masked array with {np.sum(mask)} masked entries. Leave them out, or fill them in"
-        raise _WrongEntryError(value, ValueError, why)
-    return np.where(mask, np.nan, array) if np.any(mask) else array
-
-
-def _read_pandas(value: Any) -> NDArray[Any]:
-    """Return a Series or an Index as an array, NA as NaN.
-
-    The types of pandas with NA become arrays of objects, which would hide that they were of single precision.
-    """
-    kind = getattr(getattr(value, "dtype", None), "numpy_dtype", None)
-    if kind is None or kind.kind not in "iuf":
-        return np.asarray(value)
-    return np.asarray(value.to_numpy(dtype=kind if kind.kind == "f" else np.float64, na_value=np.nan))
+    return array.astype(np.float64)
 
 
 # --- single precision -------------------------------------------------------------------------------------------------

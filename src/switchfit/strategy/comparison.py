@@ -225,8 +225,7 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
     Unknowns k: all of theta, less the number of guards and terminal constraints, and the residual variance if sigma is
     left out. If a sigma is a parameter, it is in theta.
 
-    For cross-validation, leave a run out, fit the others, and predict it:
-    ``sf.estimate(problem.without_runs("run 3")).validate(run_3)``.
+    For cross-validation, fit all runs but one, and predict it: ``sf.estimate(others).validate(run_3)``.
 
     See Also
     --------
