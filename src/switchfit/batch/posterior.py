@@ -33,8 +33,7 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import get_min_duration
-from switchfit.problem.validation import as_array, join_names, shorten
-from switchfit.runtime.frames import Variable, build_arviz
+from switchfit.problem.validation import join_names, shorten
 
 FLAT = -np.inf
 """Logarithm of a density of zero."""
@@ -223,48 +222,6 @@ class LogPosterior:
             away = np.where(has_low, np.log(np.maximum(at - low, EDGE)), -np.log(np.maximum(high - at, EDGE)))
         z = np.where(has_low & has_high, np.log(part / (1 - part)), np.where(has_low | has_high, away, at))
         return np.asarray(np.linalg.solve(self.root, z - self.center), dtype=np.float64)
-
-    def to_arviz(self, samples: ArrayLike) -> Any:
-        """Return samples with a variable for each unknown: ArviZ's InferenceData.
-
-        Parameters
-        ----------
-        samples : (chains, draws, d) or (draws, d) array_like
-            Of theta.
-
-        Raises
-        ------
-        MissingExtraError
-            If ArviZ or xarray is not installed.
-        ValueError
-            For samples of another shape.
-
-        See Also
-        --------
-        LogPosterior.constrain
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-
-        >>> posterior = sf.log_posterior(heater_problem())
-        >>> table = posterior.to_arviz(np.random.default_rng(0).normal(size=(4, 100, 2)))
-        >>> list(table.posterior), table.posterior["k"].shape
-        (['tau_1', 'k'], (4, 100))
-        """
-        given = as_array(samples, "samples")
-        given = given[None] if given.ndim == 2 else given
-        if given.ndim != 3 or given.shape[-1] != len(self.names):
-            raise ValueError(
-                f"samples must have shape (chains, draws, {len(self.names)}): {join_names(self.names)}; got "
-                f"{np.shape(samples)}."
-            )
-        units = [unit if unit != "1" else "" for unit in self.problem.unknowns.units]
-        named = enumerate(zip(self.names, units, strict=True))
-        draws = [Variable(name, given[..., i], ("chain", "draw"), unit) for i, (name, unit) in named]
-        return build_arviz(draws, {"inference_library": "switchfit", "draws": "posterior"})
 
     @cached_property
     def _limits(self) -> Limits:

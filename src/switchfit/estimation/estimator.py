@@ -39,7 +39,7 @@ from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
 from switchfit.runtime.files import from_json, read_document, to_json, write_atomically, write_document
-from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
+from switchfit.runtime.frames import Tabular, build_pandas, describe_frame
 from switchfit.runtime.presentation import (
     Displayed,
     Drawn,
@@ -68,7 +68,6 @@ from switchfit.uncertainty.walks import HIGHEST_LEVEL, compute_threshold, replac
 
 if TYPE_CHECKING:
     import pandas
-    import xarray
 
 
 TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
@@ -749,7 +748,7 @@ class Estimate(Fit, Tabular, Displayed):
 
         See Also
         --------
-        Estimate.to_xarray, Trajectory.to_pandas, Fits.to_pandas
+        Trajectory.to_pandas, Fits.to_pandas
 
         Examples
         --------
@@ -763,34 +762,6 @@ class Estimate(Fit, Tabular, Displayed):
         (24, 6)
         """
         return build_pandas(describe_frame(self, what=as_choice(what, "what", TABLES)))
-
-    def to_xarray(self, what: TableKind = "unknowns") -> xarray.Dataset:
-        """Return one of the tables of the fit as a Dataset; that of the unknowns has covariance and Hessian too.
-
-        Parameters
-        ----------
-        what : {"unknowns", "trajectories", "residuals", "history"}
-            As in `to_pandas`.
-
-        Raises
-        ------
-        ImportError
-            If xarray is not installed.
-
-        See Also
-        --------
-        Estimate.to_pandas, Trajectory.to_xarray, Fits.to_xarray
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> fit.to_xarray()["covariance"].sel(unknown="k", unknown_2="k").item() > 0
-        True
-        """
-        return build_xarray(describe_frame(self, what=as_choice(what, "what", TABLES)))
 
     def complete(self) -> Estimate:
         """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix, and the profiles of

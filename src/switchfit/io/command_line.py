@@ -476,8 +476,7 @@ def list_unknowns(estimate: Estimate) -> list[dict[str, Any]]:
     estimate : Estimate
     """
     frame = describe_frame(estimate)
-    columns = (*frame.index, *(each for each in frame.variables if each.dimensions == (frame.rows,)))
-    return zip_rows({each.name: each.values.tolist() for each in columns})
+    return zip_rows({each.name: each.values.tolist() for each in (*frame.index, *frame.columns)})
 
 
 def zip_rows(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
