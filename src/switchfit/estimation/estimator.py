@@ -2,7 +2,7 @@
 
 Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 9, "seal": "...", "fit": {...}, "certificate":
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 10, "seal": "...", "fit": {...}, "certificate":
 {...}}`` with the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of
 text, and the "transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes
 them again from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without
@@ -32,12 +32,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import CovarianceKind, Fit, inverse_on
+from switchfit.fit.result import Fit, inverse_on
 from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
+from switchfit.runtime import special
 from switchfit.runtime.files import from_json, read_document, to_json, write_atomically, write_document
 from switchfit.runtime.frames import Tabular, build_pandas, describe_frame
 from switchfit.runtime.presentation import (
@@ -56,7 +57,6 @@ from switchfit.uncertainty.certificate import Certificate, Identifiability, cert
 from switchfit.uncertainty.prediction import (
     Prediction,
     Sensitivity,
-    build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
     predict,
@@ -72,6 +72,7 @@ if TYPE_CHECKING:
 
 TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
 TABLES = get_args(TableKind)
+CovarianceKind = Literal["exact", "sandwich"]
 
 MOST_SENSITIVITIES = 2**28
 """Largest size, in bytes, of the derivatives of states and outputs at all nodes; above it, figures have no bands."""
@@ -221,36 +222,22 @@ class Estimate(Fit, Tabular, Displayed):
         """The certificate, if it was loaded or computed before; else None."""
         return self.saved_certificate or self.__dict__.get("certificate")
 
-    @cached_property
-    def gauss_newton(self) -> FloatArray | None:
-        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None if it is unknown."""
-        if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
-            return self.saved_gauss_newton
-        if not self.problem.estimates_delays and self.has_room_for_sensitivities():
-            # From the program of the exact Hessian, which the fit has compiled: 1 ms, and 0.7 s with one of its own.
-            samples = collect_sample_derivatives(self.problem, self.sensitivities)
-            return build_gauss_newton(self.problem, self.theta, samples)
-        return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
-
     def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance of theta from the exact Hessian, the Gauss-Newton matrix or both sides of it: (d, d).
+        """Return the covariance of theta from the exact Hessian, or the "sandwich" with it on both sides: (d, d).
 
         Parameters
         ----------
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            "exact", the observed information, is used by `covariance` and everything else here. The Gauss-Newton
-            matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
-            residuals, and treats the model as linear. "sandwich" is ``n / (n - d) H^-1 B H^-1`` with the exact Hessian
-            H and ``B = sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: with a robust loss it holds
-            for independent noise of any distribution, whether sigma is right or not.
+        hessian : {"exact", "sandwich"}
+            "exact", the observed information, is used by `covariance` and everything else here. "sandwich" is
+            ``n / (n - d) H^-1 B H^-1`` with the exact Hessian H and ``B = sum_k g_k g_k'``, g_k being the gradient of
+            the cost of sample k: with a robust loss it holds for independent noise of any distribution, whether sigma
+            is right or not.
 
         Raises
         ------
         ValueError
-            For another kind, or if the Gauss-Newton matrix is unknown: the cost does not consist of Measurements
-            alone, or the estimate was loaded without its problem from a file that lacks the matrix. For "sandwich"
-            without the problem, with priors, constraints, or a sigma or delay that is a parameter, and with no more
-            values than free unknowns.
+            For another kind. For "sandwich" without the problem, with a cost of anything but Measurements, with priors,
+            constraints, or a sigma or delay that is a parameter, and with no more values than free unknowns.
 
         References
         ----------
@@ -268,11 +255,11 @@ class Estimate(Fit, Tabular, Displayed):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> fit.covariance_from("gauss-newton").shape
+        >>> fit.covariance_from("sandwich").shape
         (2, 2)
         """
         if as_choice(hessian, "hessian", get_args(CovarianceKind)) != "sandwich":
-            return super().covariance_from(hessian)
+            return self.covariance
         if self.problem is None or not self.has_sandwich:
             raise ValueError(
                 "The sandwich covariance needs the gradient of each sample: the problem, with a cost of Measurements "
@@ -365,9 +352,9 @@ class Estimate(Fit, Tabular, Displayed):
         ----------
         level : float, between 0 and 1
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            As in `covariance_from`. With the last two, kinks are ignored, and with "sandwich" the quantile is that of
-            Student's t in any case.
+        hessian : {"exact", "sandwich"}
+            As in `covariance_from`. With "sandwich", kinks are ignored, and the quantile is that of Student's t in any
+            case.
 
         See Also
         --------
@@ -383,9 +370,10 @@ class Estimate(Fit, Tabular, Displayed):
         array([[2.43, 2.5 ],
                [0.38, 0.4 ]])
         """
-        intervals = super().confidence_intervals(level, hessian=hessian)
+        intervals = super().confidence_intervals(level)
         if hessian != "exact":
-            return intervals
+            quantile = float(special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
+            return self.build_intervals(quantile * np.sqrt(np.diag(self.covariance_from(hessian))))
         pieces, places = self._trace_profiles(level)
         return replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))
 
@@ -529,7 +517,7 @@ class Estimate(Fit, Tabular, Displayed):
 
     @property
     def residuals(self) -> ResidualDiagnostics:
-        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
+        """Tests of the residuals, channel by channel: whiteness, effective sample size."""
         return diagnose(self)
 
     def plot_residuals(self) -> Figure:
@@ -764,8 +752,8 @@ class Estimate(Fit, Tabular, Displayed):
         return build_pandas(describe_frame(self, what=as_choice(what, "what", TABLES)))
 
     def complete(self) -> Estimate:
-        """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix, and the profiles of
-        transition times with samples near.
+        """Return the estimate with all fields that are saved: computes the profiles of transition times with samples
+        near.
 
         See Also
         --------
@@ -777,12 +765,11 @@ class Estimate(Fit, Tabular, Displayed):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> fit.complete().saved_gauss_newton.shape
-        (2, 2)
+        >>> fit.complete().saved_pieces.shape[0]
+        1
         """
         pieces, places = self._trace_profiles()
-        matrix = self.gauss_newton
-        return replace(self, saved_gauss_newton=matrix, saved_pieces=pieces, saved_piece_places=places)
+        return replace(self, saved_pieces=pieces, saved_piece_places=places)
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:
@@ -1000,7 +987,7 @@ def describe_platform() -> str:
 
 
 FORMAT = "switchfit fit"
-VERSION = 9
+VERSION = 10
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,8 +184,6 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
     return Issue(found.kind, tuple(names[i] for i in named), figures)
 
 
-CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]
-
 if TYPE_CHECKING:  # a float or an array: what does arithmetic with both needs no cast
     Values = Mapping[str, Any]
 else:  # what files are read as
@@ -306,8 +304,6 @@ class Fit(Termination):
         Wall time of the estimation, always in seconds.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
-    saved_gauss_newton : (d, d) or None
-        The Gauss-Newton matrix of the samples, if it has been evaluated.
     saved_pieces : (T, 2, P, 5)
         Of transition times whose intervals follow from them, in a fit that was saved: as `Fits.pieces`.
     saved_piece_places : (T,) int
@@ -375,7 +371,6 @@ class Fit(Termination):
     hessian_kind: str
     seconds: float
     constraints: tuple[tuple[str, float, float], ...] = ()
-    saved_gauss_newton: FloatArray | None = None
     saved_pieces: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 1, 5)))
     saved_piece_places: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     priors: Mapping[str, str] = field(default_factory=dict)
@@ -501,11 +496,6 @@ class Fit(Termination):
         """Degrees of freedom: number of measured values and priors minus number of free unknowns."""
         return self.samples + len(self.priors) - self.free_basis.shape[1]
 
-    @property
-    def gauss_newton(self) -> FloatArray | None:
-        """The Gauss-Newton matrix of the samples and priors: (d, d); None if it is unknown."""
-        return self.saved_gauss_newton
-
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariance of theta from the exact Hessian on the free directions: (d, d).
@@ -517,40 +507,7 @@ class Fit(Termination):
         `Measurements`) or there are too few samples, and for unknowns with a component in a direction along which
         the Hessian is not positive; the others keep their variances.
         """
-        return self.covariance_from("exact")
-
-    def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance of theta from one of its matrices: (d, d); for others see `Estimate.covariance_from`.
-
-        Parameters
-        ----------
-        hessian : {"exact", "gauss-newton"}
-
-        Raises
-        ------
-        ValueError
-            If the Gauss-Newton matrix is unknown.
-
-        See Also
-        --------
-        Estimate.covariance_from
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> bool((fit.covariance_from("exact") == fit.covariance).all())
-        True
-        """
-        matrix = self.hessian if hessian == "exact" else self.gauss_newton
-        if matrix is None:
-            raise ValueError(
-                "The Gauss-Newton matrix of this fit is not known: it needs a cost of Measurements alone, and the "
-                "problem. Use hessian='exact'."
-            )
-        return self.variance_scale * inverse_on(self.free_basis, matrix)
+        return self.variance_scale * inverse_on(self.free_basis, self.hessian)
 
     @property
     def standard_errors(self) -> FloatArray:
@@ -582,7 +539,7 @@ class Fit(Termination):
         """
         return float(measure_quantile(as_level(level), max(self.freedom, 1), self.sigma_known))
 
-    def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
+    def confidence_intervals(self, level: float = 0.95) -> FloatArray:
         """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
 
         For unknowns on a logarithmic scale, theta is multiplied and divided by exp(quantile x relative standard
@@ -593,8 +550,6 @@ class Fit(Termination):
         ----------
         level : float, between 0 and 1
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            As in `covariance_from`. With "sandwich", the quantile is that of Student's t in any case.
 
         See Also
         --------
@@ -610,10 +565,24 @@ class Fit(Termination):
         array([[2.43, 2.5 ],
                [0.38, 0.4 ]])
         """
-        quantile = self.quantile(level)
-        if hessian == "sandwich":
-            quantile = float(special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
-        half = quantile * np.sqrt(np.diag(self.covariance_from(hessian)))
+        return self.build_intervals(self.quantile(level) * self.standard_errors)
+
+    def build_intervals(self, half: FloatArray) -> FloatArray:
+        """Return the intervals theta +- half (d,), cut off at the bounds, as of `confidence_intervals`: (d, 2).
+
+        See Also
+        --------
+        Estimate.confidence_intervals
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> bool((fit.build_intervals(0.0 * fit.theta + 1.0)[:, 1] == fit.theta + 1.0).all())
+        True
+        """
         log = np.isin(self.theta_names, self.log_scaled)
         low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
@@ -623,50 +592,6 @@ def measure_quantile(level: float, freedom: Any, sigma_known: bool | None) -> An
     """Return the two-sided quantiles of fits with these degrees of freedom, as of `Fit.quantile`: (R,)."""
     tail = 0.5 + level / 2
     return special.stdtrit(freedom, tail) if sigma_known is False else np.full(np.shape(freedom), special.ndtri(tail))
-
-
-class Disagreement(NamedTuple):
-    """Difference between the standard errors from the exact Hessian and from the Gauss-Newton matrix.
-
-    Attributes
-    ----------
-    factor : float
-        Largest ratio of the larger to the smaller one, over all linear combinations of the unknowns.
-    name : str
-        The unknown whose own standard errors differ the most.
-    exact, gauss_newton : float
-        Its standard errors.
-    """
-
-    factor: float
-    name: str
-    exact: float
-    gauss_newton: float
-
-
-@one_thread()
-def disagreement(fit: Fit) -> Disagreement | None:
-    """Compare the two covariances of a fit; None if one of them is unknown.
-
-    The ratios of the two variances over all linear combinations of the unknowns lie between the smallest and the
-    largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix.
-    """
-    Z, A = fit.free_basis, fit.gauss_newton
-    if A is None or fit.sigma_known is None or Z.shape[1] == 0:
-        return None
-    both = fit.covariance, fit.covariance_from("gauss-newton")
-    if not all(np.isfinite(covariance).all() for covariance in both):
-        return None
-    errors = np.sqrt([np.diag(covariance) for covariance in both])
-    ratios = []
-    for one, other in ((fit.hessian, A), (A, fit.hessian)):  # of each the largest, which no rounding hides
-        values, vectors, size = compute_scaled_spectrum(one, Z)
-        root = size[:, None] * vectors / np.sqrt(values)  # root' one root = 1
-        ratios.append(float(np.linalg.eigvalsh(root.T @ other @ root)[-1]))
-    held = errors[0] <= 0
-    changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
-    k = int(np.argmax(changes))
-    return Disagreement(max(ratios) ** 0.5, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:

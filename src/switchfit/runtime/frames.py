@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """Name, values (one a row) and unit of a column; the unit is empty where there is none, or where rows differ in it."""
+    """Name, values (one a row) and unit of a column, empty where there is none, or where rows differ in it."""
 
     name: str
     values: Any
