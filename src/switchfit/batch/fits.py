@@ -319,7 +319,7 @@ class Fits(Tabular, Displayed):
         if isinstance(best := getattr(self, "best", None), Estimate):
             content["best"] = describe_best(best)
         header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
-        write_arrays({name: getattr(self, name) for name in arrays} | {"header": header}, file, np.savez_compressed)
+        write_arrays({name: getattr(self, name) for name in arrays} | {"header": header}, file)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -39,8 +39,7 @@ SAME_COST = 1e-6
 
 SAME_PLACE = 1e-3
 """... each parameter by less than this part of the spread of the starts, or of its size where they do not differ in it,
-each transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count:
-where they sit is arbitrary."""
+with the same modes. Modes that are shorter than this part of the horizon have collapsed, and do not count."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -225,13 +224,12 @@ def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     labels = np.full(len(fits), -1)
     spread, size = np.ptp(fits.start, axis=0), np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
     spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)
-    others = ~np.isin(np.arange(len(spread)), np.concatenate(problem.unknowns.times))
+    others = ~problem.unknowns.is_time
     found: list[tuple[float, list[list[str]], FloatArray]] = []
     for k in np.argsort(fits.cost, kind="stable").tolist():
         if not fits.success[k]:
             continue
-        cost, (modes, switches) = float(fits.cost[k]), _list_switches(problem, fits.theta[k])
-        place = np.append((fits.theta[k] / spread)[others], switches)
+        cost, modes, place = float(fits.cost[k]), _list_modes(problem, fits.theta[k]), (fits.theta[k] / spread)[others]
         same = (
             label
             for label, (level, sequences, at) in enumerate(found)
@@ -245,18 +243,11 @@ def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     return labels
 
 
-def _list_switches(problem: Problem, theta: FloatArray) -> tuple[list[list[str]], list[float]]:
-    """Return each experiment's modes without the collapsed ones, and when they begin and end as parts of its horizon,
-    of all experiments together.
-    """
-    sequences, switches = [], []
+def _list_modes(problem: Problem, theta: FloatArray) -> list[list[str]]:
+    """Return the modes of each experiment without the collapsed ones."""
+    sequences = []
     for experiment, ends in zip(problem.experiments, problem.ends_of_modes(theta), strict=True):
-        knots = ((ends - experiment.t0) / experiment.initial_length).tolist()
-        modes: list[str] = []
-        for mode, begin, end in zip(experiment.mode_sequence, knots[:-1], knots[1:], strict=True):
-            if end - begin > SAME_PLACE and (not modes or modes[-1] != mode):
-                modes.append(mode)
-                switches.append(begin)
-        switches.append(knots[-1])
-        sequences.append(modes)
-    return sequences, switches
+        lasting = np.diff(ends) > SAME_PLACE * experiment.initial_length
+        modes = [mode for mode, lasts in zip(experiment.mode_sequence, lasting, strict=True) if lasts]
+        sequences.append([mode for mode, before in zip(modes, ["", *modes], strict=False) if mode != before])
+    return sequences

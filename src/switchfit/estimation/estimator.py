@@ -4,9 +4,8 @@ Save fits as JSON files that can be read without switchfit, and load them withou
 
 A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 10, "seal": "...", "fit": {...}, "certificate":
 {...}}`` with the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of
-text, and the "transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes
-them again from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without
-it are read too.
+text, is meant for readers of the file; `load` computes it again from the rest. ``"provenance"`` holds the fields of
+`Provenance`: what the fit was made from. Files without it are read too.
 
 `runtime.files` says how numbers, arrays and dataclasses are written.
 
@@ -1029,7 +1028,6 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "seal": _compute_seal(sealed),
-        **_list_dates(fit),
         **sealed,
     }
 
@@ -1064,17 +1062,6 @@ def load_saved(path: Path) -> tuple[Fit, Certificate, Provenance | None]:
         return fit, certificate, None if provenance is None else provenance.find_from(Path(path))
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
-
-
-def _list_dates(fit: Fit) -> dict[str, Any]:
-    """Return the transition times that are dates by their names, for readers of the file; {} where none is."""
-    dates = {}
-    for transition in fit.transitions:
-        origin = fit.trajectories[transition.experiment].origin
-        date = None if origin is None else origin.find_date(transition.time, transition.unit)
-        if date is not None:
-            dates[transition.name] = date.isoformat()
-    return {"transition_dates": dates} if dates else {}
 
 
 def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:

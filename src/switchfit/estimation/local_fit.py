@@ -328,17 +328,20 @@ def _describe(problem: Problem) -> dict[str, Any]:
     """Return the fields of an Estimate that all fits of a problem share."""
     unknowns, parameters = problem.unknowns, problem.parameters
     counts = [len(run.transition_times) for run in problem.experiments]
+    times = list(zip(unknowns.times, counts, strict=True))
     return {
         "theta_names": unknowns.names,
         "theta_units": unknowns.units,
         "lower": unknowns.lower,
         "upper": unknowns.upper,
         "run_names": problem.run_names,
-        "transition_places": tuple(where[:count] for where, count in zip(unknowns.times, counts, strict=True)),
+        "transition_places": tuple(where[:count] for where, count in times),
+        "final_places": tuple(int(where[count]) if len(where) > count else -1 for where, count in times),
         "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
         "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),
         "sigma_known": problem.is_sigma_known,
         "priors": {name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
         "log_scaled": unknowns.log_names,
+        "log_origins": unknowns.origin,
         "least_squares": problem.is_least_squares,
     }

@@ -270,6 +270,8 @@ class Fit(Termination):
     transition_times : tuple of (N,) arrays, one per experiment, fixed ones included
     transition_places : tuple of (N,) int arrays, one per experiment
         Index in theta of each transition time; -1 if it is fixed.
+    final_places : tuple of int, one per experiment
+        Index in theta of its tf; -1 if it is fixed.
     parameters : dict of name -> float, or array where there are several, fixed ones included
     parameter_units : dict of name -> str, fixed ones included
     fixed : tuple of str
@@ -312,6 +314,8 @@ class Fit(Termination):
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
+    log_origins : (d,)
+        From where these logarithms count: t0 for a transition time, otherwise 0.
     least_squares : bool
         Whether the terms of measurements and priors in J are half a sum of squares: no sigma is a parameter, no loss is
         robust.
@@ -356,6 +360,7 @@ class Fit(Termination):
     run_names: tuple[str, ...]
     transition_times: tuple[FloatArray, ...]
     transition_places: tuple[NDArray[np.intp], ...]
+    final_places: tuple[int, ...]
     parameters: Values
     parameter_units: Mapping[str, str]
     fixed: tuple[str, ...]
@@ -370,6 +375,7 @@ class Fit(Termination):
     integration_error: float
     hessian_kind: str
     seconds: float
+    log_origins: FloatArray
     constraints: tuple[tuple[str, float, float], ...] = ()
     saved_pieces: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 1, 5)))
     saved_piece_places: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
@@ -416,30 +422,9 @@ class Fit(Termination):
         return tuple(float(trajectory.times[-1]) for trajectory in self.trajectories)
 
     @property
-    def final_places(self) -> tuple[int, ...]:
-        """Index in theta of the tf of each experiment; -1 if it is fixed."""
-        names = ["tf"] if len(self.run_names) == 1 else [f"{run}.tf" for run in self.run_names]
-        free = [name in self.theta_names and name not in self.parameters for name in names]  # a parameter may be "tf"
-        return tuple(self.theta_names.index(name) if own else -1 for name, own in zip(names, free, strict=True))
-
-    @property
-    def log_origins(self) -> FloatArray:
-        """From where the logarithms of `log_scaled` unknowns count, (d,): t0 for a transition time, otherwise 0."""
-        origins = np.zeros(len(self.theta_names))
-        if not self.is_time[np.isin(self.theta_names, self.log_scaled)].any():
-            return origins
-        for e, trajectory in enumerate(self.trajectories):
-            places = np.append(self.transition_places[e], self.final_places[e])
-            origins[places[places >= 0]] = trajectory.times[0]
-        return origins
-
-    @property
     def is_time(self) -> NDArray[np.bool_]:
         """Which of the unknowns are transition times or a free tf: (d,)."""
-        found = np.zeros(len(self.theta_names), dtype=bool)
-        for places in (*self.transition_places, np.array(self.final_places, dtype=np.intp)):
-            found[places[places >= 0]] = True
-        return found
+        return np.isin(np.arange(len(self.theta_names)), [*np.concatenate(self.transition_places), *self.final_places])
 
     @property
     def transitions(self) -> list[Transition]:

@@ -41,13 +41,13 @@ from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import select_visible
+from switchfit.fit.trajectory import read_times, select_visible
 from switchfit.problem.data import FloatArray, influence
 from switchfit.problem.dates import Origin
-from switchfit.problem.experiment import count_times, show_time
+from switchfit.problem.experiment import show_time
 from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_instance, as_level
+from switchfit.problem.validation import as_index, as_instance, as_level
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Drawn, draw_figure, format_html, format_line, join_first
 
@@ -520,9 +520,7 @@ def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -
 
 def _check_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
     experiment = problem.experiments[e]
-    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
-    if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
-        raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
+    asked = read_times(experiment, times)
     if asked.min() < experiment.t0:
         unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
         start, first = show_time(experiment, experiment.t0), show_time(experiment, asked.min())
