@@ -273,7 +273,7 @@ REFUSED = {
     "theta must have shape": refused_study(theta=[2.0]),
     "noise must be given": refused_study(data=sf.Measurements(TIMES, np.zeros(24))),
     "simulates Measurements: every run needs some": refused_study(data=sf.RunningCost(lambda t, x, p: x[0] ** 2)),
-    "and none a ReferenceSignal": refused_study(data=sf.ReferenceSignal.from_samples([0.0, 6.0], [0.0, 0.0])),
+    "and none a ReferenceSignal": refused_study(data=sf.ReferenceSignal.from_samples(np.arange(7.0), np.zeros(7))),
     r"client must be a dask\.distributed\.Client; got str": refused_study(client="scheduler:8786"),
     r"array of shape \(S, 2\)": lambda: sf.multistart(room(), [1.0, 2.0]),
     "start 1 violates: k at its upper bound 5": lambda: sf.multistart(room(), [[1.0, 2.0], [1.0, 6.0]]),

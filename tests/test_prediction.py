@@ -266,7 +266,7 @@ def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known(
         return sf.estimate(sf.Problem(sf.HybridSystem({"on": driven}, [0.0]), run, {"k": 0.3}))
 
     assert fit("hold").predict([9.0]).outputs[0, 0] == pytest.approx(2.5 * (1 - np.exp(-3.6)), rel=1e-6)
-    with pytest.raises(ValueError, match=r"cannot be continued from tf = 6 to 9 s: Input must be known.*Input that"):
+    with pytest.raises(ValueError, match="Input must be known"):
         fit("linear").predict([9.0])
 
 

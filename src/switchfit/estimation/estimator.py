@@ -11,7 +11,7 @@ text, is meant for readers of the file; `load` computes it again from the rest. 
 
 The seal is a digest of fit and certificate: a file in which a number was changed, or lost, is refused.
 
-What a fit was made from: the problem file, hashes of data and models, versions. Enough to run it again.
+What a fit was made from: the problem file, hashes of the files that it names, versions. Enough to run it again.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Estimate(Fit, Tabular, Displayed):
     Attributes
     ----------
     provenance : Provenance or None
-        What a loaded estimate was made from, if its file says so: problem file, hashes of data and models, versions.
+        What a loaded estimate was made from, if its file says so: problem file, hashes of files, versions.
 
     See Also
     --------
@@ -633,7 +633,7 @@ class Estimate(Fit, Tabular, Displayed):
         path : path
         provenance : Provenance, optional
             What the fit was made from, ``load_problem("problem.toml").provenance``, from which ``switchfit validate``
-            and ``compare`` build the problem again. Left out, the file keeps hashes of the data, and versions.
+            and ``compare`` build the problem again. Left out, the file keeps versions.
 
         See Also
         --------
@@ -673,13 +673,12 @@ class Estimate(Fit, Tabular, Displayed):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> [digest.name for digest in fit.describe_provenance().data]
-        ['thermometer']
+        >>> sorted(fit.describe_provenance().versions)[:3]
+        ['Python', 'daqp', 'jax']
         """
         if given is not None:
-            as_instance(given, "provenance", Provenance, "the provenance of a problem file")
-            return replace(given, data=digest_data(self))
-        return self.provenance if self.saved_certificate is not None else describe_python_problem(self)
+            return as_instance(given, "provenance", Provenance, "the provenance of a problem file")
+        return self.provenance if self.saved_certificate is not None else describe_python_problem()
 
     def save_report(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
@@ -692,7 +691,7 @@ class Estimate(Fit, Tabular, Displayed):
             Such as "report.html".
         provenance : Provenance, optional
             As for `Estimate.save`: the text of the problem file goes into the report, with the hashes of the files that
-            it names; left out, the report holds the hashes of the data.
+            it names.
 
         Raises
         ------
@@ -838,12 +837,12 @@ PACKAGES = ("switchfit", "daqp", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class FileDigest:
-    """A file that a fit was made from, or an array.
+    """A file that a fit was made from.
 
     Attributes
     ----------
     name : str
-        Path of a file from the folder of the problem file, with forward slashes; channels of an array.
+        Its path from the folder of the problem file, with forward slashes.
     size : int
         Bytes.
     sha256 : str
@@ -874,8 +873,6 @@ class Provenance:
         Arguments of `estimate`.
     files : tuple of FileDigest
         The data files and the Python files of the model.
-    data : tuple of FileDigest
-        Times and values of each of the measurements, as they were fitted.
     versions : mapping of str to str
         Of Python, switchfit and the libraries.
     platform : str
@@ -887,7 +884,6 @@ class Provenance:
     log: str
     options: Mapping[str, int | float | str]
     files: tuple[FileDigest, ...]
-    data: tuple[FileDigest, ...]
     versions: Mapping[str, str]
     platform: str
 
@@ -933,32 +929,9 @@ def make_relative(path: str | Path, folder: str | Path) -> str:
         return Path(whole).as_posix()
 
 
-def describe_python_problem(fit: Fit) -> Provenance:
-    """Return what is known of a fit whose problem was built in Python: data, versions, platform.
-
-    Parameters
-    ----------
-    fit : Fit
-    """
-    return Provenance("", "", "", "", {}, (), digest_data(fit), find_versions(), describe_platform())
-
-
-def digest_data(fit: Fit) -> tuple[FileDigest, ...]:
-    """Return the digest of times and values of each Measurements, as float64 of little-endian machines.
-
-    Parameters
-    ----------
-    fit : Fit
-    """
-    found, single = [], len(fit.comparisons) == 1
-    for run, comparisons in zip(fit.run_names, fit.comparisons, strict=True):
-        for comparison in comparisons:
-            if comparison.kind == "measurements":
-                columns = np.column_stack([comparison.times, comparison.measured]).astype("<f8")
-                label = ", ".join(comparison.names) if single else f"{run}: {', '.join(comparison.names)}"
-                raw = columns.tobytes()  # row by row
-                found.append(FileDigest(label, len(raw), hashlib.sha256(raw).hexdigest()))
-    return tuple(found)
+def describe_python_problem() -> Provenance:
+    """Return what is known of a problem that was built in Python: versions and platform."""
+    return Provenance("", "", "", "", {}, (), find_versions(), describe_platform())
 
 
 def find_versions() -> dict[str, str]:
