@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import read_arrays, write_arrays
+from switchfit.batch.program import Ends
 from switchfit.estimation.estimator import Estimate, parse_fit, write_fit
 from switchfit.fit.result import interval, measure_quantile
 from switchfit.optimize import Status
@@ -85,7 +86,7 @@ def load_best(content: Any) -> Estimate | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Fits(Tabular, Displayed):
+class Fits(Ends, Tabular, Displayed):
     """Many fits of one model; R of them, d unknowns in the order of `theta_names`.
 
     Attributes
@@ -155,17 +156,6 @@ class Fits(Tabular, Displayed):
     requested: int
     runs: NDArray[np.intp]
     start: FloatArray
-    theta: FloatArray
-    cost: FloatArray
-    gradient: FloatArray
-    hessian: FloatArray
-    optimality: FloatArray
-    iterations: NDArray[np.int64]
-    evaluations: NDArray[np.int64]
-    status: NDArray[np.str_]
-    message: NDArray[np.str_]
-    free: NDArray[np.int64]
-    covariance: FloatArray
     samples: NDArray[np.int64]
     explained: FloatArray
     collapsed: NDArray[np.int64]

@@ -253,22 +253,13 @@ class LogPosterior:
 
     def _transform(self, z: Any) -> tuple[Any, Any]:
         """Return theta at z (d,), and ``log |dtheta/dz|``."""
-        limits = self._limits
-        lower, upper = limits.low, limits.high
+        before, gap, lower, upper = self._limits
         z = self.center + jnp.asarray(self.root) @ z
-        has_low, has_high = np.isfinite(lower), np.isfinite(upper)
-        both, one = has_low & has_high, (has_low != has_high) & (limits.before < 0)
-        width = np.where(both, upper - lower, 1.0)
-        signed, inside = jnp.where(has_low, z, -z), jax.nn.sigmoid(z)
-        log_slope = jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
-        away = jnp.exp(jnp.where(one, signed, 0.0))
-        theta = jnp.where(both, lower + width * inside, jnp.where(has_low, lower + away, upper - away))
-        theta = jnp.where(both | one, theta, z)
-        slopes = jnp.where(both, np.log(width) + log_slope, jnp.where(one, signed, 0.0))
-        for i in np.flatnonzero(limits.before >= 0).tolist():  # each after the time before it
-            first = jnp.maximum(lower[i], theta[limits.before[i]] + limits.gap[i])
-            theta = theta.at[i].set(first + (upper[i] - first) * inside[i])
-            slopes = slopes.at[i].set(jnp.log(upper[i] - first) + log_slope[i])
+        theta, slopes = _place_between(z, lower, upper)
+        for i in np.flatnonzero(before >= 0).tolist():  # each after the time before it
+            first = jnp.maximum(lower[i], theta[before[i]] + gap[i])
+            own, slope = _place_between(z[i], first, upper[i])
+            theta, slopes = theta.at[i].set(own), slopes.at[i].set(slope)
         return theta, jnp.sum(slopes) + np.linalg.slogdet(self.root)[1]
 
     def _scale_by(self, fit: Fit) -> LogPosterior:
@@ -327,6 +318,17 @@ class LogPosterior:
                 return J, g @ tangents[0]
 
         return cost
+
+
+def _place_between(z: Any, low: Any, high: Any) -> tuple[Any, Any]:
+    """Return theta between limits, which may be infinite, at z, and ``log dtheta/dz``: (d,) each, or numbers."""
+    has_low, has_high = jnp.isfinite(low), jnp.isfinite(high)
+    both, one = has_low & has_high, has_low ^ has_high
+    width, outwards = jnp.where(both, high - low, 1.0), jnp.where(one, jnp.where(has_low, z, -z), 0.0)
+    away = jnp.exp(outwards)
+    beside = jnp.where(one, jnp.where(has_low, low + away, high - away), z)
+    inside = jnp.log(width) + jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
+    return jnp.where(both, low + width * jax.nn.sigmoid(z), beside), jnp.where(both, inside, outwards)
 
 
 def require_float64(given: Any) -> None:

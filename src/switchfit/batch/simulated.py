@@ -56,7 +56,6 @@ from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_count, as_seed, shorten
 from switchfit.runtime import special
 from switchfit.uncertainty.prediction import collect_sample_derivatives
-from switchfit.uncertainty.residuals import compute_autocorrelation
 from switchfit.uncertainty.verdict import Verdict
 
 Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
@@ -594,6 +593,16 @@ def _compute_acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
     return np.nan_to_num(acceleration)
 
 
+def _choose_block(estimate: Estimate, longest: int) -> int:
+    """Return the length of a block, by the channel with the largest correlation of neighbours."""
+    lengths = [1.0]
+    for channel in estimate.residuals.channels:
+        if channel.correlation > 0:
+            r = min(channel.correlation, 0.99)
+            lengths.append((np.sqrt(6) * r / (1 - r**2)) ** (2 / 3) * len(channel.values) ** (1 / 3))
+    return max(1, min(round(max(lengths)), longest // 2))
+
+
 class _Draw:
     """The noise of one run: as `monte_carlo` takes it."""
 
@@ -607,20 +616,9 @@ class _Draw:
             self.pools.append(residuals if resample == "wild" else residuals - np.nanmean(residuals, axis=0))
         if resample == "blocks":
             longest = max(map(len, self.pools))
-            self.block = self._length(longest) if block is None else as_count(block, "block")
+            self.block = _choose_block(estimate, longest) if block is None else as_count(block, "block")
             if not 1 <= self.block <= longest:
                 raise ValueError(f"block must lie between 1 and the {longest} samples there are; got {block}.")
-
-    def _length(self, longest: int) -> int:
-        """Return the length of a block, by the channel with the largest correlation of neighbours."""
-        lengths = [1.0]
-        for pool in self.pools:
-            for channel in pool.T:
-                known = channel[np.isfinite(channel)]
-                if len(known) > 2:
-                    r = min(float(compute_autocorrelation(known, 1)[0]), 0.99)
-                    lengths.append((np.sqrt(6) * r / (1 - r**2)) ** (2 / 3) * len(known) ** (1 / 3) if r > 0 else 1.0)
-        return max(1, min(round(max(lengths)), longest // 2))
 
     def __call__(self, rng: np.random.Generator, clean: FloatArray, item: Any) -> FloatArray:
         pool = next(pool for own, pool in zip(self.items, self.pools, strict=True) if own is item)
