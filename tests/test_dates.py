@@ -389,7 +389,7 @@ def test_predictions_and_simulations_at_dates(fits):
         plain.predict(["2020-03-21"])
     with pytest.raises(ValueError, match=r"inside \[t0, tf\] = \[2020-03-20 00:00:00\+01:00, .*; got 2019-01-01"):
         sf.simulate(dated.problem, dated.theta, times="2019-01-01")
-    with pytest.raises(ValueError, match=r"times must be numbers, dates or 'samples'; got 'sampels'"):
+    with pytest.raises(ValueError, match=r"times must be a number or a date; got 'sampels'"):
         sf.simulate(plain.problem, plain.theta, times="sampels")
 
 
