@@ -35,11 +35,7 @@ CLEARLY_LOWER = 1e-4
 """Part of the best cost by which another end is better: on the mesh that all starts share costs are less accurate."""
 
 SAME_COST = 1e-6
-"""Two ends are one minimum if their costs differ by less than this part of them, and ..."""
-
-SAME_PLACE = 1e-3
-"""... each parameter by less than this part of the spread of the starts, or of its size where they do not differ in it,
-with the same modes. Modes that are shorter than this part of the horizon have collapsed, and do not count."""
+"""Two ends are one minimum if their costs differ by less than this part of them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -167,7 +163,7 @@ def multistart(
     study = Study(problem, _find_meshes(problem, points), points, how.limits, seed)
     found = repeat(problem, study, len(points), "Multistart", how)
     fits, best = _find_best(problem, Fits(**found), how.limits)
-    clusters = _find_clusters(problem, fits)
+    clusters = _find_clusters(fits)
     if best is not None:
         best = replace(best, starts=_count_starts(fits, clusters, best.cost))
     return Multistart(**found | {"status": fits.status, "message": fits.message}, clusters=clusters, best=best)
@@ -219,35 +215,13 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
     return points
 
 
-def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
+def _find_clusters(fits: Fits) -> NDArray[np.int64]:
     """Return the number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
-    labels = np.full(len(fits), -1)
-    spread, size = np.ptp(fits.start, axis=0), np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
-    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)
-    others = ~problem.unknowns.is_time
-    found: list[tuple[float, list[list[str]], FloatArray]] = []
-    for k in np.argsort(fits.cost, kind="stable").tolist():
-        if not fits.success[k]:
-            continue
-        cost, modes, place = float(fits.cost[k]), _list_modes(problem, fits.theta[k]), (fits.theta[k] / spread)[others]
-        same = (
-            label
-            for label, (level, sequences, at) in enumerate(found)
-            if abs(cost - level) <= SAME_COST * max(abs(cost), 1e-300)
-            and modes == sequences
-            and np.all(np.abs(place - at) <= SAME_PLACE)
-        )
-        labels[k] = next(same, len(found))
-        if labels[k] == len(found):
-            found.append((cost, modes, place))
+    labels, ended = np.full(len(fits), -1), np.flatnonzero(fits.success)
+    found, lowest = -1, -np.inf
+    for k in ended[np.argsort(fits.cost[ended], kind="stable")].tolist():
+        cost = float(fits.cost[k])
+        if not cost - lowest <= SAME_COST * max(abs(cost), 1e-300):
+            found, lowest = found + 1, cost
+        labels[k] = found
     return labels
-
-
-def _list_modes(problem: Problem, theta: FloatArray) -> list[list[str]]:
-    """Return the modes of each experiment without the collapsed ones."""
-    sequences = []
-    for experiment, ends in zip(problem.experiments, problem.ends_of_modes(theta), strict=True):
-        lasting = np.diff(ends) > SAME_PLACE * experiment.initial_length
-        modes = [mode for mode, lasts in zip(experiment.mode_sequence, lasting, strict=True) if lasts]
-        sequences.append([mode for mode, before in zip(modes, ["", *modes], strict=False) if mode != before])
-    return sequences
