@@ -333,11 +333,8 @@ _ISSUES: dict[str, Sentence] = {
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "no errors: not finite": "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "
     "Measurements alone, with sigma or without.",
-    "no errors: too few samples": "No standard errors: sigma is unknown and {samples:.0f} values are too few to "
-    "estimate it beside {unknowns:.0f} unknowns.",
     "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
     "sigma too small": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too small, or the "

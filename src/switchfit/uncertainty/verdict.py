@@ -244,18 +244,12 @@ def _find_weakest(fit: Fit) -> tuple[float, tuple[str, ...]]:
 def _find_missing_errors(fit: Fit, smallest: float) -> Iterator[Issue]:
     """Find the reason why a fit has no standard errors; `smallest`: of the eigenvalues of its scaled Hessian."""
     missing = ~np.isfinite(fit.standard_errors) & ~np.isin(fit.theta_names, list_without_effect(fit))
-    unknowns = fit.free_basis.shape[1]
-    if not missing.any():
+    if not missing.any() or not np.isfinite(fit.hessian).all():
         return
-    if not np.isfinite(fit.hessian).all():
-        yield Issue("no errors: not finite")
-    elif fit.sigma_known is None:
+    if fit.sigma_known is None:
         if any(fit.comparisons):  # a cost of the trajectory alone never has standard errors
             yield Issue("no errors: no noise model")
-    elif fit.sigma_known is False and fit.samples <= unknowns:
-        figures = {"samples": float(fit.samples), "unknowns": float(unknowns)}
-        yield Issue("no errors: too few samples", figures=figures)
-    else:
+    elif fit.sigma_known or fit.freedom > 0:  # with too few samples the verdict says so
         names = () if missing.all() else tuple(np.array(fit.theta_names, dtype=object)[missing].tolist())
         yield Issue("no errors: not positive definite", names, {"eigenvalue": smallest})
 
