@@ -143,11 +143,9 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         smallest, direction = result.smallest_eigenvalue, result.curvature.spectrum.lowest
         largest = [i for i in np.argsort(-np.abs(direction), kind="stable") if abs(direction[i]) > SMALL_WEIGHT]
         flat = tuple((names[i], float(direction[i])) for i in largest[:NAMED])
+    same = {name: getattr(result, name) for name in ("status", "cost", "optimality", "tolerance", "violated")}
     return Termination(
-        status=result.status,
-        cost=result.cost,
-        optimality=result.optimality,
-        tolerance=result.tolerance,
+        **same,
         iterations=earlier + result.iterations,
         earlier_iterations=earlier,
         active=tuple(ActiveConstraint(**vars(each), multiplier=multipliers[each]) for each in result.active),
@@ -155,7 +153,6 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         idle=tuple(names[i] for i in result.idle),
         smallest_eigenvalue=smallest,
         flat_direction=flat,
-        violated=result.violated,
         reason=None if result.reason is None else _describe_failure(result, result.reason, problem),
         **find_unread(problem)._asdict(),
     )
