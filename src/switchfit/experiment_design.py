@@ -372,7 +372,9 @@ def improve_input(
     found = []
     for start in starts:
         x = np.clip((start - lower)[free] / width[free], 0.0, 1.0)
-        found.append(minimize(rate, x, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(x), options={"eps": STEP}))
+        found.append(
+            minimize(rate, x, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(x), options={"eps": STEP, "ftol": 1e-6})
+        )
     return place(min(found, key=lambda end: end.fun).x)
 
 

@@ -18,12 +18,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.batch.program import Inputs, choose_layout, has_gpu
 from switchfit.estimation.estimator import Estimate
@@ -32,61 +32,11 @@ from switchfit.fit.result import Fit
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import get_min_duration
 from switchfit.problem.validation import join_names, shorten
+from switchfit.uncertainty.profiles import Limits, limit_unknowns
 
 FLAT = -np.inf
 """Logarithm of a density of zero."""
-
-
-class Limits(NamedTuple):
-    """What limits each unknown.
-
-    Attributes
-    ----------
-    before : (d,) int
-        Of a transition time, or a free tf, the index in theta of the time before it; -1 if that is fixed, or t0, and
-        for all other unknowns.
-    gap : (d,)
-        Shortest time between the two.
-    low : (d,)
-        Lower bound; of a time after one that is fixed, not less than this plus the gap.
-    high : (d,)
-        Upper bound, so that all times after it find room.
-    """
-
-    before: NDArray[np.intp]
-    gap: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-def limit_unknowns(problem: Problem) -> Limits:
-    """Return the limits of all unknowns.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    unknowns, d = problem.unknowns, len(problem.theta_names)
-    found = Limits(np.full(d, -1), np.zeros(d), unknowns.lower.copy(), unknowns.upper.copy())
-    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        times, places = experiment.initial_times, where.tolist()
-        gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
-        latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
-        for i in reversed(range(len(places))):
-            latest = min(latest, times[i] if places[i] < 0 else found.high[places[i]])
-            if places[i] >= 0:
-                found.high[places[i]] = latest
-            latest -= gaps[i]
-        before, last = -1, experiment.t0
-        for i, place in enumerate(places):
-            if place >= 0:
-                found.before[place], found.gap[place] = before, gaps[i]
-                if before < 0:
-                    found.low[place] = max(found.low[place], last + gaps[i])
-            before, last = place, times[i]
-    return found
 
 
 @dataclass(frozen=True, eq=False)
