@@ -262,8 +262,9 @@ def simulate_values(problem: Problem, e: int, theta: FloatArray, taken: list[NDA
 UNUSABLE = 1e3
 """log m of a design whose trajectory cannot be integrated."""
 
-STEP = 1e-6
-"""Change of an input, as a part of its range, by which its gradient is found."""
+SEARCH = {"eps": 1e-6, "ftol": 1e-6}
+"""Change of an input, as a part of its range, by which its gradient is found; and the part of log m by which it must
+fall in an iteration."""
 
 
 def name_inputs(run: Experiment) -> tuple[str, ...]:
@@ -372,9 +373,7 @@ def improve_input(
     found = []
     for start in starts:
         x = np.clip((start - lower)[free] / width[free], 0.0, 1.0)
-        found.append(
-            minimize(rate, x, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(x), options={"eps": STEP, "ftol": 1e-6})
-        )
+        found.append(minimize(rate, x, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(x), options=SEARCH))
     return place(min(found, key=lambda end: end.fun).x)
 
 
