@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from switchfit.batch.chunks import read_arrays, write_arrays
 from switchfit.batch.program import Ends
 from switchfit.estimation.estimator import Estimate, parse_fit, write_fit
-from switchfit.fit.result import interval, measure_quantile
+from switchfit.fit.result import count_samples, interval, measure_quantile, measure_variance
 from switchfit.optimize import Status
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
@@ -397,26 +397,6 @@ def _count_collapsed(problem: Problem, experiment: Experiment, ends: FloatArray)
     shortest = least + AT_END * (experiment.end - experiment.t0)
     found: NDArray[np.int64] = np.sum(np.diff(ends, axis=1) <= shortest, axis=1)
     return found
-
-
-def count_samples(problem: Problem) -> int:
-    """Return the measured values that are not missing."""
-    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
-
-
-def count_priors(problem: Problem) -> int:
-    """Return the unknowns that have a prior."""
-    return int(np.count_nonzero(problem.unknowns.priors.precision))
-
-
-def measure_variance(cost: FloatArray, freedom: NDArray[np.int64], sigma_known: bool | None) -> FloatArray:
-    """Return by what covariances are multiplied: 1 if sigma is known, the residual variance if not; NaN where neither
-    is: (R,).
-    """
-    if sigma_known:
-        return np.ones(len(cost))
-    there = (freedom > 0) & (sigma_known is False)
-    return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
 
 
 MINOR = 0.01

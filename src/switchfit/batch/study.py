@@ -30,14 +30,14 @@ from numpy.typing import NDArray
 
 from switchfit.batch import fits as judged
 from switchfit.batch.chunks import Arrays, compute_fingerprint, run_chunks
-from switchfit.batch.fits import Fits, count_priors, count_samples, has_converged, measure_variance
+from switchfit.batch.fits import Fits, has_converged
 from switchfit.batch.program import Batch, Chunk, Limits, Varying, choose_chunk_size, describe_failure
 from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.branches import has_corners
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
-from switchfit.fit.result import measure_quantile
+from switchfit.fit.result import count_priors, count_samples, measure_quantile, measure_variance
 from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.optimize import Status
 from switchfit.optimize.traced import Outcome

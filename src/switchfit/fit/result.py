@@ -576,6 +576,26 @@ def measure_quantile(level: float, freedom: Any, sigma_known: bool | None) -> An
     return special.stdtrit(freedom, tail) if sigma_known is False else np.full(np.shape(freedom), special.ndtri(tail))
 
 
+def count_samples(problem: Problem) -> int:
+    """Return the measured values that are not missing."""
+    return sum(item.count for item in problem.measurements)
+
+
+def count_priors(problem: Problem) -> int:
+    """Return the unknowns that have a prior."""
+    return int(np.count_nonzero(problem.unknowns.priors.precision))
+
+
+def measure_variance(cost: Any, freedom: Any, sigma_known: bool | None) -> Any:
+    """Return by what covariances are multiplied: 1 if sigma is known, the residual variance if not; NaN where neither
+    is: (R,), or one number.
+    """
+    if sigma_known:
+        return np.ones(np.shape(cost))
+    there = (freedom > 0) & (sigma_known is False)
+    return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
+
+
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:
     """Return ``theta -+ half``, or if `log` ``o + (theta - o) exp(-+ half / (theta - o))``, o the origin: (..., 2)."""
     away = theta - origin

@@ -511,11 +511,10 @@ def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Cost:
     """Return J as a function of theta, NaN where bounds or the order of times are violated; not so at the centre, which
     may be on a constraint up to rounding.
     """
-    u = evaluator.problem.unknowns
 
     def compute_cost(theta: FloatArray) -> float:
-        is_allowed = np.all(theta >= u.lower) and np.all(theta <= u.upper) and np.all(u.A @ theta >= u.b)
-        return evaluator(theta).cost if is_allowed or theta is centre else np.nan
+        is_allowed = theta is centre or bool(np.all(evaluator.problem.constraints.slack(theta) >= 0))
+        return evaluator(theta).cost if is_allowed else np.nan
 
     return compute_cost
 
