@@ -79,8 +79,6 @@ def load_best(content: Any) -> Estimate | None:
     """
     if content is None:
         return None
-    if not isinstance(content, Mapping):
-        raise ValueError("best must be an object")
     fit, certificate = parse_fit(content)
     return Estimate(**vars(fit), saved_certificate=certificate)
 
@@ -518,17 +516,6 @@ def judge_study(
     found += _find_stop(fits)
     figures = {"count": float(ended.sum()), "fits": float(R)}
     return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
-
-
-def judge_failed_starts(fits: Fits) -> Verdict:
-    """Return the verdict on fits from many starts none of which could be fitted to the end.
-
-    Parameters
-    ----------
-    fits : Fits
-    """
-    everywhere = Doubt("not converged", "bad", np.ones(len(fits), dtype=bool))
-    return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
 
 
 def measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:
