@@ -192,7 +192,6 @@ def describe_prediction(prediction: Prediction) -> Frame:
     for label, values in output.items():
         names = prediction.output_names
         columns += _split(values, names, [""] * len(names), label.format("{} output"))
-    columns.append(Column("near_transition", prediction.near_transition))
     return Frame((Column("time", prediction.times, prediction.time_unit),), tuple(columns))
 
 

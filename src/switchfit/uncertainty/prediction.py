@@ -8,7 +8,7 @@ would be too narrow by the same factor. sigma is not changed.
 
 At a transition X jumps (see `switchfit.uncertainty.prediction`): just before it the state does not depend on that
 transition time, just after it does. The linear approximation assumes that the active mode is that of the fit, which may
-be wrong within two standard errors of a transition time: `near_transition` marks these times.
+be wrong within two standard errors of a transition time.
 
 After tf the last mode goes on: the problem is simulated with a later tf. Bands there contain the uncertainty of the
 unknowns and the noise of a sample. They do not contain that of the model: no mode may follow, and the model has no
@@ -191,10 +191,6 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
-NEAR = 2.0
-"""Distance from a transition time, in its standard errors, within which a band is unreliable."""
-
-
 @dataclass(frozen=True, eq=False)
 class Prediction(Tabular):
     """States and outputs of one experiment with their standard errors.
@@ -212,8 +208,6 @@ class Prediction(Tabular):
     state_names, state_units, output_names : tuple of str
     time_unit : str
         Unit of the experiment's times.
-    near_transition : (K,) bool
-        Whether a time is within two standard errors of a transition time, where the bands ignore the other mode.
     fit : Fit or Validation
         With the covariance and the quantiles.
     experiment : int
@@ -251,7 +245,6 @@ class Prediction(Tabular):
     state_units: tuple[str, ...]
     output_names: tuple[str, ...]
     time_unit: str
-    near_transition: NDArray[np.bool_]
     fit: Any = field(repr=False)
     experiment: int = 0
     origin: Origin | None = None
@@ -403,8 +396,6 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     >>> prediction.outputs.round(1)
     array([[8.3],
            [8.6]])
-    >>> prediction.near_transition
-    array([False, False])
 
     The log ends at 6 h; after it the heater stays off:
 
@@ -454,7 +445,6 @@ def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Pred
         trajectory.state_units,
         tuple(names),
         trajectory.time_unit,
-        _is_near_transition(fit, problem, e, points.times),
         fit,
         e,
         trajectory.origin,
@@ -503,13 +493,6 @@ def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatAr
         halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
         columns.append(sigma[np.searchsorted(halfway, times)])
     return np.concatenate(columns, axis=1)
-
-
-def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
-    where = problem.unknowns.times[e]
-    free = where[where >= 0]
-    reach = NEAR * np.sqrt(np.diag(fit.corrected_covariance)[free])
-    return np.asarray((np.abs(times[:, None] - fit.theta[free][None]) <= reach[None]).any(1))
 
 
 def _check_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
