@@ -887,33 +887,6 @@ class Provenance:
     versions: Mapping[str, str]
     platform: str
 
-    def place_beside(self, path: Path) -> Provenance:
-        """Return this with the folder as the path from that of a saved file.
-
-        Parameters
-        ----------
-        path : Path
-            Of the saved file.
-        """
-        return replace(self, folder=make_relative(self.folder, path.resolve().parent)) if self.folder else self
-
-    def find_from(self, path: Path) -> Provenance:
-        """Return this with the folder found from that of a saved file.
-
-        Parameters
-        ----------
-        path : Path
-            Of the saved file.
-
-        Raises
-        ------
-        ValueError
-            If no folder can have that name.
-        """
-        if "\0" in self.folder:
-            raise ValueError("provenance.folder has a null character")
-        return replace(self, folder=os.path.normpath(path.resolve().parent / self.folder)) if self.folder else self
-
 
 def make_relative(path: str | Path, folder: str | Path) -> str:
     """Return a path from a folder, with forward slashes; the whole path where none leads there, as to another drive.
@@ -982,7 +955,8 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provena
     """
     content = write_fit(fit, certificate)
     if provenance is not None:
-        content["provenance"] = to_json(provenance.place_beside(Path(path)), Provenance)
+        folder = provenance.folder and make_relative(provenance.folder, path.resolve().parent)
+        content["provenance"] = to_json(replace(provenance, folder=folder), Provenance)
     write_document(content, Path(path))
 
 
@@ -1031,8 +1005,11 @@ def load_saved(path: Path) -> tuple[Fit, Certificate, Provenance | None]:
     try:
         fit, certificate = parse_fit(content)
         given = content.get("provenance")
-        provenance = None if given is None else from_json(Provenance, given, "provenance")
-        return fit, certificate, None if provenance is None else provenance.find_from(Path(path))
+        if given is None:
+            return fit, certificate, None
+        found = from_json(Provenance, given, "provenance")
+        folder = found.folder and os.path.normpath(path.resolve().parent / found.folder)
+        return fit, certificate, replace(found, folder=folder)
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
 
