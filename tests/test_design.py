@@ -414,12 +414,10 @@ def test_wrong_limits(limits):
 def test_problems_that_cannot_be_designed():
     with pytest.raises(TypeError, match=r"problem must be an sf\.Problem"):
         sf.design(3)
-    with pytest.raises(
-        ValueError, match="design needs sigma, the standard deviation of the noise, for the data of run1"
-    ):
+    with pytest.raises(ValueError, match="design needs Measurements with sigma, for the data of run1"):
         sf.design(line(sigma=None))
     cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("on", "off"), (1.0,), 0.0, 2.0)
-    with pytest.raises(ValueError, match="design needs Measurements, for the data of run1"):
+    with pytest.raises(ValueError, match="design needs Measurements with sigma, for the data of run1"):
         sf.design(sf.Problem(sf.HybridSystem({"on": charge, "off": decay}, [0.0]), cost, {"k": 1.0}))
     system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + u}, [1.0])
     run = sf.Experiment(planned(TIMES[1:]), ("on",), (), 0.0, 4.0, inputs=sf.Input([0.0], [1.0]))

@@ -218,8 +218,8 @@ SAMPLES = sf.Measurements(TIMES, VALUES, sigma=NOISE)
 AREA, END = sf.RunningCost(lambda t, x, p: x[0] ** 2), sf.TerminalConstraint(lambda x, p: x[0] - 3.0)
 REFUSED = {
     r"log_posterior needs an sf.Problem or the result of sf.estimate; got 3": 3,
-    "a posterior needs the noise: sigma is left out in some Measurements": ramp(sigma=None),
-    "a posterior needs a cost of Measurements and priors alone": sf.Problem(RAMP, experiment(AREA), {"rate": 1.0}),
+    "a posterior needs a cost of Measurements with sigma": ramp(sigma=None),
+    "other terms are no probability": sf.Problem(RAMP, experiment(AREA), {"rate": 1.0}),
     "a posterior cannot have equality constraints; this problem has terminal": sf.Problem(
         RAMP, experiment(SAMPLES, END), {"rate": 1.0}
     ),

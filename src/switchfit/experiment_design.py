@@ -696,10 +696,8 @@ def _check_data(problem: Problem) -> None:
     """Raise ValueError unless all data are `Measurements` with sigma: their information does not depend on values."""
     for name, run in zip(problem.run_names, problem.experiments, strict=True):
         for item in run.data:
-            if not isinstance(item, Measurements):
-                raise ValueError(f"design needs Measurements, for the data of {name}; got {shorten(item)}.")
-            if item.sigma is None:
-                raise ValueError(f"design needs sigma, the standard deviation of the noise, for the data of {name}.")
+            if not isinstance(item, Measurements) or item.sigma is None:
+                raise ValueError(f"design needs Measurements with sigma, for the data of {name}; got {shorten(item)}.")
 
 
 def _find_chosen(problem: Problem, names: Any) -> tuple[NDArray[np.intp], FloatArray]:

@@ -29,7 +29,7 @@ from switchfit.batch.program import Inputs, choose_layout, has_gpu
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import join_names, shorten
@@ -351,14 +351,9 @@ def log_posterior(problem: Problem | Estimate) -> LogPosterior:
         raise TypeError(f"log_posterior needs an sf.Problem or the result of sf.estimate; got {shorten(problem)}.")
     own = evaluator.problem
     if not own.is_sigma_known:
-        items = [item for run in own.experiments for item in run.data]
-        missing = any(isinstance(item, Measurements) and item.sigma is None for item in items)
         raise ValueError(
-            "a posterior needs the noise: sigma is left out in some Measurements. Give sigma a number, or the name of "
-            "a parameter to sample it with the others."
-            if missing
-            else "a posterior needs a cost of Measurements and priors alone; this one has other terms, which are no "
-            "probability."
+            "a posterior needs a cost of Measurements with sigma, and of priors, alone: other terms are no "
+            "probability. Give sigma a number, or the name of a parameter to sample it with the others."
         )
     if own.constraint_names:
         raise ValueError(

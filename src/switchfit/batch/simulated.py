@@ -213,17 +213,13 @@ def monte_carlo(
     noise = _check_noise(noise)
     given = None if theta is None else problem.check_theta(theta)
     begin = None if start is None else problem.check_theta(start, "start")
-    truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
+    truth = fit_locally(problem).theta if given is None else given
+    if given is not None and problem.constraint_names:
+        with suppress(ValueError):  # it is not near the guards
+            truth = place_on_guards(problem, given)[1]
     begin = truth if begin is None else begin
     study, error = build_study(problem, truth, begin, noise, seed, how.limits)
     return MonteCarlo(**repeat(problem, study, runs, "Monte Carlo", how), truth=truth, integration_error=error)
-
-
-def _move_onto_guards(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Return `theta` with guarded times on their guards; as it is where there are none, or no such point is near."""
-    with suppress(ValueError):
-        return place_on_guards(problem, theta)[1]
-    return theta
 
 
 def _check_noise(noise: Noise) -> Noise:

@@ -293,10 +293,7 @@ class Estimate(Fit, Tabular, Displayed):
         True
         """
         rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
-        width = max(
-            t.states.shape[1] + sum(len(c.names) for c in run)
-            for t, run in zip(self.trajectories, self.comparisons, strict=True)
-        )
+        width = 2 * max(trajectory.states.shape[1] for trajectory in self.trajectories)  # about as many outputs
         return 16 * rows * width * len(self.theta) <= MOST_SENSITIVITIES
 
     @cached_property
