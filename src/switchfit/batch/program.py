@@ -152,11 +152,8 @@ class Inputs(NamedTuple):
     @classmethod
     def of(cls, evaluator: Evaluator, layout: Layout) -> Inputs:
         """Return those of a problem on the meshes of an evaluator."""
-        problem, unknowns, variables = (
-            evaluator.problem,
-            evaluator.problem.unknowns,
-            evaluator.problem.unknowns.variables,
-        )
+        problem, unknowns = evaluator.problem, evaluator.problem.unknowns
+        variables = unknowns.variables
         times = tuple(experiment.initial_times_with_jumps for experiment in problem.experiments)
         sequences = tuple(places_in_library(each) if layout.natively else {} for each in evaluator.structures)
         limits: list[Any] = [variables.inward(unknowns.lower), variables.inward(unknowns.upper)]

@@ -576,13 +576,8 @@ def measure_quality(fit: Fit) -> Quality:
         chi_square = 2 * fit.cost
         above, is_size = compare_with_sigma(chi_square, fit.freedom)
         known, found = bool(is_size), [*found, float(above)]
-    return Quality(
-        channels=tuple(channels),
-        explained=explain_all(fit.comparisons),
-        chi_square=chi_square,
-        probability=min(found, default=np.nan),
-        known=known,
-    )
+    explained, probability = explain_all(fit.comparisons), min(found, default=np.nan)
+    return Quality(tuple(channels), explained, chi_square, probability, known)
 
 
 def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals, is_given: bool) -> dict[str, float]:
