@@ -325,7 +325,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "the journal forgets the inputs": swap(TRACKER, '"u": u}', '"u": None}'),
     },
     "design": {
-        "sign of the criterion's slope": swap(CRITERION, "return mean, -np.swapaxes", "return mean, np.swapaxes"),
+        "sign of shares": swap(CRITERION, "rule.rate(whole - step, power) -", "rule.rate(whole - step, power) +"),
         "A in place of D": swap(CRITERION, '{"D": 0.0,', '{"D": 1.0,'),
         "information of one side": swap(CRITERION, "SIDES = (1, -1)", "SIDES = (1, 1)"),
         "scales left out": swap(CRITERION, "basis[self.chosen] / self.scales[:, None]", "basis[self.chosen]"),

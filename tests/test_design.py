@@ -12,7 +12,6 @@ from models import STILL, charge, curve, decay, first_state
 import switchfit as sf
 from switchfit.experiment_design import (
     Candidates,
-    Criterion,
     Nominal,
     choose_samples,
     replace_inputs,
@@ -294,16 +293,6 @@ def test_information_with_another_input_is_that_of_a_problem_with_it(problem):
     taken = np.arange(len(whole[0])) % 3 > 0
     found = nominal.inform(nominal.change_input(nominal.keep_samples([taken]), changed))
     np.testing.assert_allclose(found, other.candidates.information[taken].sum(0), rtol=1e-9, atol=1e-9 * found.max())
-
-
-def test_slope_of_the_criterion_in_the_information():
-    rng = np.random.default_rng(0)
-    F, step = (root @ root.T for root in rng.normal(size=(2, 3, 3)))
-    rule = Criterion(np.array([0, 2]), np.array([1.0, 3.0]), np.eye(3), np.array([1.0, 0.5, 2.0]))
-    for power in (0.0, 1.0, 20.0):
-        slope = rule.rate(F, power)[1]
-        difference = rule.rate(F + 1e-6 * step, power)[0] - rule.rate(F - 1e-6 * step, power)[0]
-        assert np.sum(slope * step) == pytest.approx(difference / 2e-6, rel=1e-6)
 
 
 def test_a_gain_is_known_best_with_the_input_at_its_limit():
