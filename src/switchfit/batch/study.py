@@ -288,12 +288,10 @@ class Study:
 
     def _find_doubted(self, chunk: Chunk, runs: range) -> NDArray[np.bool_]:
         """Return of which fits a better end may be elsewhere: not converged, a mode collapsed, or far from the data."""
-        arrays = self.describe_fits(chunk, runs)
-        doubted = arrays["collapsed"] > 0
-        for doubt in judged.find_doubts(arrays, self.problem.is_sigma_known, count_priors(self.problem)):
-            if doubt.kind in ("not converged", "little explained", *judged.EXPLAINED_BADLY):
-                doubted |= doubt.which
-        return doubted
+        kinds = "not converged", "a mode collapsed", "little explained", *judged.EXPLAINED_BADLY
+        arrays, known = self.describe_fits(chunk, runs), self.problem.is_sigma_known
+        doubts = [d for d in judged.find_doubts(arrays, known, count_priors(self.problem)) if d.kind in kinds]
+        return np.any([np.zeros(len(runs), dtype=bool), *(doubt.which for doubt in doubts)], axis=0)
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
         """Return the arrays of fits as they are."""
