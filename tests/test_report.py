@@ -98,7 +98,7 @@ def made(**changes) -> Fit:
         tolerance=1e-7,
         seconds=1.25,
     )
-    return replace(fit, **changes)
+    return replace(fit, **{"log_origins": np.zeros(len(changes.get("theta", theta)))} | changes)
 
 
 def several(count: int, names=None) -> Fit:
@@ -117,7 +117,6 @@ def several(count: int, names=None) -> Fit:
         transition_times=tuple(np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)),
         transition_places=tuple(np.array([e, -1]) for e in range(count)),
         final_places=(-1,) * count,
-        log_origins=np.zeros(count + 1),
         gradient=np.zeros(count + 1),
         hessian=np.diag(np.linspace(100.0, 400.0, count + 1)),
         free_basis=np.eye(count + 1),
