@@ -224,8 +224,8 @@ def test_files_that_hold_no_fits(studies, heater, tmp_path, monkeypatch):
     whole = path.read_bytes()
     with pytest.raises(ValueError, match=r"holds the kind of fits 'MonteCarlo', not Bootstrap: sf\.Fits\.load reads"):
         sf.Bootstrap.load(path)
-    monkeypatch.setattr(saved, "VERSION", 3)
-    with pytest.raises(ValueError, match="is a file of saved fits of version 2; this switchfit reads version 3"):
+    monkeypatch.setattr(saved, "VERSION", 4)
+    with pytest.raises(ValueError, match="is a file of saved fits of version 3; this switchfit reads version 4"):
         sf.Fits.load(path)
     heater.save(tmp_path / "fit.json")
     np.savez(tmp_path / "pickle.npz", header=np.array([{}], dtype=object))

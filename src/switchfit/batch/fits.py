@@ -49,7 +49,7 @@ from switchfit.uncertainty.verdict import FINE, LEVELS, Doubt, Finding, Level, N
 from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"
-VERSION = 2
+VERSION = 3
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
