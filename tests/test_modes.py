@@ -580,7 +580,7 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         sf.ModeSearch.load(path, problem=sf.Problem(SYSTEM, other, FREE))
     for changes, message in (
         ({"format": "switchfit fit"}, "is not a saved search"),
-        ({"version": 1}, "of version 1; this switchfit reads version 4"),
+        ({"version": 1}, "of version 1; this switchfit reads version 5"),
         ({"search": content["search"] | {"fits": "many"}}, "is damaged"),
     ):
         path.write_text(json.dumps(content | changes))

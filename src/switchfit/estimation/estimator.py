@@ -1023,6 +1023,6 @@ def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
     ValueError
         If the content is not what `write_fit` returned.
     """
-    if content.get("seal") != _compute_seal(content):
+    if not isinstance(content, Mapping) or content.get("seal") != _compute_seal(content):
         raise ValueError("its content is not what was written")
     return from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")
