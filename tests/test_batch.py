@@ -195,22 +195,13 @@ def work_of(problem, truth, start, noise=None, seed=3):
     return module.build_study(problem, truth, start, noise, seed, LIMITS)[0]
 
 
-def reference_room():
-    """Measurements, and a reference with a gap that is filtered anew in every run."""
-    values = np.zeros((13, 1))
-    values[4] = np.nan
-    signal = sf.ReferenceSignal.from_samples(np.linspace(0.0, 6.0, 13), values, lowpass_hz=0.8, weights=[3.0])
-    return room([sf.Measurements(TIMES, np.zeros(24), sigma=0.05), signal])
-
-
 @pytest.mark.parametrize(
     ("problem", "noise"),
     [
         (room(), None),
         (room(upper=0.8, guess=(1.7, 0.5)), 0.03),  # some estimates of k end on its bound
-        pytest.param(reference_room(), 0.02, marks=pytest.mark.slow),
     ],
-    ids=["ordinary", "bound", "reference"],
+    ids=["ordinary", "bound"],
 )
 def test_monte_carlo_is_the_same_as_single_fits(problem, noise):
     """Those that are no ordinary minima are finished as a single fit is."""
@@ -281,7 +272,8 @@ REFUSED = {
     "noise must give finite values of shape": refused_study(noise=lambda rng, clean, item: clean[:3]),
     "theta must have shape": refused_study(theta=[2.0]),
     "noise must be given": refused_study(data=sf.Measurements(TIMES, np.zeros(24))),
-    "needs Measurements or a ReferenceSignal": refused_study(data=sf.RunningCost(lambda t, x, p: x[0] ** 2)),
+    "simulates Measurements: every run needs some": refused_study(data=sf.RunningCost(lambda t, x, p: x[0] ** 2)),
+    "and none a ReferenceSignal": refused_study(data=sf.ReferenceSignal.from_samples(np.arange(7.0), np.zeros(7))),
     r"client must be a dask\.distributed\.Client; got str": refused_study(client="scheduler:8786"),
     r"array of shape \(S, 2\)": lambda: sf.multistart(room(), [1.0, 2.0]),
     "start 1 violates: k at its upper bound 5": lambda: sf.multistart(room(), [[1.0, 2.0], [1.0, 6.0]]),

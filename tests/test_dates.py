@@ -356,7 +356,6 @@ def test_tables_frames_and_json_have_dates_beside_numbers(fits):
     assert list(dated.to_pandas()["date"]) == [end, ""]
     prediction = dated.predict(["2020-03-21"])
     assert list(prediction.to_pandas()["date (UTC)"]) == [pd.Timestamp("2020-03-20T23:00")]
-    assert prediction.to_xarray()["date (UTC)"].dtype.kind == "M"
     numbers = json.dumps(summarize_estimate(plain), default=np.ndarray.tolist)
     for text in (write_unknowns(plain), numbers, str(list(plain.to_pandas())), str(plain.predict([1.0]).to_pandas())):
         assert "date" not in text
@@ -366,8 +365,6 @@ def test_tables_frames_and_json_have_dates_beside_numbers(fits):
 def test_a_saved_fit_has_the_dates(fits, tmp_path):
     dated, _ = fits
     dated.save(tmp_path / "fit.json")
-    content = json.loads((tmp_path / "fit.json").read_text())
-    assert content["transition_dates"] == {"tau_1": dated.transition_dates[0][0].isoformat()}
     loaded = sf.Estimate.load(tmp_path / "fit.json", problem=dated.problem)
     assert loaded.transition_dates == dated.transition_dates
     assert str(loaded) == str(dated)
@@ -392,7 +389,7 @@ def test_predictions_and_simulations_at_dates(fits):
         plain.predict(["2020-03-21"])
     with pytest.raises(ValueError, match=r"inside \[t0, tf\] = \[2020-03-20 00:00:00\+01:00, .*; got 2019-01-01"):
         sf.simulate(dated.problem, dated.theta, times="2019-01-01")
-    with pytest.raises(ValueError, match=r"times must be numbers, dates or 'samples'; got 'sampels'"):
+    with pytest.raises(ValueError, match=r"times must be a number or a date; got 'sampels'"):
         sf.simulate(plain.problem, plain.theta, times="sampels")
 
 

@@ -12,19 +12,14 @@ from models import STILL, charge, curve, decay, first_state
 import switchfit as sf
 from switchfit.experiment_design import (
     Candidates,
-    Criterion,
     Nominal,
-    _build_criterion,
-    _describe,
     choose_samples,
-    differentiate_criterion,
     replace_inputs,
     simulate_values,
     stack_inputs,
 )
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import heater_problem
-from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.0, 4.0, 9)
 
@@ -271,56 +266,33 @@ def test_shares_of_the_information_add_up_to_one():
 KNOTS = [1.0, -0.4, 0.3, 0.8]
 NOISE, LATE = sf.Parameter(0.1, lower=0.01), sf.Parameter(0.2, lower=0.0, upper=0.4)
 PROBLEMS = {
-    "linear, E": (lag(KNOTS, kind="linear"), 20.0),
-    "cubic": (lag([*KNOTS, 0.2], kind="cubic"), 0.0),
-    "constant": (lag([0.5]), 1.0),
-    "implicit": (lag(KNOTS, solver="stiff"), 0.0),
-    "sigma and delay": (
-        lag(KNOTS[:2], data={"sigma": "noise", "delay": "late"}, parameters={"noise": NOISE, "late": LATE}),
-        1.0,
+    "linear": lag(KNOTS, kind="linear"),
+    "cubic": lag([*KNOTS, 0.2], kind="cubic"),
+    "constant": lag([0.5]),
+    "implicit": lag(KNOTS, solver="stiff"),
+    "sigma and delay": lag(
+        KNOTS[:2], data={"sigma": "noise", "delay": "late"}, parameters={"noise": NOISE, "late": LATE}
     ),
-    "prior": (lag([1.0, 0.3], data={"loss": "cauchy"}, parameters={"b": sf.Parameter(2, prior=sf.Normal(2, 0.1))}), 0),
-    "two runs": (two_lags(), 0.0),
-    "transitions at knots": (transitions_at_knots(), 0.0),
+    "robust": lag([1.0, 0.3], data={"loss": "cauchy"}, parameters={"b": sf.Parameter(2, prior=sf.Normal(2, 0.1))}),
+    "two runs": two_lags(),
+    "transitions at knots": transitions_at_knots(),
 }
 
 
-@pytest.mark.parametrize(("problem", "power"), PROBLEMS.values(), ids=PROBLEMS)
-def test_gradient_against_differences(problem, power):
-    """The exact gradient by JAX, against differences of the criterion by the engine of the problem on the same mesh."""
+@pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS)
+def test_information_with_another_input_is_that_of_a_problem_with_it(problem):
+    """On the same mesh, with two thirds of the samples."""
     whole = [np.ones(len(item.times), dtype=bool) for item in problem.experiments[0].data]
-    problem, d = simulate_values(problem, 0, problem.initial_theta, whole), len(problem.theta_names)
-    nominal = Nominal(problem, 0, problem.initial_theta)
-    rule = _build_criterion(nominal, np.arange(d), np.linspace(1.0, 2.0, d))
-    table, taken = stack_inputs(problem.experiments[0]), [np.arange(len(whole[0])) % 3 > 0]
+    theta, changed = problem.initial_theta, stack_inputs(problem.experiments[0])[::-1] + 0.2
 
-    def rate(changed):
-        other = Nominal(simulate_values(replace_inputs(problem, 0, changed), 0, nominal.theta, whole), 0, nominal.theta)
-        other.evaluator = Evaluator(other.problem, meshes=nominal.evaluator.meshes)
-        own = other.candidates.information[taken[0]].sum(0)
-        return float(rule.rate(nominal.candidates.others + own, power)[0])
+    def plan(problem):
+        return Nominal(simulate_values(problem, 0, theta, whole), 0, theta)
 
-    with use_float64():
-        background = _describe(nominal, rule, taken)
-        value, slope = differentiate_criterion(
-            table, background, structure=nominal.evaluator.structures[0], power=power
-        )
-    assert float(value) == pytest.approx(rate(table), abs=1e-9)
-    for place in list(np.ndindex(table.shape))[:6]:
-        step = np.zeros_like(table)
-        step[place] = 1e-4
-        difference = (rate(table + step) - rate(table - step)) / 2e-4
-        assert float(slope[place]) == pytest.approx(difference, rel=1e-5, abs=1e-7)
-
-
-def test_slope_of_the_criterion_in_the_information():
-    rng = np.random.default_rng(0)
-    F, step = (root @ root.T for root in rng.normal(size=(2, 3, 3)))
-    rule = Criterion(np.array([0, 2]), np.array([1.0, 3.0]), np.eye(3), np.array([1.0, 0.5, 2.0]))
-    for power in (0.0, 1.0, 20.0):
-        slope = rule.rate(F, power)[1]
-        difference = rule.rate(F + 1e-6 * step, power)[0] - rule.rate(F - 1e-6 * step, power)[0]
-        assert np.sum(slope * step) == pytest.approx(difference / 2e-6, rel=1e-6)
+    nominal, other = plan(problem), plan(replace_inputs(problem, 0, changed))
+    other.evaluator = Evaluator(other.problem, meshes=nominal.evaluator.meshes)
+    taken = np.arange(len(whole[0])) % 3 > 0
+    found = nominal.inform(nominal.change_input(nominal.keep_samples([taken]), changed))
+    np.testing.assert_allclose(found, other.candidates.information[taken].sum(0), rtol=1e-9, atol=1e-9 * found.max())
 
 
 def test_a_gain_is_known_best_with_the_input_at_its_limit():
@@ -431,12 +403,10 @@ def test_wrong_limits(limits):
 def test_problems_that_cannot_be_designed():
     with pytest.raises(TypeError, match=r"problem must be an sf\.Problem"):
         sf.design(3)
-    with pytest.raises(
-        ValueError, match="design needs sigma, the standard deviation of the noise, for the data of run1"
-    ):
+    with pytest.raises(ValueError, match="design needs Measurements with sigma, for the data of run1"):
         sf.design(line(sigma=None))
     cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("on", "off"), (1.0,), 0.0, 2.0)
-    with pytest.raises(ValueError, match="design needs Measurements, for the data of run1"):
+    with pytest.raises(ValueError, match="design needs Measurements with sigma, for the data of run1"):
         sf.design(sf.Problem(sf.HybridSystem({"on": charge, "off": decay}, [0.0]), cost, {"k": 1.0}))
     system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + u}, [1.0])
     run = sf.Experiment(planned(TIMES[1:]), ("on",), (), 0.0, 4.0, inputs=sf.Input([0.0], [1.0]))

@@ -352,7 +352,6 @@ REFUSED = {
     r"strictly inside \(t0, tf\) = \(0.0, 3.0\); got \[3.0\]": lambda fit: cool(LONG, ("a", "b"), (3.0,)),
     r"\(t0, tf\) = \(0.0, 5.0\), with the upper bound": lambda fit: sf.simulate(minimum_time(), [1.0, 5.5]),
     "must not decrease": lambda fit: sf.simulate(minimum_time(), [2.0, 1.5]),
-    "after the lower bound of a free tf, cannot be": lambda fit: sf.monte_carlo(cooling(cool(LONG)), runs=2),
     r"only from 1 to 1.1 s are all samples .* = \(0.0, 2.0\)": lambda fit: cool_late(0.4),
     "a profile does not support guards and terminal constraints": lambda fit: fit.profile("tf"),
     "times must not lie after tf where tf is": lambda fit: fit.predict([fit.final_times[0] + 1e-3]),

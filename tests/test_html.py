@@ -240,10 +240,7 @@ def test_the_inputs_are_there_to_run_it_again(toss_page):
 
 
 @pytest.mark.usefixtures("quick_certificates")
-def test_without_a_problem_file_the_data_are_hashed_and_without_a_model_nothing_moves(heater, tmp_path):
-    log = heater.problem.experiments[0].data[0]
-    raw = np.column_stack([log.times, log.values]).astype("<f8").tobytes()
-    assert hashlib.sha256(raw).hexdigest() in Reader(format_page(heater)).words
+def test_without_a_model_nothing_moves(heater, tmp_path):
     with pytest.raises(TypeError, match="provenance must be the provenance of a problem file"):
         heater.save_report(tmp_path / "report.html", provenance="problem.toml")
     heater.save(tmp_path / "fit.json")

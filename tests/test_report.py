@@ -71,6 +71,8 @@ def made(**changes) -> Fit:
         run_names=("run1",),
         transition_times=(theta[:2].copy(),),
         transition_places=(np.array([0, 1]),),
+        final_places=(-1,),
+        log_origins=np.zeros(3),
         parameters={"mu": np.array(0.8), "g": np.array(9.81)},
         parameter_units={"mu": "1", "g": "m/s^2"},
         fixed=("g",),
@@ -96,7 +98,7 @@ def made(**changes) -> Fit:
         tolerance=1e-7,
         seconds=1.25,
     )
-    return replace(fit, **changes)
+    return replace(fit, **{"log_origins": np.zeros(len(changes.get("theta", theta)))} | changes)
 
 
 def several(count: int, names=None) -> Fit:
@@ -114,6 +116,7 @@ def several(count: int, names=None) -> Fit:
         run_names=tuple(names),
         transition_times=tuple(np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)),
         transition_places=tuple(np.array([e, -1]) for e in range(count)),
+        final_places=(-1,) * count,
         gradient=np.zeros(count + 1),
         hessian=np.diag(np.linspace(100.0, 400.0, count + 1)),
         free_basis=np.eye(count + 1),

@@ -163,7 +163,6 @@ def test_a_real_fit_comes_back(tmp_path):
     loaded = sf.Estimate.load(tmp_path / "fit.json")
     for field in fields(Fit):
         assert_same(getattr(estimate.complete(), field.name), getattr(loaded, field.name), field.name)
-    assert_same(estimate.covariance_from("gauss-newton"), loaded.covariance_from("gauss-newton"))
     with pytest.raises(ValueError, match=r"loaded without its model: load it with Estimate.load\(path, problem="):
         loaded.profile("v")
     with_model = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
@@ -194,10 +193,10 @@ def test_a_file_in_the_repository_prints_the_same_report_as_ever():
         (b"[" * 100_000, "not valid JSON"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 9"),
-        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 9"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 10"),
+        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 10"),
         (b'{"format": "switchfit fit", "version": NaN}', "of version nan; this switchfit reads"),
-        (b'{"format": "switchfit fit", "version": 9}', "is damaged: its content is not what was written"),
+        (b'{"format": "switchfit fit", "version": 10}', "is damaged: its content is not what was written"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):

@@ -221,18 +221,13 @@ def test_the_file_holds_the_problem_hashes_and_versions(project):
     assert content["options"] == {"strategy": "local"}
     assert content["versions"]["switchfit"] == sf.__version__
     assert content["versions"]["Python"].count(".") == 2
-    found = sf.Estimate.load(FIT)
-    values = found.comparisons[0][0]
-    raw = np.column_stack([values.times, values.measured]).astype("<f8").tobytes()
-    assert [digest.sha256 for digest in found.provenance.data] == [hashlib.sha256(raw).hexdigest()]
 
 
-def test_an_estimate_of_python_keeps_the_hash_of_its_data_and_versions(project):
+def test_an_estimate_of_python_keeps_versions(project):
     fit = sf.Estimate.load("heater.json")
     found = fit.provenance
     assert (found.problem_file, found.text, found.files) == ("", "", ())
-    assert [digest.name for digest in found.data] == ["thermometer"]
-    assert found == describe_python_problem(fit)
+    assert found == describe_python_problem()
     assert "does not have its problem, which was built in Python: functions are not saved" in refuse_to_build(
         "heater.json"
     )
@@ -311,7 +306,6 @@ DAMAGES = [
     (lambda p: p.pop("text"), "provenance is not what was written"),
     (lambda p: p["files"][0].update(size="big"), "provenance is not what was written"),
     (lambda p: p.update(versions=[]), "provenance is not what was written"),
-    (lambda p: p.update(folder="a\0b"), "provenance.folder has a null character"),
 ]
 
 

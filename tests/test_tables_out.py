@@ -1,4 +1,4 @@
-"""Results as DataFrames, Datasets and CSV, read back by their own readers; many fits saved, printed, drawn."""
+"""Results as DataFrames and CSV, read back by their own readers; many fits saved, printed, drawn."""
 
 import csv
 import io
@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet
 import pytest
-import xarray as xr
 from models import RAMP, heated_room, temperature
 from test_many_logs import folder, log_of, run  # noqa: F401  # a fixture
 from test_report import made, several, trajectory_of
@@ -53,11 +52,6 @@ def studies(heater):
 def through_csv(table):
     levels = list(range(table.index.nlevels))
     return pd.read_csv(io.StringIO(table.to_csv()), index_col=levels)
-
-
-def through_netcdf(dataset):
-    """Written and read in memory by SciPy's netCDF, which xarray takes where there is no other."""
-    return xr.load_dataset(io.BytesIO(dataset.to_netcdf(engine="scipy")), engine="scipy")
 
 
 # --- single fits ------------------------------------------------------------------------------------------------------
@@ -106,7 +100,7 @@ def test_the_history_has_a_row_for_each_iteration(heater):
 
 @pytest.mark.parametrize("what", ["unknowns", "trajectories", "residuals", "history"])
 def test_tables_of_a_fit_come_back_from_their_files(heater, what, tmp_path):
-    table, found = heater.to_pandas(what), heater.to_xarray(what)
+    table = heater.to_pandas(what)
     again = through_csv(table)
     assert list(again.columns) == list(table.columns)
     for name in table.select_dtypes("number"):
@@ -115,50 +109,44 @@ def test_tables_of_a_fit_come_back_from_their_files(heater, what, tmp_path):
     stored = pd.read_parquet(tmp_path / "table.parquet")
     pd.testing.assert_frame_equal(stored, table)
     assert stored.attrs == table.attrs
-    xr.testing.assert_identical(through_netcdf(found), found)
 
 
 def test_a_table_or_a_library_that_is_not_there(heater, monkeypatch):
-    for make in (heater.to_pandas, heater.to_xarray):
-        with pytest.raises(ValueError, match="what must be one of unknowns, trajectories, residuals, history; got"):
-            make("theta")
-    for library in ("pandas", "xarray"):
-        monkeypatch.setitem(sys.modules, library, None)
-        with pytest.raises(MissingExtraError, match=f"needs {library}, which cannot .*: pip install {library}"):
-            getattr(heater, f"to_{library}")()
+    with pytest.raises(ValueError, match="what must be one of unknowns, trajectories, residuals, history; got"):
+        heater.to_pandas("theta")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingExtraError, match=r"needs pandas, which cannot .*: pip install pandas"):
+        heater.to_pandas()
 
 
 def test_states_that_are_called_like_other_columns():
     path = replace(trajectory_of(), state_names=("mode", "time"))
     table = path.to_pandas()
-    assert list(table.columns) == ["mode", "mode (mode)", "time (time)"]
-    np.testing.assert_array_equal(table["mode (mode)"], path.states[:, 0])
-    np.testing.assert_array_equal(path.to_xarray()["mode (value)"], path.states[:, 0])
+    assert list(table.columns) == ["mode", "mode 2", "time 2"]
+    np.testing.assert_array_equal(table["mode 2"], path.states[:, 0])
     several_alike = replace(trajectory_of(), state_names=("x", "x"))
-    assert list(several_alike.to_pandas().columns) == ["mode", "x", "x (x)"]
+    assert list(several_alike.to_pandas().columns) == ["mode", "x", "x 2"]
 
 
 def test_a_trajectory_goes_back_in_as_data_with_its_names_and_units():
     path = sf.simulate(heater_problem(), times=[1.0, 2.0, 3.0])
-    table, found = path.to_pandas(), path.to_xarray()
-    for times, values in ((table.index, table[["T"]]), (found["time"], found[["T"]])):
-        data = sf.Measurements(times, values, sigma=0.1)
-        assert (data.names, data.units) == (("T",), ("K",))
-        np.testing.assert_array_equal(data.values, path.states)
+    table = path.to_pandas()
+    data = sf.Measurements(table.index, table[["T"]], sigma=0.1)
+    assert (data.names, data.units) == (("T",), ("K",))
+    np.testing.assert_array_equal(data.values, path.states)
 
 
 def test_predictions_and_profiles_as_tables(heater):
     prediction, profile = heater.predict([1.0, 4.0]), heater.profile("k")
-    table, found = prediction.to_pandas(), prediction.to_xarray()
+    table = prediction.to_pandas()
     np.testing.assert_array_equal(table[["T low", "T high"]], prediction.state_band()[:, 0])
     bands = table[["thermometer output low", "thermometer output high"]]
     np.testing.assert_array_equal(bands, prediction.output_band()[:, 0])
-    assert (table.attrs["units"]["T std. error"], found["state_unit"].item()) == ("K", "K")
-    xr.testing.assert_identical(through_netcdf(found), found)
-    table, found = profile.to_pandas(), profile.to_xarray()
+    assert table.attrs["units"]["T std. error"] == "K"
+    table = profile.to_pandas()
     assert (table.index.name, list(table.columns)) == ("k", ["cost", "zeta", "converged", "tau_1"])
     assert (table.attrs["low"], table.attrs["high"]) == profile.interval()
-    assert (found["tau_1"].dims, found["k"].attrs) == (("k",), {"units": "1/h"})
+    assert table.attrs["units"]["k"] == "1/h"
 
 
 # --- many fits --------------------------------------------------------------------------------------------------------
@@ -169,17 +157,13 @@ KINDS = ["Fits", "MonteCarlo", "Bootstrap", "Multistart"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_fits_have_a_row_each(studies, kind):
     fits = studies[kind]
-    table, found = fits.to_pandas(), fits.to_xarray()
+    table = fits.to_pandas()
     np.testing.assert_array_equal(table[["tau_1", "k"]], fits.theta)
     np.testing.assert_array_equal(table["k std. error"], fits.standard_errors[:, 1])
     np.testing.assert_array_equal(table[["k low", "k high"]], fits.confidence_intervals()[:, 1])
     assert table["level"].tolist() == fits.levels.tolist()
     assert table.attrs["units"]["k std. error"] == "1/h"
-    np.testing.assert_array_equal(found["covariance"], fits.covariance)
-    assert found["unknown_unit"].values.tolist() == ["h", "1/h"]
     assert ("cluster" in table) == (kind == "Multistart")
-    assert ("truth" in found, "estimate" in found) == (kind == "MonteCarlo", kind == "Bootstrap")
-    xr.testing.assert_identical(through_netcdf(found), found)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -240,8 +224,8 @@ def test_files_that_hold_no_fits(studies, heater, tmp_path, monkeypatch):
     whole = path.read_bytes()
     with pytest.raises(ValueError, match=r"holds the kind of fits 'MonteCarlo', not Bootstrap: sf\.Fits\.load reads"):
         sf.Bootstrap.load(path)
-    monkeypatch.setattr(saved, "VERSION", 3)
-    with pytest.raises(ValueError, match="is a file of saved fits of version 2; this switchfit reads version 3"):
+    monkeypatch.setattr(saved, "VERSION", 4)
+    with pytest.raises(ValueError, match="is a file of saved fits of version 3; this switchfit reads version 4"):
         sf.Fits.load(path)
     heater.save(tmp_path / "fit.json")
     np.savez(tmp_path / "pickle.npz", header=np.array([{}], dtype=object))
@@ -301,7 +285,7 @@ def test_a_simulation_at_given_times_is_that_of_the_nodes(heater):
     late = sf.simulate(problem, [2.5, 0.4], times=[5.0])
     assert late.segments.tolist() == [0, 0, 1]
     assert late.mode_spans == [("off", 5.0, 5.0)]
-    path = sf.simulate(heater.problem, heater.theta, times="samples")
+    path = sf.simulate(heater.problem, heater.theta, times=heater.comparisons[0][0].times)
     np.testing.assert_array_equal(path.times, heater.comparisons[0][0].times)
     np.testing.assert_allclose(path.states, heater.comparisons[0][0].fitted, rtol=1e-8)
 
@@ -314,12 +298,11 @@ def test_a_simulation_up_to_a_free_tf_and_times_outside():
     np.testing.assert_allclose(path.states[:, 0], [0.0, 2.0, 3.4], rtol=1e-9)
     for given, times, message in (
         (problem, [2.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"),
-        (problem, "samples", "times='samples' needs data with samples, and experiment 0 has none"),
         (heater_problem(), [-1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
         (heater_problem(), [1.0, 1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got 1.0"),
-        (heater_problem(), [], r"times must be finite numbers of shape \(K,\), or 'samples'; got shape \(0,\)"),
+        (heater_problem(), [], r"times must be finite numbers of shape \(K,\); got shape \(0,\)"),
         (heater_problem(), [np.nan], "times must be finite numbers"),
-        (heater_problem(), "sample", "times must be 'samples'; got 'sample'|times must be .*samples"),
+        (heater_problem(), "samples", "times must be a number or a date"),
     ):
         with pytest.raises(ValueError, match=message):
             sf.simulate(given, times=times)
@@ -334,7 +317,6 @@ def test_simulate_writes_the_times_that_are_asked_for(folder):  # noqa: F811
     for given, times in (
         ("0.5", np.arange(0.0, 6.25, 0.5)),
         ("4", [0.0, 4.0]),
-        ("samples", np.arange(0.25, 6.0, 0.5)),
     ):
         result = run("simulate", folder / "problem.toml", "--out", out, "--times", given)
         assert result.exit_code == 0, result.stderr

@@ -17,7 +17,6 @@ import switchfit as sf
 from benchmarks import vehicle_coverage
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.result import disagreement
 from switchfit.models import heater_problem, lugre
 from switchfit.optimize import Status
 from switchfit.uncertainty.certificate import LARGEST_GAP, Identifiability, analyse, certify, measure_derivative_gap
@@ -47,42 +46,9 @@ def one_line(result) -> str:
 # Covariances
 
 
-def test_the_gauss_newton_covariance_in_closed_form():
-    fit = sf.estimate(noisy_decay(0.1))
-    a, k = fit.theta
-    design = np.stack([np.exp(-k * TIMES), -a * TIMES * np.exp(-k * TIMES)], axis=1) / 0.1
-    np.testing.assert_allclose(fit.gauss_newton, design.T @ design, rtol=1e-9)
-    covariance = np.linalg.inv(design.T @ design)
-    np.testing.assert_allclose(fit.covariance_from("gauss-newton"), covariance, rtol=1e-8)
-    half = scipy.stats.norm.ppf(0.95) * np.sqrt(np.diag(covariance))
-    interval = fit.confidence_intervals(0.9, hessian="gauss-newton")
-    np.testing.assert_allclose(interval, np.stack([fit.theta - half, fit.theta + half], axis=1), rtol=1e-8)
-    np.testing.assert_array_equal(fit.covariance_from("exact"), fit.covariance)
-
-
-@pytest.mark.parametrize("part", [4.0, 0.25, 1e-8])
-def test_the_factor_between_the_covariances_goes_either_way(part):
-    hessian = np.diag([100.0, 400.0, 900.0])
-    fit = made(hessian=hessian, saved_gauss_newton=np.diag([1.0, part, 1.0]) @ hessian)
-    found = disagreement(fit)
-    assert found.factor == pytest.approx(max(part, 1 / part) ** 0.5, rel=1e-9)
-    assert (found.name, found.exact) == ("tau_2", pytest.approx(0.05, rel=1e-12))
-    assert found.gauss_newton == pytest.approx(0.05 / np.sqrt(part), rel=1e-12)
-    unseen = "To first order the fitted values hardly depend on tau_2: its standard errors"
-    assert (unseen in warnings_of(fit)[0]) == (part < 1e-4)
-
-
-def test_what_no_sample_shows_to_first_order_is_not_hidden_by_rounding():
-    hessian, unseen = np.array([[100.0, 60.0, 0.0], [60.0, 400.0, 0.0], [0.0, 0.0, 900.0]]), np.diag([1.0, 1e-11, 1.0])
-    assert disagreement(made(hessian=hessian, saved_gauss_newton=unseen @ hessian @ unseen)).factor > 1e10
-
-
 def test_no_covariance_of_another_kind():
-    with pytest.raises(ValueError, match="hessian must be 'exact', 'gauss-newton' or 'sandwich'; got 'fisher'"):
+    with pytest.raises(ValueError, match="hessian must be 'exact' or 'sandwich'; got 'fisher'"):
         sf.estimate(noisy_decay(0.1)).covariance_from("fisher")
-    with pytest.raises(ValueError, match="The Gauss-Newton matrix of this fit is not known"):
-        made().covariance_from("gauss-newton")
-    assert disagreement(made()) is None
 
 
 # Identifiability
@@ -209,15 +175,12 @@ def test_residuals_against_scipy_and_the_textbook():
     residual = 0.1 * rng.standard_normal(200)
     found = diagnose_channel(diagnostics_of(residual), 0)
     z = residual / 0.1
-    assert found.normality == pytest.approx(scipy.stats.jarque_bera(z).pvalue, rel=1e-9)
-    assert found.kurtosis == pytest.approx(scipy.stats.kurtosis(z, fisher=False), rel=1e-9)
     r = [np.sum(z[k:] * z[:-k]) / np.sum(z**2) for k in range(1, 11)]
     np.testing.assert_allclose(found.autocorrelation, r, rtol=1e-9)
     Q = 200 * 202 * sum(value**2 / (200 - k) for k, value in enumerate(r, start=1))
     assert found.whiteness == pytest.approx(scipy.stats.chi2.sf(Q, 10), rel=1e-9)
     assert found.rms == pytest.approx(np.sqrt(np.mean(z**2)), rel=1e-12)
     assert found.white
-    assert found.normal
 
 
 def test_correlated_residuals_are_worth_fewer():
@@ -259,10 +222,7 @@ def test_outliers_are_told():
     residual = 0.1 * rng.standard_normal(100)
     residual[[20, 70]] = 1.0, -1.2
     fit = made(comparisons=((diagnostics_of(residual),),), cost=100.0, sigma_known=False)
-    found = diagnose(fit)
-    assert not found.passed
-    assert found.channels[0].outliers == 2
-    assert any(w.startswith("The residuals are not normal in X (kurtosis") for w in warnings_of(fit))
+    assert diagnose(fit).channels[0].outliers == 2
 
 
 def test_a_cost_without_measurements_has_no_residuals():
@@ -274,7 +234,7 @@ def test_a_cost_without_measurements_has_no_residuals():
 
 def test_a_channel_met_exactly_and_a_short_one():
     exact = diagnose_channel(diagnostics_of(np.zeros(30), sigma=None), 0)
-    assert (exact.white, exact.normal, exact.outliers) == (True, True, 0)
+    assert (exact.white, exact.outliers) == (True, 0)
     short = diagnose_channel(diagnostics_of(np.ones(4)), 0)
     assert np.isnan(short.whiteness)
     assert len(short.autocorrelation) == 0

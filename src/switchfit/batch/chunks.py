@@ -12,10 +12,10 @@ import functools
 import hashlib
 import io
 import os
-from collections.abc import Callable, Generator, Mapping
+import warnings
+from collections.abc import Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.runtime.errors import get_first_line
-from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
+from switchfit.runtime.files import write_atomically
 from switchfit.runtime.progress import Progress
 
 
@@ -56,8 +56,8 @@ def run_chunks(
         Where the chunks are computed; in threads of this process, one a core, if left out. A chunk whose worker is
         lost is computed again by another one.
     folder : path, optional
-        Each chunk is written there when it is done, and chunks that are found there are not computed again. A damaged
-        file is renamed, which is said in a warning, and its runs are computed again.
+        Each chunk is written there when it is done, and chunks that are found there are not computed again. The runs of
+        a damaged file, which is said in a warning, are.
     progress : callable, optional
         ``progress(done, total)``; a true return value stops, as Ctrl-C does.
 
@@ -154,14 +154,9 @@ class _Store:
     def __init__(self, folder: Path, fingerprint: str) -> None:
         self.folder, self.fingerprint = folder, fingerprint
         folder.mkdir(parents=True, exist_ok=True)
-        own = ("*.damaged*", f"{PREFIX}*{SUFFIX}")
-        names = [entry.name for entry in folder.iterdir()]
-        strange = [name for name in names if not any(fnmatch(name, pattern) for pattern in own)]
-        if strange and not any(folder.glob("chunk-*.npz")):
-            raise ValueError(f"{folder} holds other files: give an empty or a new folder for the results.")
 
     def load(self, chunk: range) -> Arrays | None:
-        """Return the chunk's arrays; None if it is not there, or damaged and therefore set aside.
+        """Return the chunk's arrays; None if it is not there, or damaged, which is said in a warning.
 
         Raises
         ------
@@ -172,29 +167,28 @@ class _Store:
         if not path.exists():
             return None
         arrays, reason = read_arrays(path)
-        if not reason and str(arrays.pop("fingerprint")) != self.fingerprint:
+        if reason:
+            again = f"Runs {chunk.start} to {chunk.stop - 1} are computed again."
+            warnings.warn(f"{path} is damaged: {reason}. {again}", stacklevel=2)
+            return None
+        if str(arrays.pop("fingerprint")) != self.fingerprint:
             raise ValueError(
                 f"{self.folder} holds the results of another run (of other data, models or settings). Choose another "
                 "folder, or delete this one."
             )
-        if not reason:
-            first, last = arrays.pop("runs").tolist()
-            if first == chunk.start:
-                return arrays if last == chunk.stop else None  # the last chunk of a shorter study
-            reason = f"it holds runs from {first} on, which is not what its name says"
-        set_aside(path, reason, f"Runs {chunk.start} to {chunk.stop - 1} are computed again.")
-        return None
+        # The last chunk of a shorter study has fewer runs.
+        return arrays if arrays.pop("runs").tolist() == [chunk.start, chunk.stop] else None
 
     def save(self, chunk: range, arrays: Arrays) -> None:
         """Write a chunk, whole or not at all."""
         runs = np.array([chunk.start, chunk.stop])
-        write_arrays(arrays | {"fingerprint": np.array(self.fingerprint), "runs": runs}, self._path(chunk), np.savez)
+        write_arrays(arrays | {"fingerprint": np.array(self.fingerprint), "runs": runs}, self._path(chunk))
 
     def _path(self, chunk: range) -> Path:
         return self.folder / f"chunk-{chunk.start:08d}.npz"
 
 
-def write_arrays(arrays: Arrays, path: Path, save: Callable[..., None]) -> None:
+def write_arrays(arrays: Arrays, path: Path) -> None:
     """Write arrays and their digest to a NumPy archive, whole or not at all.
 
     Parameters
@@ -202,11 +196,9 @@ def write_arrays(arrays: Arrays, path: Path, save: Callable[..., None]) -> None:
     arrays : dict of str to array
     path : Path
         An existing file is replaced.
-    save : callable
-        ``np.savez`` or ``np.savez_compressed``.
     """
     buffer = io.BytesIO()
-    save(buffer, **arrays, seal=np.array(compute_seal(arrays)))
+    np.savez_compressed(buffer, **arrays, seal=np.array(compute_seal(arrays)))  # type: ignore[arg-type]
     write_atomically(buffer.getvalue(), path)
 
 

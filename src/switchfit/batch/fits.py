@@ -27,10 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import read_arrays, write_arrays
+from switchfit.batch.program import Ends
 from switchfit.estimation.estimator import Estimate, parse_fit, write_fit
-from switchfit.fit.result import interval, measure_quantile
+from switchfit.fit.result import count_samples, interval, measure_quantile, measure_variance
 from switchfit.optimize import Status
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
@@ -48,7 +49,7 @@ from switchfit.uncertainty.verdict import FINE, LEVELS, Doubt, Finding, Level, N
 from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"
-VERSION = 2
+VERSION = 3
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
@@ -78,14 +79,12 @@ def load_best(content: Any) -> Estimate | None:
     """
     if content is None:
         return None
-    if not isinstance(content, Mapping):
-        raise ValueError("best must be an object")
     fit, certificate = parse_fit(content)
     return Estimate(**vars(fit), saved_certificate=certificate)
 
 
 @dataclass(frozen=True, eq=False)
-class Fits(Tabular, Displayed):
+class Fits(Ends, Tabular, Displayed):
     """Many fits of one model; R of them, d unknowns in the order of `theta_names`.
 
     Attributes
@@ -155,17 +154,6 @@ class Fits(Tabular, Displayed):
     requested: int
     runs: NDArray[np.intp]
     start: FloatArray
-    theta: FloatArray
-    cost: FloatArray
-    gradient: FloatArray
-    hessian: FloatArray
-    optimality: FloatArray
-    iterations: NDArray[np.int64]
-    evaluations: NDArray[np.int64]
-    status: NDArray[np.str_]
-    message: NDArray[np.str_]
-    free: NDArray[np.int64]
-    covariance: FloatArray
     samples: NDArray[np.int64]
     explained: FloatArray
     collapsed: NDArray[np.int64]
@@ -319,7 +307,7 @@ class Fits(Tabular, Displayed):
         if isinstance(best := getattr(self, "best", None), Estimate):
             content["best"] = describe_best(best)
         header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
-        write_arrays({name: getattr(self, name) for name in arrays} | {"header": header}, file, np.savez_compressed)
+        write_arrays({name: getattr(self, name) for name in arrays} | {"header": header}, file)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -407,26 +395,6 @@ def _count_collapsed(problem: Problem, experiment: Experiment, ends: FloatArray)
     shortest = least + AT_END * (experiment.end - experiment.t0)
     found: NDArray[np.int64] = np.sum(np.diff(ends, axis=1) <= shortest, axis=1)
     return found
-
-
-def count_samples(problem: Problem) -> int:
-    """Return the measured values that are not missing."""
-    return sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
-
-
-def count_priors(problem: Problem) -> int:
-    """Return the unknowns that have a prior."""
-    return int(np.count_nonzero(problem.unknowns.priors.precision))
-
-
-def measure_variance(cost: FloatArray, freedom: NDArray[np.int64], sigma_known: bool | None) -> FloatArray:
-    """Return by what covariances are multiplied: 1 if sigma is known, the residual variance if not; NaN where neither
-    is: (R,).
-    """
-    if sigma_known:
-        return np.ones(len(cost))
-    there = (freedom > 0) & (sigma_known is False)
-    return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
 
 
 MINOR = 0.01
@@ -548,17 +516,6 @@ def judge_study(
     found += _find_stop(fits)
     figures = {"count": float(ended.sum()), "fits": float(R)}
     return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
-
-
-def judge_failed_starts(fits: Fits) -> Verdict:
-    """Return the verdict on fits from many starts none of which could be fitted to the end.
-
-    Parameters
-    ----------
-    fits : Fits
-    """
-    everywhere = Doubt("not converged", "bad", np.ones(len(fits), dtype=bool))
-    return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
 
 
 def measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:

@@ -18,76 +18,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.batch.program import Inputs, choose_layout, has_gpu
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import get_min_duration
-from switchfit.problem.validation import as_array, join_names, shorten
-from switchfit.runtime.frames import Variable, build_arviz
+from switchfit.problem.validation import join_names, shorten
+from switchfit.uncertainty.profiles import Limits, limit_unknowns
 
 FLAT = -np.inf
 """Logarithm of a density of zero."""
-
-
-class Limits(NamedTuple):
-    """What limits each unknown.
-
-    Attributes
-    ----------
-    before : (d,) int
-        Of a transition time, or a free tf, the index in theta of the time before it; -1 if that is fixed, or t0, and
-        for all other unknowns.
-    gap : (d,)
-        Shortest time between the two.
-    low : (d,)
-        Lower bound; of a time after one that is fixed, not less than this plus the gap.
-    high : (d,)
-        Upper bound, so that all times after it find room.
-    """
-
-    before: NDArray[np.intp]
-    gap: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-def limit_unknowns(problem: Problem) -> Limits:
-    """Return the limits of all unknowns.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    unknowns, d = problem.unknowns, len(problem.theta_names)
-    found = Limits(np.full(d, -1), np.zeros(d), unknowns.lower.copy(), unknowns.upper.copy())
-    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        times, places = experiment.initial_times, where.tolist()
-        gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
-        latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
-        for i in reversed(range(len(places))):
-            latest = min(latest, times[i] if places[i] < 0 else found.high[places[i]])
-            if places[i] >= 0:
-                found.high[places[i]] = latest
-            latest -= gaps[i]
-        before, last = -1, experiment.t0
-        for i, place in enumerate(places):
-            if place >= 0:
-                found.before[place], found.gap[place] = before, gaps[i]
-                if before < 0:
-                    found.low[place] = max(found.low[place], last + gaps[i])
-            before, last = place, times[i]
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,48 +173,6 @@ class LogPosterior:
         z = np.where(has_low & has_high, np.log(part / (1 - part)), np.where(has_low | has_high, away, at))
         return np.asarray(np.linalg.solve(self.root, z - self.center), dtype=np.float64)
 
-    def to_arviz(self, samples: ArrayLike) -> Any:
-        """Return samples with a variable for each unknown: ArviZ's InferenceData.
-
-        Parameters
-        ----------
-        samples : (chains, draws, d) or (draws, d) array_like
-            Of theta.
-
-        Raises
-        ------
-        MissingExtraError
-            If ArviZ or xarray is not installed.
-        ValueError
-            For samples of another shape.
-
-        See Also
-        --------
-        LogPosterior.constrain
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-
-        >>> posterior = sf.log_posterior(heater_problem())
-        >>> table = posterior.to_arviz(np.random.default_rng(0).normal(size=(4, 100, 2)))
-        >>> list(table.posterior), table.posterior["k"].shape
-        (['tau_1', 'k'], (4, 100))
-        """
-        given = as_array(samples, "samples")
-        given = given[None] if given.ndim == 2 else given
-        if given.ndim != 3 or given.shape[-1] != len(self.names):
-            raise ValueError(
-                f"samples must have shape (chains, draws, {len(self.names)}): {join_names(self.names)}; got "
-                f"{np.shape(samples)}."
-            )
-        units = [unit if unit != "1" else "" for unit in self.problem.unknowns.units]
-        named = enumerate(zip(self.names, units, strict=True))
-        draws = [Variable(name, given[..., i], ("chain", "draw"), unit) for i, (name, unit) in named]
-        return build_arviz(draws, {"inference_library": "switchfit", "draws": "posterior"})
-
     @cached_property
     def _limits(self) -> Limits:
         return limit_unknowns(self.problem)
@@ -296,22 +203,13 @@ class LogPosterior:
 
     def _transform(self, z: Any) -> tuple[Any, Any]:
         """Return theta at z (d,), and ``log |dtheta/dz|``."""
-        limits = self._limits
-        lower, upper = limits.low, limits.high
+        before, gap, lower, upper = self._limits
         z = self.center + jnp.asarray(self.root) @ z
-        has_low, has_high = np.isfinite(lower), np.isfinite(upper)
-        both, one = has_low & has_high, (has_low != has_high) & (limits.before < 0)
-        width = np.where(both, upper - lower, 1.0)
-        signed, inside = jnp.where(has_low, z, -z), jax.nn.sigmoid(z)
-        log_slope = jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
-        away = jnp.exp(jnp.where(one, signed, 0.0))
-        theta = jnp.where(both, lower + width * inside, jnp.where(has_low, lower + away, upper - away))
-        theta = jnp.where(both | one, theta, z)
-        slopes = jnp.where(both, np.log(width) + log_slope, jnp.where(one, signed, 0.0))
-        for i in np.flatnonzero(limits.before >= 0).tolist():  # each after the time before it
-            first = jnp.maximum(lower[i], theta[limits.before[i]] + limits.gap[i])
-            theta = theta.at[i].set(first + (upper[i] - first) * inside[i])
-            slopes = slopes.at[i].set(jnp.log(upper[i] - first) + log_slope[i])
+        theta, slopes = _place_between(z, lower, upper)
+        for i in np.flatnonzero(before >= 0).tolist():  # each after the time before it
+            first = jnp.maximum(lower[i], theta[before[i]] + gap[i])
+            own, slope = _place_between(z[i], first, upper[i])
+            theta, slopes = theta.at[i].set(own), slopes.at[i].set(slope)
         return theta, jnp.sum(slopes) + np.linalg.slogdet(self.root)[1]
 
     def _scale_by(self, fit: Fit) -> LogPosterior:
@@ -370,6 +268,17 @@ class LogPosterior:
                 return J, g @ tangents[0]
 
         return cost
+
+
+def _place_between(z: Any, low: Any, high: Any) -> tuple[Any, Any]:
+    """Return theta between limits, which may be infinite, at z, and ``log dtheta/dz``: (d,) each, or numbers."""
+    has_low, has_high = jnp.isfinite(low), jnp.isfinite(high)
+    both, one = has_low & has_high, has_low ^ has_high
+    width, outwards = jnp.where(both, high - low, 1.0), jnp.where(one, jnp.where(has_low, z, -z), 0.0)
+    away = jnp.exp(outwards)
+    beside = jnp.where(one, jnp.where(has_low, low + away, high - away), z)
+    inside = jnp.log(width) + jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
+    return jnp.where(both, low + width * jax.nn.sigmoid(z), beside), jnp.where(both, inside, outwards)
 
 
 def require_float64(given: Any) -> None:
@@ -442,14 +351,9 @@ def log_posterior(problem: Problem | Estimate) -> LogPosterior:
         raise TypeError(f"log_posterior needs an sf.Problem or the result of sf.estimate; got {shorten(problem)}.")
     own = evaluator.problem
     if not own.is_sigma_known:
-        items = [item for run in own.experiments for item in run.data]
-        missing = any(isinstance(item, Measurements) and item.sigma is None for item in items)
         raise ValueError(
-            "a posterior needs the noise: sigma is left out in some Measurements. Give sigma a number, or the name of "
-            "a parameter to sample it with the others."
-            if missing
-            else "a posterior needs a cost of Measurements and priors alone; this one has other terms, which are no "
-            "probability."
+            "a posterior needs a cost of Measurements with sigma, and of priors, alone: other terms are no "
+            "probability. Give sigma a number, or the name of a parameter to sample it with the others."
         )
     if own.constraint_names:
         raise ValueError(

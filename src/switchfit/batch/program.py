@@ -152,11 +152,8 @@ class Inputs(NamedTuple):
     @classmethod
     def of(cls, evaluator: Evaluator, layout: Layout) -> Inputs:
         """Return those of a problem on the meshes of an evaluator."""
-        problem, unknowns, variables = (
-            evaluator.problem,
-            evaluator.problem.unknowns,
-            evaluator.problem.unknowns.variables,
-        )
+        problem, unknowns = evaluator.problem, evaluator.problem.unknowns
+        variables = unknowns.variables
         times = tuple(experiment.initial_times_with_jumps for experiment in problem.experiments)
         sequences = tuple(places_in_library(each) if layout.natively else {} for each in evaluator.structures)
         limits: list[Any] = [variables.inward(unknowns.lower), variables.inward(unknowns.upper)]
@@ -264,18 +261,18 @@ class Limits(NamedTuple):
     max_iterations: int
 
 
-@dataclass
-class Chunk:
-    """What was found, one entry a fit, to be written to: a fit that is done again replaces what was found before.
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Where R fits ended, one entry a fit.
 
     Attributes
     ----------
     theta, cost, gradient, hessian : (R, d), (R,), (R, d), (R, d, d)
     optimality : (R,)
     iterations, evaluations : (R,) int
-    status : (R,) object
+    status : (R,) str
         Name of the `Status`.
-    message : (R,) object
+    message : (R,) str
         Empty where the status is CONVERGED without an active constraint; the error of a fit that ended with one.
     free : (R,) int
         Directions that constraints and kinks leave free; the covariance is of these.
@@ -290,17 +287,21 @@ class Chunk:
     optimality: FloatArray
     iterations: NDArray[np.int64]
     evaluations: NDArray[np.int64]
-    status: NDArray[np.object_]
-    message: NDArray[np.object_]
+    status: NDArray[np.str_]
+    message: NDArray[np.str_]
     free: NDArray[np.int64]
     covariance: FloatArray
+
+
+class Chunk(Ends):
+    """Ends to be written to: a fit that is done again replaces what was found before. Text is in arrays of objects."""
 
     @classmethod
     def of(cls, outcome: Outcome) -> Chunk:
         """Return the outcomes of R fits as if all of them had converged, without covariances."""
         found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
         R, d = outcome.theta.shape
-        texts = np.full(R, Status.CONVERGED.name, dtype=object), np.full(R, "", dtype=object)
+        texts: list[NDArray[Any]] = [np.full(R, text, dtype=object) for text in (Status.CONVERGED.name, "")]
         return cls(
             **found, status=texts[0], message=texts[1], free=np.full(R, d), covariance=np.full((R, d, d), np.nan)
         )

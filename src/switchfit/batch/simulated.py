@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -43,7 +43,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.batch.fits import Fits, judge_study
 from switchfit.batch.program import Limits, Varying
 from switchfit.batch.study import LongRun, Study, repeat
-from switchfit.discretization.mesh import Mesh, split_by_cell
+from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, fit_locally
 from switchfit.fit.accuracy import cost_error
@@ -51,13 +51,11 @@ from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_guard
 from switchfit.fit.result import inverse_on
 from switchfit.fit.trajectory import compare, replace_values
 from switchfit.problem import validation
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.experiment import Experiment
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_count, as_seed, shorten
 from switchfit.runtime import special
 from switchfit.uncertainty.prediction import collect_sample_derivatives
-from switchfit.uncertainty.residuals import compute_autocorrelation
 from switchfit.uncertainty.verdict import Verdict
 
 Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
@@ -165,8 +163,7 @@ def monte_carlo(
     noise : optional
         Standard deviation of Gaussian noise: a number, one for each channel (q,), or by default the sigma of each of
         the `Measurements`. Or a function ``noise(rng, clean, item) -> (K, q)`` that returns the noisy values of one
-        of the data from the clean ones. A `ReferenceSignal` is simulated at the samples it was made from, and
-        interpolated and filtered anew.
+        of the data from the clean ones.
     seed : int
         Run k draws from ``numpy.random.default_rng([seed, k])``, wherever and in whatever order it is done.
     tolerance, max_iterations : as of `estimate`
@@ -185,7 +182,8 @@ def monte_carlo(
     Raises
     ------
     ValueError
-        If the noise is not known, there is nothing to simulate, or the folder holds something else.
+        If the noise is not known, there are no Measurements or other signals to simulate, or the folder holds something
+        else.
     TypeError
         If an argument is of the wrong type.
 
@@ -215,17 +213,13 @@ def monte_carlo(
     noise = _check_noise(noise)
     given = None if theta is None else problem.check_theta(theta)
     begin = None if start is None else problem.check_theta(start, "start")
-    truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
+    truth = fit_locally(problem).theta if given is None else given
+    if given is not None and problem.constraint_names:
+        with suppress(ValueError):  # it is not near the guards
+            truth = place_on_guards(problem, given)[1]
     begin = truth if begin is None else begin
     study, error = build_study(problem, truth, begin, noise, seed, how.limits)
     return MonteCarlo(**repeat(problem, study, runs, "Monte Carlo", how), truth=truth, integration_error=error)
-
-
-def _move_onto_guards(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Return `theta` with guarded times on their guards; as it is where there are none, or no such point is near."""
-    with suppress(ValueError):
-        return place_on_guards(problem, theta)[1]
-    return theta
 
 
 def _check_noise(noise: Noise) -> Noise:
@@ -262,18 +256,14 @@ Values = dict[tuple[int, int], FloatArray]
 
 def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     """Return what data would be without noise."""
-    runs, places = [], []
-    for e, experiment in enumerate(problem.experiments):
-        sampled_items = ((k, _sample(item, experiment)) for k, item in enumerate(experiment.data))
-        items = {k: item for k, item in sampled_items if item is not None}
-        if not items:
-            raise ValueError("monte_carlo needs Measurements or a ReferenceSignal made from samples to simulate.")
-        runs.append(replace(experiment, data=list(items.values())))
-        places += [(e, k) for k in items]
-    sampled = replace(problem, experiments=runs)
-    evaluator = Evaluator(sampled, meshes=[mesh.divide() for mesh in Evaluator(sampled, truth).meshes])
-    _, comparisons = compare(evaluator, truth)
-    return dict(zip(places, (comparison.fitted for run in comparisons for comparison in run), strict=True))
+    found: Values = {}
+    comparisons = compare(Evaluator(problem, truth).halved, truth)[1]
+    for e, (experiment, run) in enumerate(zip(problem.experiments, comparisons, strict=True)):
+        places = [k for k, item in enumerate(experiment.data) if isinstance(item, Measurements)]
+        if not places or any(comparison.kind != "measurements" for comparison in run):
+            raise ValueError("monte_carlo simulates Measurements: every run needs some, and none a ReferenceSignal.")
+        found |= {(e, k): comparison.fitted for k, comparison in zip(places, run, strict=True)}
+    return found
 
 
 def _find_spreads(problem: Problem, truth: FloatArray, noise: Any, clean: Values) -> Values:
@@ -281,7 +271,7 @@ def _find_spreads(problem: Problem, truth: FloatArray, noise: Any, clean: Values
     found = {}
     for (e, k), values in clean.items():
         item, sigma = problem.experiments[e].data[k], noise
-        if sigma is None and isinstance(item, Measurements):
+        if sigma is None:
             sigma = item.noise(problem.name_parameters(truth, e))
         if sigma is None:
             raise ValueError(
@@ -295,21 +285,6 @@ def _find_spreads(problem: Problem, truth: FloatArray, noise: Any, clean: Values
         if not np.all(np.isfinite(found[e, k]) & (found[e, k] >= 0)):
             raise ValueError(f"noise must be zero or positive; got {shorten(sigma)}.")
     return found
-
-
-def _sample(item: Any, experiment: Experiment) -> Measurements | None:
-    """Return what is simulated of the data of an experiment: Measurements; None for costs without data."""
-    if isinstance(item, Measurements):
-        return replace(item, values=np.nan_to_num(item.values))
-    if not isinstance(item, ReferenceSignal) or item.samples is None:
-        return None
-    times, values = item.samples
-    if np.any(np.diff(times) == 0):
-        raise ValueError("A ReferenceSignal that was broken by a time given twice cannot be simulated.")
-    if times.min() < experiment.t0 or times.max() > experiment.earliest_end:
-        after = ", or after the lower bound of a free tf," if experiment.has_free_tf else ""
-        raise ValueError(f"A ReferenceSignal with samples outside the horizon{after} cannot be simulated.")
-    return Measurements(times, np.nan_to_num(values), item.observe, sigma=1.0)
 
 
 def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
@@ -383,36 +358,14 @@ class SimulatedStudy(Study):
 
     def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
-        (leaves, places), changed = self.leaves, dict[int, Any]()
+        (leaves, places), changed = self.leaves, {}
         for e, experiment in enumerate(self.problem.experiments):
-            samples, signals, channel = iter(places[e].samples), places[e].signals, 0
-            for k, item in enumerate(experiment.data):
-                if isinstance(item, Measurements):
-                    leaf = next(samples).value
-                    changed[leaf] = np.zeros((len(values[e, k]), *leaves[leaf].shape))
-                    changed[leaf][:, : len(item.times)] = np.where(np.isnan(item.values), 0.0, values[e, k])
-                elif isinstance(item, ReferenceSignal):
-                    q = item.signal.channels
-                    if (e, k) in values:
-                        every = np.repeat(np.asarray(leaves[signals])[None], len(values[e, k]), axis=0)
-                        cells = _find_cells(item, values[e, k], self.meshes[e])
-                        changed.setdefault(signals, every)[..., channel : channel + q] = cells
-                    channel += q
+            measured = [(k, item) for k, item in enumerate(experiment.data) if isinstance(item, Measurements)]
+            for samples, (k, item) in zip(places[e].samples, measured, strict=True):
+                own, leaf = values[e, k], samples.value
+                changed[leaf] = np.zeros((len(own), *leaves[leaf].shape))
+                changed[leaf][:, : len(item.times)] = np.where(np.isnan(item.values), 0.0, own)
         return changed
-
-
-def _find_cells(item: ReferenceSignal, values: FloatArray, mesh: Mesh) -> FloatArray:
-    """Return reference signals made from values (R, K, q), as cubics in the cells of a mesh: (R, G, 4, q).
-
-    All R at once: interpolation and filter treat channels one by one, so that runs can be channels too.
-    """
-    R, K, q = values.shape
-    times, measured = item.samples  # type: ignore[misc]  # there are some: they have been simulated
-    table = np.where(np.isnan(measured), np.nan, values)
-    channels = np.moveaxis(table, 0, 1).reshape(K, R * q)
-    signal = ReferenceSignal.from_samples(times, channels, lowpass_hz=item.lowpass_hz).signal
-    cells = split_by_cell(signal, mesh)
-    return np.moveaxis(cells.reshape(*cells.shape[:2], R, q), 2, 0)
 
 
 Resample = Literal["residuals", "wild", "blocks", "runs"]
@@ -636,6 +589,16 @@ def _compute_acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
     return np.nan_to_num(acceleration)
 
 
+def _choose_block(estimate: Estimate, longest: int) -> int:
+    """Return the length of a block, by the channel with the largest correlation of neighbours."""
+    lengths = [1.0]
+    for channel in estimate.residuals.channels:
+        if channel.correlation > 0:
+            r = min(channel.correlation, 0.99)
+            lengths.append((np.sqrt(6) * r / (1 - r**2)) ** (2 / 3) * len(channel.values) ** (1 / 3))
+    return max(1, min(round(max(lengths)), longest // 2))
+
+
 class _Draw:
     """The noise of one run: as `monte_carlo` takes it."""
 
@@ -649,20 +612,9 @@ class _Draw:
             self.pools.append(residuals if resample == "wild" else residuals - np.nanmean(residuals, axis=0))
         if resample == "blocks":
             longest = max(map(len, self.pools))
-            self.block = self._length(longest) if block is None else as_count(block, "block")
+            self.block = _choose_block(estimate, longest) if block is None else as_count(block, "block")
             if not 1 <= self.block <= longest:
                 raise ValueError(f"block must lie between 1 and the {longest} samples there are; got {block}.")
-
-    def _length(self, longest: int) -> int:
-        """Return the length of a block, by the channel with the largest correlation of neighbours."""
-        lengths = [1.0]
-        for pool in self.pools:
-            for channel in pool.T:
-                known = channel[np.isfinite(channel)]
-                if len(known) > 2:
-                    r = min(float(compute_autocorrelation(known, 1)[0]), 0.99)
-                    lengths.append((np.sqrt(6) * r / (1 - r**2)) ** (2 / 3) * len(known) ** (1 / 3) if r > 0 else 1.0)
-        return max(1, min(round(max(lengths)), longest // 2))
 
     def __call__(self, rng: np.random.Generator, clean: FloatArray, item: Any) -> FloatArray:
         pool = next(pool for own, pool in zip(self.items, self.pools, strict=True) if own is item)

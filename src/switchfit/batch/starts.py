@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.fits import Fits, judge_failed_starts
+from switchfit.batch.fits import Fits, judge_many
 from switchfit.batch.program import Limits, describe_failure
 from switchfit.batch.study import LongRun, Study, repeat
 from switchfit.discretization.mesh import Mesh
@@ -35,12 +35,7 @@ CLEARLY_LOWER = 1e-4
 """Part of the best cost by which another end is better: on the mesh that all starts share costs are less accurate."""
 
 SAME_COST = 1e-6
-"""Two ends are one minimum if their costs differ by less than this part of them, and ..."""
-
-SAME_PLACE = 1e-3
-"""... each parameter by less than this part of the spread of the starts, or of its size where they do not differ in it,
-each transition time by less than this part of the horizon. Modes that have collapsed (shorter than that) do not count:
-where they sit is arbitrary."""
+"""Two ends are one minimum if their costs differ by less than this part of them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,7 +70,7 @@ class Multistart(Fits):
     @cached_property
     def verdict(self) -> Verdict:
         """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
-        return judge_failed_starts(self) if self.best is None else self.best.verdict
+        return judge_many(self) if self.best is None else self.best.verdict
 
     def plot(self, *, ax: Drawn | None = None) -> Drawn:  # type: ignore[override]  # it is not of one unknown
         """Draw a waterfall: the cost at the end of every start, ascending.
@@ -168,7 +163,7 @@ def multistart(
     study = Study(problem, _find_meshes(problem, points), points, how.limits, seed)
     found = repeat(problem, study, len(points), "Multistart", how)
     fits, best = _find_best(problem, Fits(**found), how.limits)
-    clusters = _find_clusters(problem, fits)
+    clusters = _find_clusters(fits)
     if best is not None:
         best = replace(best, starts=_count_starts(fits, clusters, best.cost))
     return Multistart(**found | {"status": fits.status, "message": fits.message}, clusters=clusters, best=best)
@@ -220,43 +215,13 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
     return points
 
 
-def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
+def _find_clusters(fits: Fits) -> NDArray[np.int64]:
     """Return the number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
-    labels = np.full(len(fits), -1)
-    spread, size = np.ptp(fits.start, axis=0), np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
-    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)
-    others = ~np.isin(np.arange(len(spread)), np.concatenate(problem.unknowns.times))
-    found: list[tuple[float, list[list[str]], FloatArray]] = []
-    for k in np.argsort(fits.cost, kind="stable").tolist():
-        if not fits.success[k]:
-            continue
-        cost, (modes, switches) = float(fits.cost[k]), _list_switches(problem, fits.theta[k])
-        place = np.append((fits.theta[k] / spread)[others], switches)
-        same = (
-            label
-            for label, (level, sequences, at) in enumerate(found)
-            if abs(cost - level) <= SAME_COST * max(abs(cost), 1e-300)
-            and modes == sequences
-            and np.all(np.abs(place - at) <= SAME_PLACE)
-        )
-        labels[k] = next(same, len(found))
-        if labels[k] == len(found):
-            found.append((cost, modes, place))
+    labels, ended = np.full(len(fits), -1), np.flatnonzero(fits.success)
+    found, lowest = -1, -np.inf
+    for k in ended[np.argsort(fits.cost[ended], kind="stable")].tolist():
+        cost = float(fits.cost[k])
+        if not cost - lowest <= SAME_COST * max(abs(cost), 1e-300):
+            found, lowest = found + 1, cost
+        labels[k] = found
     return labels
-
-
-def _list_switches(problem: Problem, theta: FloatArray) -> tuple[list[list[str]], list[float]]:
-    """Return each experiment's modes without the collapsed ones, and when they begin and end as parts of its horizon,
-    of all experiments together.
-    """
-    sequences, switches = [], []
-    for experiment, ends in zip(problem.experiments, problem.ends_of_modes(theta), strict=True):
-        knots = ((ends - experiment.t0) / experiment.initial_length).tolist()
-        modes: list[str] = []
-        for mode, begin, end in zip(experiment.mode_sequence, knots[:-1], knots[1:], strict=True):
-            if end - begin > SAME_PLACE and (not modes or modes[-1] != mode):
-                modes.append(mode)
-                switches.append(begin)
-        switches.append(knots[-1])
-        sequences.append(modes)
-    return sequences, switches

@@ -30,14 +30,14 @@ from numpy.typing import NDArray
 
 from switchfit.batch import fits as judged
 from switchfit.batch.chunks import Arrays, compute_fingerprint, run_chunks
-from switchfit.batch.fits import Fits, count_priors, count_samples, has_converged, measure_variance
+from switchfit.batch.fits import Fits, has_converged
 from switchfit.batch.program import Batch, Chunk, Limits, Varying, choose_chunk_size, describe_failure
 from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.branches import has_corners
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
-from switchfit.fit.result import measure_quantile
+from switchfit.fit.result import count_priors, count_samples, measure_quantile, measure_variance
 from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.optimize import Status
 from switchfit.optimize.traced import Outcome
@@ -288,12 +288,10 @@ class Study:
 
     def _find_doubted(self, chunk: Chunk, runs: range) -> NDArray[np.bool_]:
         """Return of which fits a better end may be elsewhere: not converged, a mode collapsed, or far from the data."""
-        arrays = self.describe_fits(chunk, runs)
-        doubted = arrays["collapsed"] > 0
-        for doubt in judged.find_doubts(arrays, self.problem.is_sigma_known, count_priors(self.problem)):
-            if doubt.kind in ("not converged", "little explained", *judged.EXPLAINED_BADLY):
-                doubted |= doubt.which
-        return doubted
+        kinds = "not converged", "a mode collapsed", "little explained", *judged.EXPLAINED_BADLY
+        arrays, known = self.describe_fits(chunk, runs), self.problem.is_sigma_known
+        doubts = [d for d in judged.find_doubts(arrays, known, count_priors(self.problem)) if d.kind in kinds]
+        return np.any([np.zeros(len(runs), dtype=bool), *(doubt.which for doubt in doubts)], axis=0)
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
         """Return the arrays of fits as they are."""

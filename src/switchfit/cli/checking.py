@@ -171,7 +171,7 @@ def _check_files(problem: Path, full: bool) -> None:
 OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
 Times = Annotated[
     str,
-    option(metavar="STEP", help="A step, such as 0.1, or 'samples': times of the data. Default: the integrator's."),
+    option(metavar="STEP", help="A step, such as 0.1. Default: the integrator's."),
 ]
 
 

@@ -2,17 +2,16 @@
 
 Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 9, "seal": "...", "fit": {...}, "certificate":
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 10, "seal": "...", "fit": {...}, "certificate":
 {...}}`` with the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of
-text, and the "transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes
-them again from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without
-it are read too.
+text, is meant for readers of the file; `load` computes it again from the rest. ``"provenance"`` holds the fields of
+`Provenance`: what the fit was made from. Files without it are read too.
 
 `runtime.files` says how numbers, arrays and dataclasses are written.
 
 The seal is a digest of fit and certificate: a file in which a number was changed, or lost, is refused.
 
-What a fit was made from: the problem file, hashes of data and models, versions. Enough to run it again.
+What a fit was made from: the problem file, hashes of the files that it names, versions. Enough to run it again.
 """
 
 from __future__ import annotations
@@ -32,14 +31,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import CovarianceKind, Fit, inverse_on
+from switchfit.fit.result import Fit, inverse_on
 from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
+from switchfit.runtime import special
 from switchfit.runtime.files import from_json, read_document, to_json, write_atomically, write_document
-from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
+from switchfit.runtime.frames import Tabular, build_pandas, describe_frame
 from switchfit.runtime.presentation import (
     Displayed,
     Drawn,
@@ -56,7 +56,6 @@ from switchfit.uncertainty.certificate import Certificate, Identifiability, cert
 from switchfit.uncertainty.prediction import (
     Prediction,
     Sensitivity,
-    build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
     predict,
@@ -68,11 +67,11 @@ from switchfit.uncertainty.walks import HIGHEST_LEVEL, compute_threshold, replac
 
 if TYPE_CHECKING:
     import pandas
-    import xarray
 
 
 TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
 TABLES = get_args(TableKind)
+CovarianceKind = Literal["exact", "sandwich"]
 
 MOST_SENSITIVITIES = 2**28
 """Largest size, in bytes, of the derivatives of states and outputs at all nodes; above it, figures have no bands."""
@@ -85,7 +84,7 @@ class Estimate(Fit, Tabular, Displayed):
     Attributes
     ----------
     provenance : Provenance or None
-        What a loaded estimate was made from, if its file says so: problem file, hashes of data and models, versions.
+        What a loaded estimate was made from, if its file says so: problem file, hashes of files, versions.
 
     See Also
     --------
@@ -222,36 +221,22 @@ class Estimate(Fit, Tabular, Displayed):
         """The certificate, if it was loaded or computed before; else None."""
         return self.saved_certificate or self.__dict__.get("certificate")
 
-    @cached_property
-    def gauss_newton(self) -> FloatArray | None:
-        """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None if it is unknown."""
-        if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
-            return self.saved_gauss_newton
-        if not self.problem.estimates_delays and self.has_room_for_sensitivities():
-            # From the program of the exact Hessian, which the fit has compiled: 1 ms, and 0.7 s with one of its own.
-            samples = collect_sample_derivatives(self.problem, self.sensitivities)
-            return build_gauss_newton(self.problem, self.theta, samples)
-        return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
-
     def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance of theta from the exact Hessian, the Gauss-Newton matrix or both sides of it: (d, d).
+        """Return the covariance of theta from the exact Hessian, or the "sandwich" with it on both sides: (d, d).
 
         Parameters
         ----------
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            "exact", the observed information, is used by `covariance` and everything else here. The Gauss-Newton
-            matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
-            residuals, and treats the model as linear. "sandwich" is ``n / (n - d) H^-1 B H^-1`` with the exact Hessian
-            H and ``B = sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: with a robust loss it holds
-            for independent noise of any distribution, whether sigma is right or not.
+        hessian : {"exact", "sandwich"}
+            "exact", the observed information, is used by `covariance` and everything else here. "sandwich" is
+            ``n / (n - d) H^-1 B H^-1`` with the exact Hessian H and ``B = sum_k g_k g_k'``, g_k being the gradient of
+            the cost of sample k: with a robust loss it holds for independent noise of any distribution, whether sigma
+            is right or not.
 
         Raises
         ------
         ValueError
-            For another kind, or if the Gauss-Newton matrix is unknown: the cost does not consist of Measurements
-            alone, or the estimate was loaded without its problem from a file that lacks the matrix. For "sandwich"
-            without the problem, with priors, constraints, or a sigma or delay that is a parameter, and with no more
-            values than free unknowns.
+            For another kind. For "sandwich" without the problem, with a cost of anything but Measurements, with priors,
+            constraints, or a sigma or delay that is a parameter, and with no more values than free unknowns.
 
         References
         ----------
@@ -269,11 +254,11 @@ class Estimate(Fit, Tabular, Displayed):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> fit.covariance_from("gauss-newton").shape
+        >>> fit.covariance_from("sandwich").shape
         (2, 2)
         """
         if as_choice(hessian, "hessian", get_args(CovarianceKind)) != "sandwich":
-            return super().covariance_from(hessian)
+            return self.covariance
         if self.problem is None or not self.has_sandwich:
             raise ValueError(
                 "The sandwich covariance needs the gradient of each sample: the problem, with a cost of Measurements "
@@ -308,10 +293,7 @@ class Estimate(Fit, Tabular, Displayed):
         True
         """
         rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
-        width = max(
-            t.states.shape[1] + sum(len(c.names) for c in run)
-            for t, run in zip(self.trajectories, self.comparisons, strict=True)
-        )
+        width = 2 * max(trajectory.states.shape[1] for trajectory in self.trajectories)  # about as many outputs
         return 16 * rows * width * len(self.theta) <= MOST_SENSITIVITIES
 
     @cached_property
@@ -366,9 +348,9 @@ class Estimate(Fit, Tabular, Displayed):
         ----------
         level : float, between 0 and 1
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            As in `covariance_from`. With the last two, kinks are ignored, and with "sandwich" the quantile is that of
-            Student's t in any case.
+        hessian : {"exact", "sandwich"}
+            As in `covariance_from`. With "sandwich", kinks are ignored, and the quantile is that of Student's t in any
+            case.
 
         See Also
         --------
@@ -384,9 +366,10 @@ class Estimate(Fit, Tabular, Displayed):
         array([[2.43, 2.5 ],
                [0.38, 0.4 ]])
         """
-        intervals = super().confidence_intervals(level, hessian=hessian)
+        intervals = super().confidence_intervals(level)
         if hessian != "exact":
-            return intervals
+            quantile = float(special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
+            return self.build_intervals(quantile * np.sqrt(np.diag(self.covariance_from(hessian))))
         pieces, places = self._trace_profiles(level)
         return replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))
 
@@ -530,7 +513,7 @@ class Estimate(Fit, Tabular, Displayed):
 
     @property
     def residuals(self) -> ResidualDiagnostics:
-        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
+        """Tests of the residuals, channel by channel: whiteness, effective sample size."""
         return diagnose(self)
 
     def plot_residuals(self) -> Figure:
@@ -647,7 +630,7 @@ class Estimate(Fit, Tabular, Displayed):
         path : path
         provenance : Provenance, optional
             What the fit was made from, ``load_problem("problem.toml").provenance``, from which ``switchfit validate``
-            and ``compare`` build the problem again. Left out, the file keeps hashes of the data, and versions.
+            and ``compare`` build the problem again. Left out, the file keeps versions.
 
         See Also
         --------
@@ -687,13 +670,12 @@ class Estimate(Fit, Tabular, Displayed):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> [digest.name for digest in fit.describe_provenance().data]
-        ['thermometer']
+        >>> sorted(fit.describe_provenance().versions)[:3]
+        ['Python', 'daqp', 'jax']
         """
         if given is not None:
-            as_instance(given, "provenance", Provenance, "the provenance of a problem file")
-            return replace(given, data=digest_data(self))
-        return self.provenance if self.saved_certificate is not None else describe_python_problem(self)
+            return as_instance(given, "provenance", Provenance, "the provenance of a problem file")
+        return self.provenance if self.saved_certificate is not None else describe_python_problem()
 
     def save_report(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
@@ -706,7 +688,7 @@ class Estimate(Fit, Tabular, Displayed):
             Such as "report.html".
         provenance : Provenance, optional
             As for `Estimate.save`: the text of the problem file goes into the report, with the hashes of the files that
-            it names; left out, the report holds the hashes of the data.
+            it names.
 
         Raises
         ------
@@ -749,7 +731,7 @@ class Estimate(Fit, Tabular, Displayed):
 
         See Also
         --------
-        Estimate.to_xarray, Trajectory.to_pandas, Fits.to_pandas
+        Trajectory.to_pandas, Fits.to_pandas
 
         Examples
         --------
@@ -764,37 +746,9 @@ class Estimate(Fit, Tabular, Displayed):
         """
         return build_pandas(describe_frame(self, what=as_choice(what, "what", TABLES)))
 
-    def to_xarray(self, what: TableKind = "unknowns") -> xarray.Dataset:
-        """Return one of the tables of the fit as a Dataset; that of the unknowns has covariance and Hessian too.
-
-        Parameters
-        ----------
-        what : {"unknowns", "trajectories", "residuals", "history"}
-            As in `to_pandas`.
-
-        Raises
-        ------
-        ImportError
-            If xarray is not installed.
-
-        See Also
-        --------
-        Estimate.to_pandas, Trajectory.to_xarray, Fits.to_xarray
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> fit.to_xarray()["covariance"].sel(unknown="k", unknown_2="k").item() > 0
-        True
-        """
-        return build_xarray(describe_frame(self, what=as_choice(what, "what", TABLES)))
-
     def complete(self) -> Estimate:
-        """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix, and the profiles of
-        transition times with samples near.
+        """Return the estimate with all fields that are saved: computes the profiles of transition times with samples
+        near.
 
         See Also
         --------
@@ -806,12 +760,11 @@ class Estimate(Fit, Tabular, Displayed):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> fit.complete().saved_gauss_newton.shape
-        (2, 2)
+        >>> fit.complete().saved_pieces.shape[0]
+        1
         """
         pieces, places = self._trace_profiles()
-        matrix = self.gauss_newton
-        return replace(self, saved_gauss_newton=matrix, saved_pieces=pieces, saved_piece_places=places)
+        return replace(self, saved_pieces=pieces, saved_piece_places=places)
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:
@@ -881,12 +834,12 @@ PACKAGES = ("switchfit", "daqp", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class FileDigest:
-    """A file that a fit was made from, or an array.
+    """A file that a fit was made from.
 
     Attributes
     ----------
     name : str
-        Path of a file from the folder of the problem file, with forward slashes; channels of an array.
+        Its path from the folder of the problem file, with forward slashes.
     size : int
         Bytes.
     sha256 : str
@@ -917,8 +870,6 @@ class Provenance:
         Arguments of `estimate`.
     files : tuple of FileDigest
         The data files and the Python files of the model.
-    data : tuple of FileDigest
-        Times and values of each of the measurements, as they were fitted.
     versions : mapping of str to str
         Of Python, switchfit and the libraries.
     platform : str
@@ -930,36 +881,8 @@ class Provenance:
     log: str
     options: Mapping[str, int | float | str]
     files: tuple[FileDigest, ...]
-    data: tuple[FileDigest, ...]
     versions: Mapping[str, str]
     platform: str
-
-    def place_beside(self, path: Path) -> Provenance:
-        """Return this with the folder as the path from that of a saved file.
-
-        Parameters
-        ----------
-        path : Path
-            Of the saved file.
-        """
-        return replace(self, folder=make_relative(self.folder, path.resolve().parent)) if self.folder else self
-
-    def find_from(self, path: Path) -> Provenance:
-        """Return this with the folder found from that of a saved file.
-
-        Parameters
-        ----------
-        path : Path
-            Of the saved file.
-
-        Raises
-        ------
-        ValueError
-            If no folder can have that name.
-        """
-        if "\0" in self.folder:
-            raise ValueError("provenance.folder has a null character")
-        return replace(self, folder=os.path.normpath(path.resolve().parent / self.folder)) if self.folder else self
 
 
 def make_relative(path: str | Path, folder: str | Path) -> str:
@@ -976,32 +899,9 @@ def make_relative(path: str | Path, folder: str | Path) -> str:
         return Path(whole).as_posix()
 
 
-def describe_python_problem(fit: Fit) -> Provenance:
-    """Return what is known of a fit whose problem was built in Python: data, versions, platform.
-
-    Parameters
-    ----------
-    fit : Fit
-    """
-    return Provenance("", "", "", "", {}, (), digest_data(fit), find_versions(), describe_platform())
-
-
-def digest_data(fit: Fit) -> tuple[FileDigest, ...]:
-    """Return the digest of times and values of each Measurements, as float64 of little-endian machines.
-
-    Parameters
-    ----------
-    fit : Fit
-    """
-    found, single = [], len(fit.comparisons) == 1
-    for run, comparisons in zip(fit.run_names, fit.comparisons, strict=True):
-        for comparison in comparisons:
-            if comparison.kind == "measurements":
-                columns = np.column_stack([comparison.times, comparison.measured]).astype("<f8")
-                label = ", ".join(comparison.names) if single else f"{run}: {', '.join(comparison.names)}"
-                raw = columns.tobytes()  # row by row
-                found.append(FileDigest(label, len(raw), hashlib.sha256(raw).hexdigest()))
-    return tuple(found)
+def describe_python_problem() -> Provenance:
+    """Return what is known of a problem that was built in Python: versions and platform."""
+    return Provenance("", "", "", "", {}, (), find_versions(), describe_platform())
 
 
 def find_versions() -> dict[str, str]:
@@ -1029,7 +929,7 @@ def describe_platform() -> str:
 
 
 FORMAT = "switchfit fit"
-VERSION = 9
+VERSION = 10
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:
@@ -1052,7 +952,8 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provena
     """
     content = write_fit(fit, certificate)
     if provenance is not None:
-        content["provenance"] = to_json(provenance.place_beside(Path(path)), Provenance)
+        folder = provenance.folder and make_relative(provenance.folder, path.resolve().parent)
+        content["provenance"] = to_json(replace(provenance, folder=folder), Provenance)
     write_document(content, Path(path))
 
 
@@ -1071,7 +972,6 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "seal": _compute_seal(sealed),
-        **_list_dates(fit),
         **sealed,
     }
 
@@ -1102,21 +1002,13 @@ def load_saved(path: Path) -> tuple[Fit, Certificate, Provenance | None]:
     try:
         fit, certificate = parse_fit(content)
         given = content.get("provenance")
-        provenance = None if given is None else from_json(Provenance, given, "provenance")
-        return fit, certificate, None if provenance is None else provenance.find_from(Path(path))
+        if given is None:
+            return fit, certificate, None
+        found = from_json(Provenance, given, "provenance")
+        folder = found.folder and os.path.normpath(path.resolve().parent / found.folder)
+        return fit, certificate, replace(found, folder=folder)
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
-
-
-def _list_dates(fit: Fit) -> dict[str, Any]:
-    """Return the transition times that are dates by their names, for readers of the file; {} where none is."""
-    dates = {}
-    for transition in fit.transitions:
-        origin = fit.trajectories[transition.experiment].origin
-        date = None if origin is None else origin.find_date(transition.time, transition.unit)
-        if date is not None:
-            dates[transition.name] = date.isoformat()
-    return {"transition_dates": dates} if dates else {}
 
 
 def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
@@ -1131,6 +1023,6 @@ def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
     ValueError
         If the content is not what `write_fit` returned.
     """
-    if content.get("seal") != _compute_seal(content):
+    if not isinstance(content, Mapping) or content.get("seal") != _compute_seal(content):
         raise ValueError("its content is not what was written")
     return from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")

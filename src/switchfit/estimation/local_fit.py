@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower, constraint_errors, cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
-from switchfit.fit.result import Termination, termination_of
+from switchfit.fit.result import Termination, count_priors, count_samples, measure_variance, termination_of
 from switchfit.fit.solution import explain_nonfinite, minimize_cost
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
@@ -178,14 +178,11 @@ def _compute_insignificance(problem: Problem, result: Result) -> float:
 
     J falls by s²/2 times the residual variance to its minimum from a distance of s standard errors.
     """
-    known, variance = problem.is_sigma_known, 1.0
-    if not known:
-        samples = sum(item.count for item in problem.measurements)
-        priors = int(np.count_nonzero(problem.unknowns.priors.precision))
-        freedom = samples + priors - result.free_basis.shape[1]
-        judged = known is not None and problem.is_least_squares and freedom > 0
-        variance = 2.0 * result.cost / freedom if judged else 0.0
-    return 0.5 * INSIGNIFICANT**2 * variance
+    known = problem.is_sigma_known
+    if not (known or problem.is_least_squares):
+        return 0.0
+    freedom = count_samples(problem) + count_priors(problem) - result.free_basis.shape[1]
+    return 0.5 * INSIGNIFICANT**2 * float(np.nan_to_num(measure_variance(result.cost, freedom, known)))
 
 
 def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
@@ -328,17 +325,20 @@ def _describe(problem: Problem) -> dict[str, Any]:
     """Return the fields of an Estimate that all fits of a problem share."""
     unknowns, parameters = problem.unknowns, problem.parameters
     counts = [len(run.transition_times) for run in problem.experiments]
+    times = list(zip(unknowns.times, counts, strict=True))
     return {
         "theta_names": unknowns.names,
         "theta_units": unknowns.units,
         "lower": unknowns.lower,
         "upper": unknowns.upper,
         "run_names": problem.run_names,
-        "transition_places": tuple(where[:count] for where, count in zip(unknowns.times, counts, strict=True)),
+        "transition_places": tuple(where[:count] for where, count in times),
+        "final_places": tuple(int(where[count]) if len(where) > count else -1 for where, count in times),
         "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
         "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),
         "sigma_known": problem.is_sigma_known,
         "priors": {name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
         "log_scaled": unknowns.log_names,
+        "log_origins": unknowns.origin,
         "least_squares": problem.is_least_squares,
     }

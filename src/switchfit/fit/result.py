@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,11 +143,9 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         smallest, direction = result.smallest_eigenvalue, result.curvature.spectrum.lowest
         largest = [i for i in np.argsort(-np.abs(direction), kind="stable") if abs(direction[i]) > SMALL_WEIGHT]
         flat = tuple((names[i], float(direction[i])) for i in largest[:NAMED])
+    same = {name: getattr(result, name) for name in ("status", "cost", "optimality", "tolerance", "violated")}
     return Termination(
-        status=result.status,
-        cost=result.cost,
-        optimality=result.optimality,
-        tolerance=result.tolerance,
+        **same,
         iterations=earlier + result.iterations,
         earlier_iterations=earlier,
         active=tuple(ActiveConstraint(**vars(each), multiplier=multipliers[each]) for each in result.active),
@@ -155,7 +153,6 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         idle=tuple(names[i] for i in result.idle),
         smallest_eigenvalue=smallest,
         flat_direction=flat,
-        violated=result.violated,
         reason=None if result.reason is None else _describe_failure(result, result.reason, problem),
         **find_unread(problem)._asdict(),
     )
@@ -179,8 +176,6 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
         figures["delayed"] = 1.0
     return Issue(found.kind, tuple(names[i] for i, _ in found.places), figures)
 
-
-CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]
 
 if TYPE_CHECKING:  # a float or an array: what does arithmetic with both needs no cast
     Values = Mapping[str, Any]
@@ -268,6 +263,8 @@ class Fit(Termination):
     transition_times : tuple of (N,) arrays, one per experiment, fixed ones included
     transition_places : tuple of (N,) int arrays, one per experiment
         Index in theta of each transition time; -1 if it is fixed.
+    final_places : tuple of int, one per experiment
+        Index in theta of its tf; -1 if it is fixed.
     parameters : dict of name -> float, or array where there are several, fixed ones included
     parameter_units : dict of name -> str, fixed ones included
     fixed : tuple of str
@@ -302,8 +299,6 @@ class Fit(Termination):
         Wall time of the estimation, always in seconds.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
-    saved_gauss_newton : (d, d) or None
-        The Gauss-Newton matrix of the samples, if it has been evaluated.
     saved_pieces : (T, 2, P, 5)
         Of transition times whose intervals follow from them, in a fit that was saved: as `Fits.pieces`.
     saved_piece_places : (T,) int
@@ -312,6 +307,8 @@ class Fit(Termination):
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
         Unknowns that were estimated on a logarithmic scale.
+    log_origins : (d,)
+        From where these logarithms count: t0 for a transition time, otherwise 0.
     least_squares : bool
         Whether the terms of measurements and priors in J are half a sum of squares: no sigma is a parameter, no loss is
         robust.
@@ -356,6 +353,7 @@ class Fit(Termination):
     run_names: tuple[str, ...]
     transition_times: tuple[FloatArray, ...]
     transition_places: tuple[NDArray[np.intp], ...]
+    final_places: tuple[int, ...]
     parameters: Values
     parameter_units: Mapping[str, str]
     fixed: tuple[str, ...]
@@ -370,8 +368,8 @@ class Fit(Termination):
     integration_error: float
     hessian_kind: str
     seconds: float
+    log_origins: FloatArray
     constraints: tuple[tuple[str, float, float], ...] = ()
-    saved_gauss_newton: FloatArray | None = None
     saved_pieces: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 1, 5)))
     saved_piece_places: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     priors: Mapping[str, str] = field(default_factory=dict)
@@ -417,30 +415,9 @@ class Fit(Termination):
         return tuple(float(trajectory.times[-1]) for trajectory in self.trajectories)
 
     @property
-    def final_places(self) -> tuple[int, ...]:
-        """Index in theta of the tf of each experiment; -1 if it is fixed."""
-        names = ["tf"] if len(self.run_names) == 1 else [f"{run}.tf" for run in self.run_names]
-        free = [name in self.theta_names and name not in self.parameters for name in names]  # a parameter may be "tf"
-        return tuple(self.theta_names.index(name) if own else -1 for name, own in zip(names, free, strict=True))
-
-    @property
-    def log_origins(self) -> FloatArray:
-        """From where the logarithms of `log_scaled` unknowns count, (d,): t0 for a transition time, otherwise 0."""
-        origins = np.zeros(len(self.theta_names))
-        if not self.is_time[np.isin(self.theta_names, self.log_scaled)].any():
-            return origins
-        for e, trajectory in enumerate(self.trajectories):
-            places = np.append(self.transition_places[e], self.final_places[e])
-            origins[places[places >= 0]] = trajectory.times[0]
-        return origins
-
-    @property
     def is_time(self) -> NDArray[np.bool_]:
         """Which of the unknowns are transition times or a free tf: (d,)."""
-        found = np.zeros(len(self.theta_names), dtype=bool)
-        for places in (*self.transition_places, np.array(self.final_places, dtype=np.intp)):
-            found[places[places >= 0]] = True
-        return found
+        return np.isin(np.arange(len(self.theta_names)), [*np.concatenate(self.transition_places), *self.final_places])
 
     @property
     def transitions(self) -> list[Transition]:
@@ -497,11 +474,6 @@ class Fit(Termination):
         """Degrees of freedom: number of measured values and priors minus number of free unknowns."""
         return self.samples + len(self.priors) - self.free_basis.shape[1]
 
-    @property
-    def gauss_newton(self) -> FloatArray | None:
-        """The Gauss-Newton matrix of the samples and priors: (d, d); None if it is unknown."""
-        return self.saved_gauss_newton
-
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariance of theta from the exact Hessian on the free directions: (d, d).
@@ -513,40 +485,7 @@ class Fit(Termination):
         `Measurements`) or there are too few samples, and for unknowns with a component in a direction along which
         the Hessian is not positive; the others keep their variances.
         """
-        return self.covariance_from("exact")
-
-    def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance of theta from one of its matrices: (d, d); for others see `Estimate.covariance_from`.
-
-        Parameters
-        ----------
-        hessian : {"exact", "gauss-newton"}
-
-        Raises
-        ------
-        ValueError
-            If the Gauss-Newton matrix is unknown.
-
-        See Also
-        --------
-        Estimate.covariance_from
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> bool((fit.covariance_from("exact") == fit.covariance).all())
-        True
-        """
-        matrix = self.hessian if hessian == "exact" else self.gauss_newton
-        if matrix is None:
-            raise ValueError(
-                "The Gauss-Newton matrix of this fit is not known: it needs a cost of Measurements alone, and the "
-                "problem. Use hessian='exact'."
-            )
-        return self.variance_scale * inverse_on(self.free_basis, matrix)
+        return self.variance_scale * inverse_on(self.free_basis, self.hessian)
 
     @property
     def standard_errors(self) -> FloatArray:
@@ -578,7 +517,7 @@ class Fit(Termination):
         """
         return float(measure_quantile(as_level(level), max(self.freedom, 1), self.sigma_known))
 
-    def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
+    def confidence_intervals(self, level: float = 0.95) -> FloatArray:
         """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
 
         For unknowns on a logarithmic scale, theta is multiplied and divided by exp(quantile x relative standard
@@ -589,8 +528,6 @@ class Fit(Termination):
         ----------
         level : float, between 0 and 1
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
-        hessian : {"exact", "gauss-newton", "sandwich"}
-            As in `covariance_from`. With "sandwich", the quantile is that of Student's t in any case.
 
         See Also
         --------
@@ -606,10 +543,24 @@ class Fit(Termination):
         array([[2.43, 2.5 ],
                [0.38, 0.4 ]])
         """
-        quantile = self.quantile(level)
-        if hessian == "sandwich":
-            quantile = float(special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
-        half = quantile * np.sqrt(np.diag(self.covariance_from(hessian)))
+        return self.build_intervals(self.quantile(level) * self.standard_errors)
+
+    def build_intervals(self, half: FloatArray) -> FloatArray:
+        """Return the intervals theta +- half (d,), cut off at the bounds, as of `confidence_intervals`: (d, 2).
+
+        See Also
+        --------
+        Estimate.confidence_intervals
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> bool((fit.build_intervals(0.0 * fit.theta + 1.0)[:, 1] == fit.theta + 1.0).all())
+        True
+        """
         log = np.isin(self.theta_names, self.log_scaled)
         low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
@@ -621,48 +572,24 @@ def measure_quantile(level: float, freedom: Any, sigma_known: bool | None) -> An
     return special.stdtrit(freedom, tail) if sigma_known is False else np.full(np.shape(freedom), special.ndtri(tail))
 
 
-class Disagreement(NamedTuple):
-    """Difference between the standard errors from the exact Hessian and from the Gauss-Newton matrix.
+def count_samples(problem: Problem) -> int:
+    """Return the measured values that are not missing."""
+    return sum(item.count for item in problem.measurements)
 
-    Attributes
-    ----------
-    factor : float
-        Largest ratio of the larger to the smaller one, over all linear combinations of the unknowns.
-    name : str
-        The unknown whose own standard errors differ the most.
-    exact, gauss_newton : float
-        Its standard errors.
+
+def count_priors(problem: Problem) -> int:
+    """Return the unknowns that have a prior."""
+    return int(np.count_nonzero(problem.unknowns.priors.precision))
+
+
+def measure_variance(cost: Any, freedom: Any, sigma_known: bool | None) -> Any:
+    """Return by what covariances are multiplied: 1 if sigma is known, the residual variance if not; NaN where neither
+    is: (R,), or one number.
     """
-
-    factor: float
-    name: str
-    exact: float
-    gauss_newton: float
-
-
-@one_thread()
-def disagreement(fit: Fit) -> Disagreement | None:
-    """Compare the two covariances of a fit; None if one of them is unknown.
-
-    The ratios of the two variances over all linear combinations of the unknowns lie between the smallest and the
-    largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix.
-    """
-    Z, A = fit.free_basis, fit.gauss_newton
-    if A is None or fit.sigma_known is None or Z.shape[1] == 0:
-        return None
-    both = fit.covariance, fit.covariance_from("gauss-newton")
-    if not all(np.isfinite(covariance).all() for covariance in both):
-        return None
-    errors = np.sqrt([np.diag(covariance) for covariance in both])
-    ratios = []
-    for one, other in ((fit.hessian, A), (A, fit.hessian)):  # of each the largest, which no rounding hides
-        values, vectors, size = compute_scaled_spectrum(one, Z)
-        root = size[:, None] * vectors / np.sqrt(values)  # root' one root = 1
-        ratios.append(float(np.linalg.eigvalsh(root.T @ other @ root)[-1]))
-    held = errors[0] <= 0
-    changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
-    k = int(np.argmax(changes))
-    return Disagreement(max(ratios) ** 0.5, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
+    if sigma_known:
+        return np.ones(np.shape(cost))
+    there = (freedom > 0) & (sigma_known is False)
+    return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
 
 
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,11 +14,11 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.dates import Origin, read_date_text
-from switchfit.problem.experiment import count_times, drop_jumps, show_time
+from switchfit.problem.dates import Origin
+from switchfit.problem.experiment import Experiment, count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_instance, set_fields, shorten
+from switchfit.problem.validation import as_array, as_index, as_instance, set_fields
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import format_line, join_first
 
@@ -176,7 +175,7 @@ def simulate(
     problem: Problem,
     theta: ArrayLike | None = None,
     *,
-    times: ArrayLike | Literal["samples"] | None = None,
+    times: ArrayLike | None = None,
     experiment: int = 0,
 ) -> Trajectory:
     """Integrate the model to the problem's tolerances.
@@ -186,11 +185,10 @@ def simulate(
     problem : Problem
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
-    times : (K,) array_like or "samples", optional
+    times : (K,) array_like, optional
         Times that increase, inside [t0, tf], at which states are returned, as numbers, or as dates where the times of
-        the experiment are dates; at a transition it is the state just before it. "samples": the times of all samples of
-        the experiment. All nodes of the mesh if left out, each transition twice. The steps that the tolerances need are
-        taken whatever these times are.
+        the experiment are dates; at a transition it is the state just before it. All nodes of the mesh if left out,
+        each transition twice. The steps that the tolerances need are taken whatever these times are.
     experiment : int, optional
         Index of the experiment, from 0.
 
@@ -202,7 +200,7 @@ def simulate(
     ------
     ValueError
         For a theta of the wrong shape or order, times outside [t0, tf] or that do not increase, an experiment that does
-        not exist or has no samples, or a trajectory that cannot be integrated.
+        not exist, or a trajectory that cannot be integrated.
     TypeError
         If an argument is of the wrong type.
 
@@ -239,23 +237,29 @@ def simulate(
     return replace(found, times=found.times[k], states=found.states[k], modes=found.modes[k], segments=segments)
 
 
-def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike | Literal["samples"]) -> FloatArray:
-    """Return the times at which a simulation is asked for, (K,)."""
-    experiment = problem.experiments[e]
-    t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
-    if isinstance(times, str) and read_date_text(times) is None:
-        if times != "samples":
-            raise ValueError(f"times must be numbers, dates or 'samples'; got {shorten(times)}.")
-        found = [item.times for item in experiment.measurements]
-        found += [item.samples[0] for item in experiment.data if isinstance(item, ReferenceSignal) and item.samples]
-        inside = np.unique(np.concatenate([np.zeros(0), *found]))
-        inside = inside[(t0 <= inside) & (inside <= tf)]
-        if not len(inside):
-            raise ValueError(f"times='samples' needs data with samples, and experiment {e} has none; give times.")
-        return inside
+def read_times(experiment: Experiment, times: ArrayLike) -> FloatArray:
+    """Return times that are asked for, numbers or dates, as numbers: (K,).
+
+    Parameters
+    ----------
+    experiment : Experiment
+    times : (K,) array_like
+
+    Raises
+    ------
+    ValueError
+        If they are not finite numbers of shape (K,), or none.
+    """
     asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
     if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
-        raise ValueError(f"times must be finite numbers of shape (K,), or 'samples'; got shape {asked.shape}.")
+        raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
+    return asked
+
+
+def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike) -> FloatArray:
+    """Return the times at which a simulation is asked for, (K,)."""
+    experiment, asked = problem.experiments[e], read_times(problem.experiments[e], times)
+    t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
     wrong = np.append(False, np.diff(asked) <= 0) | (asked < t0) | (asked > tf)
     if wrong.any():
         unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
@@ -282,16 +286,12 @@ def replace_values(problem: Problem, values: Mapping[tuple[int, int], FloatArray
     ----------
     problem : Problem
     values : mapping of (int, int) to (K, q) array
-        By the experiment, and the place among its data.
+        By the experiment, and the place of the `Measurements` among its data.
     """
     data = [list(run.data) for run in problem.experiments]
     for (e, k), own in values.items():
         item = data[e][k]
-        if isinstance(item, Measurements):
-            data[e][k] = replace(item, values=np.where(np.isnan(item.values), np.nan, own))
-        else:
-            times, measured = item.samples
-            data[e][k] = replace(item, signal=None, samples=(times, np.where(np.isnan(measured), np.nan, own)))
+        data[e][k] = replace(item, values=np.where(np.isnan(item.values), np.nan, own))
     runs = [replace(run, data=items) for run, items in zip(problem.experiments, data, strict=True)]
     return replace(problem, experiments=runs)
 

@@ -238,7 +238,7 @@ class Certifier:
 
 
 FORMAT = "switchfit modes"
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True, eq=False)

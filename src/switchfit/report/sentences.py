@@ -309,7 +309,6 @@ EXAMPLES = {
 """What to keep from where an operation is not defined, or has no derivative."""
 
 
-_NOT_NORMAL = "{} (kurtosis {:.1f}, {:.0f} beyond 4 sigma)"
 """Of a channel."""
 _DELAYED = (
     " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, and the "
@@ -328,11 +327,8 @@ _ISSUES: dict[str, Sentence] = {
     "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
     "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
     "above is where the fit left it, not an estimate.",
-    "no errors: not finite": "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "
     "Measurements alone, with sigma or without.",
-    "no errors: too few samples": "No standard errors: sigma is unknown and {samples:.0f} values are too few to "
-    "estimate it beside {unknowns:.0f} unknowns.",
     "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
     "sigma too small": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too small, or the "
@@ -343,14 +339,6 @@ _ISSUES: dict[str, Sentence] = {
     "correlated residuals": "Neighbouring residuals are correlated in {correlated}: the model misses something there, "
     "or the samples were smoothed before. The {values:.0f} values are worth about {effective:.0f} independent ones: "
     "the standard errors, which take them as independent, are too small by a factor of up to {narrowing:.2g}.",
-    "residuals not normal": "The residuals are not normal in {non-normal}. Look for outliers; intervals from a "
-    "bootstrap do not take them as normal.",
-    "known to second order": "To first order the fitted values hardly depend on {names}: its standard errors from the "
-    "exact Hessian and from the Gauss-Newton matrix are {exact:.2g} and {Gauss-Newton:.2g}. What is known of it is "
-    "known to second order: trust its profile likelihood more than either.",
-    "covariances differ": "Standard errors from the exact Hessian and from the Gauss-Newton matrix differ by up to a "
-    "factor {factor:.3g} (of {names}: {exact:.2g} and {Gauss-Newton:.2g}): within its noise the model is not linear in "
-    "its unknowns. Trust profile likelihoods more than either.",
     "large integration error": "The integration error of {names} is {error:.1e}, relative: the numbers have fewer "
     "digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is stiff.",
     # Failures of a certificate
@@ -688,7 +676,6 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "names": _join,
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
     "correlated": lambda issue: list_each(issue, "{} ({:.2f})", "correlation"),
-    "non-normal": lambda issue: list_each(issue, _NOT_NORMAL, "kurtosis", "outliers"),
     "jump": _write_jump,
     "places": lambda issue: list_each(issue, "{} = {:.8g}", "at"),
     "kind": lambda issue: issue.kind,

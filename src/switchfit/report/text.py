@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.result import Fit, Step, disagreement
+from switchfit.fit.result import Fit, Step
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.report import formats
@@ -28,7 +28,7 @@ from switchfit.report.uncertainty import write_direction
 from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.certificate import WEAK
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel, list_channels
-from switchfit.uncertainty.verdict import DIFFERENT, find_issues
+from switchfit.uncertainty.verdict import find_issues
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which the report calls it asymmetric."""
@@ -291,8 +291,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
     has_sandwich = isinstance(fit, Estimate) and fit.has_sandwich
     other = ": covariance_from('sandwich') does not." if has_sandwich else "."
-    exact = f"the exact Hessian{_compare_covariances(fit)}"
-    matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else exact
+    matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else "the exact Hessian"
     return table, f"Standard errors from {matrix}.{ROBUST + other if robust else ''}"
 
 
@@ -325,14 +324,6 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
     """
     marked = [i for i, name in enumerate(fit.theta_names) if _mark_unknown(fit, name)]
     return formats.select_unknowns(fit.is_time.tolist(), most, marked)
-
-
-def _compare_covariances(fit: Fit) -> str:
-    """Return how the standard errors from the Gauss-Newton matrix compare; "" if that is unknown or a warning."""
-    found = disagreement(fit)
-    if found is None:
-        return ""
-    return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
 
 
 def _mark_unknown(fit: Fit, name: str) -> str:
@@ -396,11 +387,10 @@ _COVERED = {
     "idle": {"idle times", "idle parameters"},
     "at bounds": {"lower bound", "upper bound"},
     "not determined": {"no errors: not positive definite"},
-    "not converged": {"no errors: not positive definite", "no errors: not finite"},
-    "too few samples": {"no errors: too few samples"},
+    "not converged": {"no errors: not positive definite"},
     "unexplained": {"sigma too small", "correlated residuals"},
     "model suspected": {"sigma too small", "correlated residuals"},
-    "outliers suspected": {"sigma too small", "residuals not normal"},
+    "outliers suspected": {"sigma too small"},
     "sigma suspected": {"sigma too small"},
     "integration error": {"large integration error"},
 }

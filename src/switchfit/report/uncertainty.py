@@ -222,13 +222,13 @@ def tabulate_diagnostics(diagnostics: ResidualDiagnostics) -> Table:
     ----------
     diagnostics : ResidualDiagnostics
     """
-    rows, titles = [], ["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]
+    rows, titles = [], ["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "beyond 4"]
     for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
         size = [f"{len(channel.values)}", f"{channel.rms:.3g}", f"{channel.mean:+.2f}"]
         correlation = [f"{channel.correlation:+.2f}", f"{channel.effective:.0f}"]
-        tests = [format_probability(channel.whiteness), format_probability(channel.normality)]
-        rows.append([label, *size, *correlation, *tests, f"{channel.outliers}"])
-    return Table(rows, "<" + ">" * 8, titles)
+        tests = [format_probability(channel.whiteness), f"{channel.outliers}"]
+        rows.append([label, *size, *correlation, *tests])
+    return Table(rows, "<" + ">" * 7, titles)
 
 
 def format_probability(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Write files atomically, say why one cannot be read, and set damaged files aside.
+"""Write files atomically, and say why one cannot be read.
 
 Dataclasses as JSON that can be read without switchfit, and loaded without losing a bit.
 
@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 import os
 import secrets
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
@@ -94,26 +93,6 @@ def explain_read_errors(path: Path, what: str = "file", inside: str = "a file") 
         raise InputError(f"{path} is a folder; name {inside} in it.") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-
-
-def set_aside(path: Path, reason: str, remedy: str) -> None:
-    """Rename a damaged file to ``NAME.damaged`` (``.damaged-2``, ... if there is one), and warn.
-
-    Parameters
-    ----------
-    path : Path
-    reason : str
-        The damage, as the end of a sentence.
-    remedy : str
-        What happens next, as a sentence.
-    """
-    number, target = 1, path.with_name(f"{path.name}.damaged")
-    while target.exists():
-        number += 1
-        target = path.with_name(f"{path.name}.damaged-{number}")
-    with suppress(FileNotFoundError):  # another process has renamed it already
-        path.rename(target)
-    warnings.warn(f"{path} is damaged: {reason}. It is now {target.name}. {remedy}", stacklevel=2)
 
 
 NUMBERS = ("NaN", "Infinity", "-Infinity")

@@ -17,7 +17,7 @@ DELAY = 1.0
 """Seconds after which the line of progress is shown; shorter calls show none."""
 
 REDRAW = 0.2
-"""Seconds between two drawings in a notebook."""
+"""Seconds between two drawings."""
 
 Progress = Callable[[int, int], object]
 """``progress(done, total)``; a true return value stops the run."""
@@ -41,16 +41,15 @@ class Line:
     """One line about what a long call is doing, with the seconds since it began, and how much is done where that is
     known; removed at the end of the call.
 
-    Threads of its own draw it, so that it is updated while machine code runs or a program is compiled. In a notebook it
-    stands below the cell, with a bar.
+    A thread of its own draws it, so that it is updated while machine code runs or a program is compiled. In a notebook
+    it stands below the cell, with a bar.
     """
 
     def __init__(self, text: str) -> None:
         self.text, self.detail, self.lowest = text, "", math.inf
         self.done = self.total = 0
-        self._began = time.monotonic()
-        self._live: Any = None
-        self._timer: threading.Timer | None = None
+        self._began, self._ended = time.monotonic(), threading.Event()
+        self._thread: threading.Thread | None = None
 
     def write(self, text: str, lowest: float = math.inf) -> None:
         """Replace the text, and the lowest J so far; infinity shows none."""
@@ -59,51 +58,29 @@ class Line:
     @property
     def is_started(self) -> bool:
         """Whether the line is shown if the call takes longer than `DELAY`."""
-        return self._timer is not None
+        return self._thread is not None
 
     def start(self) -> None:
         """Show the line after `DELAY` seconds."""
-        self._ended = threading.Event()
-        show = self._show_below if is_notebook() else self._show
         # ipykernel finds the cell of an output by a context variable.
-        self._timer = threading.Timer(DELAY, copy_context().run, args=(show,))
-        self._timer.daemon = True
-        self._timer.start()
+        self._thread = threading.Thread(target=copy_context().run, args=(self._draw,), daemon=True)
+        self._thread.start()
 
     def end(self) -> None:
         """Remove the line."""
-        if self._timer is None:
-            return
-        self._timer.cancel()
         self._ended.set()
-        self._timer.join()
-        if self._live is not None:
-            self._live.stop()
+        if self._thread is not None:
+            self._thread.join()
 
-    def _show(self) -> None:
-        from rich.console import Console
-        from rich.live import Live
+    def _draw(self) -> None:
+        """Draw the line until the call ends."""
+        if self._ended.wait(DELAY):
+            return
+        with _show_below(self) if is_notebook() else _show_on_terminal(self) as redraw:
+            while not self._ended.wait(REDRAW):
+                redraw()
 
-        console, redirect = Console(stderr=True), is_terminal(sys.stdout)
-        settings: dict[str, Any] = {"redirect_stdout": redirect, "redirect_stderr": redirect}
-        self._live = Live(self, console=console, transient=True, refresh_per_second=5, **settings)
-        self._live.start()
-
-    def _show_below(self) -> None:
-        """Draw the line below the cell until the call ends."""
-        shown = importlib.import_module("IPython.display")  # is there in a notebook alone
-        output = None
-        while not self._ended.wait(REDRAW):
-            bar = f' value="{self.done}" max="{self.total}"' if self.total else ""
-            html = shown.HTML(f"<progress{bar}></progress> {escape(self._describe())}")
-            if output is None:
-                output = shown.display(html, display_id=True)
-            else:
-                output.update(html)
-        if output is not None:
-            output.update(shown.HTML(""))
-
-    def _describe(self) -> str:
+    def describe(self) -> str:
         """Return what is shown."""
         seconds = time.monotonic() - self._began
         parts = [self.text, f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else "", self.detail]
@@ -116,7 +93,32 @@ class Line:
     def __rich__(self) -> Any:
         from rich.text import Text
 
-        return Text(self._describe(), no_wrap=True, overflow="ellipsis")
+        return Text(self.describe(), no_wrap=True, overflow="ellipsis")
+
+
+@contextmanager
+def _show_on_terminal(line: Line) -> Iterator[Callable[[], object]]:
+    from rich.console import Console
+    from rich.live import Live
+
+    console, redirect = Console(stderr=True), is_terminal(sys.stdout)
+    settings: dict[str, Any] = {"redirect_stdout": redirect, "redirect_stderr": redirect, "auto_refresh": False}
+    with Live(line, console=console, transient=True, **settings) as live:
+        yield live.refresh
+
+
+@contextmanager
+def _show_below(line: Line) -> Iterator[Callable[[], object]]:
+    """Show a line below the cell of a notebook."""
+    shown = importlib.import_module("IPython.display")  # is there in a notebook alone
+
+    def describe() -> Any:
+        bar = f' value="{line.done}" max="{line.total}"' if line.total else ""
+        return shown.HTML(f"<progress{bar}></progress> {escape(line.describe())}")
+
+    output = shown.display(describe(), display_id=True)
+    yield lambda: output.update(describe())
+    output.update(shown.HTML(""))
 
 
 _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)

@@ -126,6 +126,10 @@ class DerivativeCheck(Printed):
         return tuple(found)
 
 
+UNCHECKED = DerivativeCheck(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), stiff=False)
+"""Of derivatives that were not checked: gaps and orders are NaN, and nothing failed."""
+
+
 def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, paper: bool = True) -> DerivativeCheck:
     """Check the gradient and the Hessian of a problem against its cost, and two methods against each other.
 
@@ -507,11 +511,10 @@ def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Cost:
     """Return J as a function of theta, NaN where bounds or the order of times are violated; not so at the centre, which
     may be on a constraint up to rounding.
     """
-    u = evaluator.problem.unknowns
 
     def compute_cost(theta: FloatArray) -> float:
-        is_allowed = np.all(theta >= u.lower) and np.all(theta <= u.upper) and np.all(u.A @ theta >= u.b)
-        return evaluator(theta).cost if is_allowed or theta is centre else np.nan
+        is_allowed = theta is centre or bool(np.all(evaluator.problem.constraints.slack(theta) >= 0))
+        return evaluator(theta).cost if is_allowed else np.nan
 
     return compute_cost
 
@@ -682,7 +685,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
     """
     found, Z = analyse_solution(fit, None), fit.free_basis
     scaled, is_known = found.eigenvalues, Z.shape[1] > 0 and np.isfinite(fit.hessian).all()
-    check = None if evaluator is None else compare_derivatives(evaluator, fit.theta, paper=True)
+    check = UNCHECKED if evaluator is None else compare_derivatives(evaluator, fit.theta, paper=True)
     smallest = float(scaled[0]) if len(scaled) else np.nan
     return Certificate(
         optimality=fit.optimality,
@@ -692,16 +695,16 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
         worst_unknowns=found.directions[0].names if found.directions else (),
         integration_error=fit.integration_error,
         integration_error_of=fit.integration_error_of,
-        gradient_gap=np.nan if check is None else check.gradient_gap,
-        hessian_gap=np.nan if check is None else check.hessian_gap,
-        taylor_orders=(np.nan,) * 3 if check is None else check.observed_orders,
+        gradient_gap=check.gradient_gap,
+        hessian_gap=check.hessian_gap,
+        taylor_orders=check.observed_orders,
         active=fit.active,
         kinks=fit.kinks,
         failures=tuple(_find_failures(fit, smallest, check)),
     )
 
 
-def _find_failures(fit: Fit, smallest: float, check: DerivativeCheck | None) -> Iterator[Issue]:
+def _find_failures(fit: Fit, smallest: float, check: DerivativeCheck) -> Iterator[Issue]:
     """Return the checks that failed."""
     if fit.status is not Status.CONVERGED_PRECISION and not fit.optimality <= fit.tolerance:
         yield Issue("optimality", figures={"optimality": fit.optimality, "tolerance": fit.tolerance})
@@ -709,8 +712,6 @@ def _find_failures(fit: Fit, smallest: float, check: DerivativeCheck | None) -> 
         yield Issue("negative curvature", figures={"eigenvalue": smallest})
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield Issue("integration error", (fit.integration_error_of,), {"error": fit.integration_error})
-    if check is None:
-        return
     yield from (issue for issue in check.failures if issue.kind == "derivative gap")
     # The first order is not tested: at a minimum, the gradient vanishes.
     if not are_orders_right((np.nan, *check.observed_orders[1:])):

@@ -8,7 +8,7 @@ would be too narrow by the same factor. sigma is not changed.
 
 At a transition X jumps (see `switchfit.uncertainty.prediction`): just before it the state does not depend on that
 transition time, just after it does. The linear approximation assumes that the active mode is that of the fit, which may
-be wrong within two standard errors of a transition time: `near_transition` marks these times.
+be wrong within two standard errors of a transition time.
 
 After tf the last mode goes on: the problem is simulated with a later tf. Bands there contain the uncertainty of the
 unknowns and the noise of a sample. They do not contain that of the model: no mode may follow, and the model has no
@@ -41,13 +41,13 @@ from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import select_visible
+from switchfit.fit.trajectory import read_times, select_visible
 from switchfit.problem.data import FloatArray, influence
 from switchfit.problem.dates import Origin
-from switchfit.problem.experiment import count_times, show_time
+from switchfit.problem.experiment import show_time
 from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_instance, as_level
+from switchfit.problem.validation import as_index, as_instance, as_level
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Drawn, draw_figure, format_html, format_line, join_first
 
@@ -191,36 +191,6 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
-def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDerivatives) -> FloatArray:
-    """Return the Gauss-Newton matrix of the samples and the priors at theta: (d, d).
-
-    A sample contributes ``rho' w (D h)' D h``, and ``2 (D log sigma)' D log sigma`` if its sigma is a parameter: the
-    Fisher information of normal noise, which has nothing between sigma and the rest.
-
-    Parameters
-    ----------
-    problem : Problem
-        No delay of it is a parameter.
-    theta : (d,)
-    samples : SampleDerivatives
-        At theta.
-    """
-    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
-    for run in problem.experiments:
-        for item in run.measurements:
-            for values, name in zip(item.values.T, item.sigma_names, strict=False):
-                span = None if name is None else problem.unknowns.parameters.get(run.parameter_map.get(name, name))
-                if span is not None:  # it is not fixed
-                    # In log sigma each sample has the information 2, in sigma 2 / sigma^2.
-                    information[span, span] += 2.0 * np.count_nonzero(~np.isnan(values)) / theta[span] ** 2
-    weight = samples.influence * samples.weight
-    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
-
-
-NEAR = 2.0
-"""Distance from a transition time, in its standard errors, within which a band is unreliable."""
-
-
 @dataclass(frozen=True, eq=False)
 class Prediction(Tabular):
     """States and outputs of one experiment with their standard errors.
@@ -238,8 +208,6 @@ class Prediction(Tabular):
     state_names, state_units, output_names : tuple of str
     time_unit : str
         Unit of the experiment's times.
-    near_transition : (K,) bool
-        Whether a time is within two standard errors of a transition time, where the bands ignore the other mode.
     fit : Fit or Validation
         With the covariance and the quantiles.
     experiment : int
@@ -277,7 +245,6 @@ class Prediction(Tabular):
     state_units: tuple[str, ...]
     output_names: tuple[str, ...]
     time_unit: str
-    near_transition: NDArray[np.bool_]
     fit: Any = field(repr=False)
     experiment: int = 0
     origin: Origin | None = None
@@ -429,8 +396,6 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     >>> prediction.outputs.round(1)
     array([[8.3],
            [8.6]])
-    >>> prediction.near_transition
-    array([False, False])
 
     The log ends at 6 h; after it the heater stays off:
 
@@ -480,7 +445,6 @@ def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Pred
         trajectory.state_units,
         tuple(names),
         trajectory.time_unit,
-        _is_near_transition(fit, problem, e, points.times),
         fit,
         e,
         trajectory.origin,
@@ -501,19 +465,13 @@ def _require_covariance(fit: Any) -> FloatArray:
 def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, times: FloatArray) -> Points:
     """Return states and outputs at times (K,), some of them after tf, with their derivatives in theta."""
     experiment = problem.experiments[e]
-    tf, last = experiment.end, float(times.max())
+    last = float(times.max())
     if isinstance(experiment.tf, Parameter):
         raise ValueError(
             f"times must not lie after tf where tf is estimated: the system stops there; got {last:.6g}"
             f"{unit_suffix(experiment.time_unit)}."
         )
-    try:
-        longer = replace(experiment, tf=last)
-    except ValueError as error:
-        raise ValueError(
-            f"the model cannot be continued from tf = {tf:.6g} to {last:.6g}{unit_suffix(experiment.time_unit)}: "
-            f"{error} Give the experiment an Input that reaches further, and fit again."
-        ) from error
+    longer = replace(experiment, tf=last)
     runs = [longer if k == e else run for k, run in enumerate(problem.experiments)]
     extended = replace(problem, experiments=runs)
     return compute_sensitivity(extended, e, theta, refine_mesh(extended, e, theta).insert(times)).at(times)
@@ -537,18 +495,9 @@ def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatAr
     return np.concatenate(columns, axis=1)
 
 
-def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
-    where = problem.unknowns.times[e]
-    free = where[where >= 0]
-    reach = NEAR * np.sqrt(np.diag(fit.corrected_covariance)[free])
-    return np.asarray((np.abs(times[:, None] - fit.theta[free][None]) <= reach[None]).any(1))
-
-
 def _check_times(times: ArrayLike, problem: Problem, e: int) -> FloatArray:
     experiment = problem.experiments[e]
-    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
-    if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
-        raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
+    asked = read_times(experiment, times)
     if asked.min() < experiment.t0:
         unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
         start, first = show_time(experiment, experiment.t0), show_time(experiment, asked.min())

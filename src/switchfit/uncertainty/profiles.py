@@ -33,7 +33,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,8 @@ from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+from switchfit.problem.unknowns import get_min_duration
 from switchfit.problem.validation import as_callable, as_flag, as_instance, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
@@ -77,6 +79,55 @@ HALVINGS = 8
 """Largest number of times that a step is reduced because a fit fails or zeta rises too much."""
 ITERATIONS = 100
 """Largest number of iterations of one fit along the profile."""
+
+
+class Limits(NamedTuple):
+    """What limits each unknown.
+
+    Attributes
+    ----------
+    before : (d,) int
+        Of a transition time, or a free tf, the index in theta of the time before it; -1 if that is fixed, or t0, and
+        for all other unknowns.
+    gap : (d,)
+        Shortest time between the two.
+    low : (d,)
+        Lower bound, so that all times before it find room.
+    high : (d,)
+        Upper bound, so that all times after it find room.
+    """
+
+    before: NDArray[np.intp]
+    gap: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+def limit_unknowns(problem: Problem) -> Limits:
+    """Return the limits of all unknowns.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    unknowns, d = problem.unknowns, len(problem.theta_names)
+    found = Limits(np.full(d, -1), np.zeros(d), unknowns.lower.copy(), unknowns.upper.copy())
+    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
+        times, places = experiment.initial_times, where.tolist()
+        gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
+        latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
+        for i in reversed(range(len(places))):
+            latest = min(latest, times[i] if places[i] < 0 else found.high[places[i]])
+            if places[i] >= 0:
+                found.high[places[i]] = latest
+            latest -= gaps[i]
+        before, earliest = -1, experiment.t0
+        for i, place in enumerate(places):
+            earliest = max(earliest + gaps[i], times[i] if place < 0 else found.low[place])
+            if place >= 0:
+                found.before[place], found.gap[place], found.low[place] = before, gaps[i], earliest
+            before = place
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +201,9 @@ class Profile(Tabular, Displayed):
         self._starts = {side: self._describe(fit.theta, self._follower(fit.theta, side), True) for side in (-1, 1)}
         self._centre = self._starts[1]
         self.points, self.fits = [self._centre], 0
-        self.limits = {side: self._find_limit(side) for side in (-1, 1)}
+        limits = limit_unknowns(evaluator.problem)
+        # The estimate is feasible: rounding must not put a limit on the wrong side of it.
+        self.limits = {-1: float(min(limits.low[k], self.value)), 1: float(max(limits.high[k], self.value))}
         self.jumps: list[float] = []
         self._ends: dict[int, End] = {-1: "stopped", 1: "stopped"}
         self._interrupted = False
@@ -311,21 +364,6 @@ class Profile(Tabular, Displayed):
         return [self._starts[side], *beyond[::side]]
 
     # --- adding points
-
-    def _find_limit(self, side: int) -> float:
-        """Return the limit that the constraints set to the unknown on one side."""
-        k, c = self._index, self._constraints
-        coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
-        if k not in coupled:
-            return float((c.lower if side < 0 else c.upper)[k])
-        from scipy.optimize import linprog  # here, since importing it takes longer than most fits
-
-        # Rows join the unknown with others, such as the order of times: its limit is a linear programme in these.
-        objective = np.where(coupled == k, -float(side), 0.0)
-        bounds = np.stack([c.lower, c.upper], axis=1)[coupled]
-        found = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds)
-        # The centre is feasible; rounding of the linear program must not put a limit on the wrong side of it.
-        return side * max(side * float(found.x[coupled == k][0]), side * float(self.fit.theta[k]))
 
     def _describe(self, theta: FloatArray, found: Any, converged: bool) -> Point:
         """Return the point at theta, where the other unknowns are optimal: its slope is the derivative of the cost."""

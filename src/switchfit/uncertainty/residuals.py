@@ -1,4 +1,4 @@
-"""Test whether residuals are like the assumed noise: white, normal, and of the size of sigma.
+"""Test whether residuals are like the assumed noise: white, and of the size of sigma.
 
 Each channel is tested by itself, in the order of its samples that are not missing. At irregular sample times, a lag
 counts samples. Standardized residuals are z = (measured - fitted) / sigma; if sigma is unknown, they are divided by
@@ -6,7 +6,6 @@ their own root mean square.
 
 - whiteness: Ljung and Box's Q = n (n + 2) sum_k r_k^2 / (n - k) over the first h lags, chi-square with h degrees of
   freedom, h = min(10, n / 5) ([1]_, [2]_);
-- normality: Jarque and Bera's n / 6 (S^2 + (K - 3)^2 / 4), chi-square with 2 degrees of freedom ([3]_);
 - effective sample size: n (1 - r) / (1 + r), at most n: the number of independent samples that are worth n samples
   with first-order autoregressive noise, whose correlation r is r_1 without its bias (`correct_correlation`).
 
@@ -25,9 +24,7 @@ References
 ----------
 .. [1] G. M. Ljung, G. E. P. Box, On a measure of lack of fit in time series models, Biometrika 65 (1978) 297-303.
 .. [2] R. J. Hyndman, G. Athanasopoulos, Forecasting: Principles and Practice, 3rd ed., section 5.4 (number of lags).
-.. [3] C. M. Jarque, A. K. Bera, A test for normality of observations and regression residuals, Int. Stat. Rev. 55
-   (1987) 163-172.
-.. [4] M. G. Kendall, Note on bias in the estimation of autocorrelation, Biometrika 41 (1954) 403-404.
+.. [3] M. G. Kendall, Note on bias in the estimation of autocorrelation, Biometrika 41 (1954) 403-404.
 """
 
 from __future__ import annotations
@@ -87,11 +84,8 @@ class ChannelResiduals:
         Root mean square of the standardized residuals: near 1 if sigma is right, 1 if it is unknown.
     autocorrelation : (h,)
         At lags 1, 2, ..., h.
-    whiteness, normality : float
-        Probabilities of Ljung and Box's and of Jarque and Bera's statistic, or a larger one, if the residuals are
-        white and normal; NaN for fewer than 20.
-    kurtosis : float
-        3 for a normal distribution.
+    whiteness : float
+        Probability of Ljung and Box's statistic, or a larger one, if the residuals are white; NaN for fewer than 20.
     effective : float
         Effective sample size.
     outliers : int
@@ -125,8 +119,6 @@ class ChannelResiduals:
     rms: float
     autocorrelation: FloatArray
     whiteness: float
-    normality: float
-    kurtosis: float
     effective: float
     outliers: int
     experiment: int = 0
@@ -145,11 +137,6 @@ class ChannelResiduals:
     def white(self) -> bool:
         """Whether the test of whiteness is passed (or there are too few residuals to test)."""
         return not self.whiteness < UNLIKELY
-
-    @property
-    def normal(self) -> bool:
-        """Whether the test of normality is passed (or there are too few residuals to test)."""
-        return not self.normality < UNLIKELY
 
     @property
     def narrowing(self) -> float:
@@ -202,8 +189,8 @@ class ResidualDiagnostics(Printed):
 
     @property
     def passed(self) -> bool:
-        """Whether all residuals look white and normal."""
-        return all(channel.white and channel.normal for channel in self.channels)
+        """Whether all residuals look white."""
+        return all(channel.white for channel in self.channels)
 
     @property
     def correlated(self) -> tuple[bool, ...]:
@@ -216,31 +203,22 @@ class ResidualDiagnostics(Printed):
 
     @property
     def issues(self) -> list[Issue]:
-        """Failed tests: channels whose residuals are correlated, and channels whose residuals are not normal."""
-        found = []
-        named = list(zip(self.labels, self.channels, strict=True))
-        alike = [each for each, correlated in zip(named, self.correlated, strict=True) if correlated]
-        if alike:
-            figures: dict[str, float | tuple[float, ...]] = {
-                "correlation": tuple(c.correlation for _, c in alike),
-                "values": float(sum(len(c.values) for _, c in alike)),
-                "effective": float(sum(c.effective for _, c in alike)),
-                "narrowing": max(c.widening for _, c in alike),
-            }
-            found.append(Issue("correlated residuals", tuple(label for label, _ in alike), figures))
-        shared = UNLIKELY / max(len(named), 1)
-        heavy = [(label, c) for label, c in named if c.normality < shared and c.white]
-        if heavy:
-            figures = {
-                "kurtosis": tuple(c.kurtosis for _, c in heavy),
-                "outliers": tuple(float(c.outliers) for _, c in heavy),
-            }
-            found.append(Issue("residuals not normal", tuple(label for label, _ in heavy), figures))
-        return found
+        """Failed tests: channels whose residuals are correlated."""
+        named = zip(self.labels, self.channels, self.correlated, strict=True)
+        alike = [(label, channel) for label, channel, correlated in named if correlated]
+        if not alike:
+            return []
+        figures: dict[str, float | tuple[float, ...]] = {
+            "correlation": tuple(c.correlation for _, c in alike),
+            "values": float(sum(len(c.values) for _, c in alike)),
+            "effective": float(sum(c.effective for _, c in alike)),
+            "narrowing": max(c.widening for _, c in alike),
+        }
+        return [Issue("correlated residuals", tuple(label for label, _ in alike), figures)]
 
 
 def find_residual_issues(fit: Fit) -> Iterator[Issue]:
-    """Find residuals of a fit that are not white, normal noise of the size of sigma.
+    """Find residuals of a fit that are not white noise of the size of sigma.
 
     Parameters
     ----------
@@ -402,14 +380,10 @@ def diagnose_channel(comparison: Comparison, k: int, *, unknowns: float = 0.0) -
     r = compute_autocorrelation(z, lags)
     spread = z - z.mean()
     variance = float(np.mean(spread**2))
-    kurtosis = float(np.mean(spread**4)) / variance**2 if variance > 0 else 3.0
-    whiteness = normality = np.nan
-    if n >= FEWEST and variance > 0:
-        # Ljung and Box, then Jarque and Bera.
+    whiteness = np.nan
+    if n >= FEWEST and variance > 0:  # Ljung and Box
         Q = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
         whiteness = float(special.chdtrc(lags, Q))
-        skewness = float(np.mean(spread**3)) / variance**1.5
-        normality = float(special.chdtrc(2, n / 6 * (skewness**2 + (kurtosis - 3) ** 2 / 4)))
     # The lags are those of residuals, whose correlation the fit has lowered; the samples are worth n (1 - r) / (1 + r).
     first = correct_correlation(float(r[0]), n, unknowns * n) if lags else 0.0
     return ChannelResiduals(
@@ -421,8 +395,6 @@ def diagnose_channel(comparison: Comparison, k: int, *, unknowns: float = 0.0) -
         rms=float(np.sqrt(np.mean(z**2))),
         autocorrelation=r,
         whiteness=whiteness,
-        normality=normality,
-        kurtosis=kurtosis,
         effective=min(n, n * (1 - first) / (1 + first)),
         outliers=int(np.sum(np.abs(spread) > 4 * np.sqrt(variance))) if variance > 0 else 0,
     )
@@ -439,7 +411,7 @@ def correct_correlation(first: float, n: int, unknowns: float) -> float:
     for d unknowns. Derivation: sum z_k z_(k-1) has the expectation (n - 1) r - d (1 + r) / (1 - r) in units of the
     variance, sum z_k^2 has n - d (1 + r) / (1 - r), since a slow direction takes the spectrum at frequency 0 out of
     both; the covariance of the two sums adds -2 r / n. With d = 1, and without the -r / n of the n - 1 products, it is
-    the ``-(1 + 3 r) / n`` of [4]_ (of the module).
+    the ``-(1 + 3 r) / n`` of [3]_ (of the module).
 
     The result is used to first order in 1 / n, up to that with which the samples are worth d + 1.
 
@@ -604,13 +576,8 @@ def measure_quality(fit: Fit) -> Quality:
         chi_square = 2 * fit.cost
         above, is_size = compare_with_sigma(chi_square, fit.freedom)
         known, found = bool(is_size), [*found, float(above)]
-    return Quality(
-        channels=tuple(channels),
-        explained=explain_all(fit.comparisons),
-        chi_square=chi_square,
-        probability=min(found, default=np.nan),
-        known=known,
-    )
+    explained, probability = explain_all(fit.comparisons), min(found, default=np.nan)
+    return Quality(tuple(channels), explained, chi_square, probability, known)
 
 
 def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals, is_given: bool) -> dict[str, float]:

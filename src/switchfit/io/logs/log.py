@@ -15,7 +15,7 @@ from switchfit.io.logs import refuse_without_times
 from switchfit.problem.dates import SECONDS, TIME_UNITS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError, Issue
-from switchfit.runtime.frames import Frame, Variable, build_pandas
+from switchfit.runtime.frames import Column, Frame, build_pandas
 from switchfit.runtime.presentation import format_line, join_first
 
 EPOCH_SECONDS = (9.4e8, 2.6e9)
@@ -298,10 +298,9 @@ class Log:
         ([1.5, 1.6], 't (s)', {'x': 'm'})
         >>> Path("drive.csv").unlink()
         """
-        rows = ("sample",)
-        index = Variable(f"{self.time_name} ({self.time_unit})" if self.time_unit else self.time_name, self.times, rows)
-        variables = [Variable(name, values, rows, self.units.get(name, "")) for name, values in self.values.items()]
-        return build_pandas(Frame("sample", (index,), tuple(variables)))
+        index = Column(f"{self.time_name} ({self.time_unit})" if self.time_unit else self.time_name, self.times)
+        columns = [Column(name, values, self.units.get(name, "")) for name, values in self.values.items()]
+        return build_pandas(Frame((index,), tuple(columns)))
 
     def __str__(self) -> str:
         """Return source, span, channels, origin and issues as text."""

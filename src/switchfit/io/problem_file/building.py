@@ -113,7 +113,6 @@ def build_problem(
         log="" if log is None else make_relative(log, folder),
         options=options,
         files=tuple(digest_file(folder, file) for file in _list_files(folder, contents)),
-        data=(),
         versions=find_versions(),
         platform=describe_platform(),
     )

@@ -51,7 +51,7 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
         raise MissingExtraError(
             f"an HTML report needs {error.name}, not installed here: pip install 'switchfit[report]'"
         ) from error
-    return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem(estimate))
+    return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem())
 
 
 @format_html.register(Prediction)
