@@ -227,10 +227,10 @@ class Fitter:
         self.fits = self.evaluations = 0
         self._evaluators: dict[Any, Evaluator] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
-        self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
-        self._sequences: dict[tuple[int, tuple[str, ...]], tuple[Structure, dict[str, NDArray[np.int64]]]] = {}
         self._trace = cache(lambda e, pair: trace_transition(self.problem, self.problem.experiments[e], pair))
+        self._build_structure = cache(self._place_functions)
+        self.find_acting = cache(self._find_acting)
         counts = [len(run.times) + len(run.jump_times) for run in self.problem.experiments]
         self._places = [places[N:] - self.first for places, N in zip(self.problem.places, counts, strict=True)]
 
@@ -351,12 +351,9 @@ class Fitter:
         if native is not None:
             # Those of one sequence together: to assign one takes half as long as J.
             for i, schedule in sorted(enumerate(schedules), key=lambda each: each[1].sequence):
-                key = e, schedule.sequence
-                if key not in self._sequences:
-                    structure = self._build_structure(*key)
-                    self._sequences[key] = structure, places_in_library(structure)
-                if self._sequences[key][0] is not native.structure:
-                    native.assign_sequence(*self._sequences[key])
+                structure = self._build_structure(e, schedule.sequence)
+                if structure is not native.structure:
+                    native.assign_sequence(structure, places_in_library(structure))
                 with suppress(FailedCheckError):
                     found[i] = native.cost(schedule.times, p)
         return found
@@ -371,7 +368,7 @@ class Fitter:
         times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
         return self.get_evaluator(schedules).cost(np.concatenate([*times, parameters]))
 
-    def _build_structure(self, e: int, sequence: tuple[str, ...]) -> Structure:
+    def _place_functions(self, e: int, sequence: tuple[str, ...]) -> Structure:
         """Return the structure of an experiment with another sequence."""
         base = self.problem.structures[e]
         modes = tuple(base.mode_names.index(mode) for mode in sequence)
@@ -409,7 +406,7 @@ class Fitter:
         given = tuple(schedules)
         moved = [spread(schedule, self.library) for schedule in given]
         start = np.clip(parameters, *self.bounds)
-        acting = self.find_acting([schedule.sequence for schedule in given])
+        acting = self.find_acting(tuple(schedule.sequence for schedule in given))
         guards = self.problem.system.guards
         guarded = sum(pair in guards for schedule in given for pair in pairwise(schedule.sequence))
         failed = Fitted(given, start, acting, np.inf, guarded)
@@ -494,7 +491,7 @@ class Fitter:
         parameters : (M,)
         """
         theta = np.concatenate([*(schedule.times for schedule in schedules), parameters])
-        acting = self.find_acting([schedule.sequence for schedule in schedules])
+        acting = self.find_acting(tuple(schedule.sequence for schedule in schedules))
         free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
         if not free.any():
             return self.cost(schedules, parameters)
@@ -512,15 +509,7 @@ class Fitter:
         whitened = np.linalg.solve(lower, here.gradient[free])
         return here.cost - 0.5 * float(whitened @ whitened)
 
-    def find_acting(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
-        """Return which parameters and initial states act in the modes of the sequences: (M,).
-
-        Parameters
-        ----------
-        sequences : sequence of tuple of str, one for each experiment
-        """
-        key = tuple(sequences)
-        if key not in self._acting:
-            structures = [self._build_structure(e, sequence) for e, sequence in enumerate(key)]
-            self._acting[key] = find_read(self.problem, structures, library=False)
-        return self._acting[key]
+    def _find_acting(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
+        """Return which parameters and initial states act in the modes of the sequences: (M,)."""
+        structures = [self._build_structure(e, sequence) for e, sequence in enumerate(sequences)]
+        return find_read(self.problem, structures, library=False)
