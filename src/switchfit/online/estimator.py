@@ -59,7 +59,7 @@ from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
 from switchfit.strategy.choice import estimate
-from switchfit.strategy.library import Rules, Sequences, build_library
+from switchfit.strategy.library import Rules, build_library
 
 THRESHOLD = 12.0
 """Of 200 drives of 20 s without a change 5 % exceed it."""
@@ -329,10 +329,9 @@ class OnlineEstimator:
         samples = self._read(y)
         if self._journal is not None:
             append_update(self._journal, t, samples, u)
-        before = None if self.now is None else self._tracker.at(self._feed.count - 1)
         changed = self._place(t, samples, u)
         try:
-            complete = self._follow(changed, before, began)
+            complete = self._follow(changed, began)
             self.now = self._judge(t, began, complete=complete)
         except StoppedError as error:
             self._stopped = error.t
@@ -341,14 +340,10 @@ class OnlineEstimator:
             raise
         return self.now
 
-    def _follow(self, changed: int, before: tuple[Sequences, Hypotheses] | None, began: float) -> bool:
+    def _follow(self, changed: int, began: float) -> bool:
         """Take the hypotheses to the last node; return whether there was time for all of the work."""
         births = self._may("births", began)
-        if before is None or changed == 0 or self._tracker.has(changed - 1):
-            for node in range(changed, self._feed.count):
-                self._tracker.step(node, births)
-        else:
-            self._tracker.repeat(*before)
+        self._tracker.advance(changed, births)
         self._charge("births", began, births)
         self._slide()
         middle = clock.perf_counter()
@@ -643,9 +638,9 @@ class OnlineEstimator:
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
-        online._tracker.step(0, births=False)  # gives the engine its settings
+        online._tracker.step(births=False)  # gives the engine its settings
         online._tracker.unpack(numbers, arrays, file)
-        if online._tracker.has(online._feed.count - 1):  # it has had a sample
+        if online._tracker.kept:  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
         online._fitted, online._lost, online._recent = (numbers[name] for name in ("_fitted", "_lost", "_recent"))
         for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
@@ -700,7 +695,7 @@ class OnlineEstimator:
     def _judge(self, t: float, began: float, *, complete: bool) -> Now:
         """Compare the hypotheses, declare or retract changes, and return what is known."""
         tracker, penalty = self._tracker, self._settings.penalty
-        kept, found = tracker.at(self._feed.count - 1)
+        kept, found = tracker.latest
         value = tracker.value(kept.switches, found)
         b, exact, more = tracker.find_best(kept, value)
         without = np.inf if exact is None else float(value[exact])
