@@ -46,6 +46,7 @@ from switchfit.problem.validation import (
     as_array,
     as_count,
     as_finite,
+    as_index,
     as_instance,
     as_names,
     as_number,
@@ -186,6 +187,8 @@ class OnlineEstimator:
         rules = Rules.of(library, self._beam.modes)
         self._settings = Settings(rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
+        pairs = [(k, own) for k, item in enumerate(self._sensors) for own in enumerate(item.names or ())]
+        self._channels = {name: (k, column) for k, (column, name) in pairs}
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
@@ -374,16 +377,13 @@ class OnlineEstimator:
         found: dict[int, FloatArray] = {}
         for key, value in ({} if y is None else y).items():
             if isinstance(key, str):
-                k = next((k for k, item in enumerate(self._sensors) if key in (item.names or ())), -1)
-                if k < 0:
-                    known = ", ".join(name for item in self._sensors for name in item.names or ()) or "none has a name"
+                if key not in self._channels:
+                    known = ", ".join(self._channels) or "none has a name"
                     raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
-                row = found.setdefault(k, np.full(len(self._weights[k]), np.nan))
-                row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
+                k, column = self._channels[key]
+                found.setdefault(k, np.full(len(self._weights[k]), np.nan))[column] = as_number(value, key)
                 continue
-            k = as_count(key, "the position of a sensor")
-            if k >= len(self._sensors):
-                raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
+            k = as_index(key, "the position of a sensor", len(self._sensors))
             found[k] = as_array(value, f"y of sensor {k}").reshape(-1)
             if found[k].size != len(self._weights[k]):
                 raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
@@ -415,7 +415,7 @@ class OnlineEstimator:
                 self._tracker = self._start_tracking()
             count = ceil(min(gap / (LONGEST_GAP * (self.spacing or gap)), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
-                node = feed.append(time)
+                node = feed.insert(time)
                 self._write_signal(node - 1, held)
         elif feed.nodes[feed.find(t)] != t:
             changed = min(changed, feed.insert(t))
@@ -560,7 +560,8 @@ class OnlineEstimator:
             write_atomically(b"", self._journal)  # the saved state has what was in it
 
     def keep_journal(self, path: str | Path) -> None:
-        """Write each update to a file before it is done, so that nothing is lost if the process is killed.
+        """Take the samples of a journal, if there is one, and write each update to it before it is done, so that
+        nothing is lost if the process is killed.
 
         `save` empties it: a saved state and a journal together are always all samples.
 
@@ -586,15 +587,14 @@ class OnlineEstimator:
         ...     (Path(folder) / "journal").read_text()
         '{"t": 0.1, "y": {"0": [0.5]}, "u": null}\\n'
         """
-        self._journal = as_path(path, "path")
-        written = self._journal.read_bytes() if self._journal.exists() else b""
-        with self._journal.open("ab") as file:
-            file.truncate(written.rfind(b"\n") + 1)  # without a line that was cut off
+        self._journal, file = None, as_path(path, "path")
+        for t, y, u in read_journal(file):
+            with suppress(ValueError):  # the update that was refused then
+                self.update(t, y, u=u)
+        self._journal = file
 
     @classmethod
-    def load(
-        cls, path: str | Path, problem: Problem, *, journal: str | Path | None = None, **settings: Any
-    ) -> OnlineEstimator:
+    def load(cls, path: str | Path, problem: Problem, **settings: Any) -> OnlineEstimator:
         """Return the estimator that was saved.
 
         Parameters
@@ -602,8 +602,6 @@ class OnlineEstimator:
         path : path
         problem : Problem
             The same as then: a file has no functions.
-        journal : path, optional
-            Of `keep_journal`: its samples are taken, too.
         settings
             Those of the estimator that was saved, but for its threshold.
 
@@ -643,9 +641,6 @@ class OnlineEstimator:
         if online._tracker.kept:  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
         online._fitted, online._lost, online._recent = (numbers[name] for name in ("_fitted", "_lost", "_recent"))
-        for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
-            with suppress(ValueError):  # the update that was refused then
-                online.update(t, y, u=u)
         return online
 
     def _collect(self, now: Now) -> tuple[list[Measurements], dict[str, Any]]:
@@ -748,15 +743,13 @@ class OnlineEstimator:
         if count:
             del self._alarms[-count:]
         self._tracker.declared = modes.copy()
-        mode = self._beam.modes[modes[-1]]
-        if common < len(modes) and len(times):
-            error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
-            alarm = Alarm(t, mode, float(times[-1]), error, statistic)
-        elif common < len(modes) and self._tracker.left:  # another mode than was declared since what left the window
-            before = self._tracker.left[-1]
-            alarm = Alarm(t, mode, before.time, before.error, statistic)
-        else:
+        if common == len(modes) or not (len(times) or self._tracker.left):
             return None, retracted
+        if len(times):
+            time, error = float(times[-1]), float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
+        else:  # another mode than was declared since what left the window
+            _, time, error = self._tracker.left[-1]
+        alarm = Alarm(t, self._beam.modes[modes[-1]], time, error, statistic)
         self._alarms += [alarm] * (len(modes) - common)  # it declares so many changes
         return alarm, retracted
 

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.protocol import Column, Hypotheses, Limits
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.beam import SLOT, Beam, Pass
+from switchfit.strategy.beam import Beam, Pass
 from switchfit.strategy.library import Integers, Rules, Sequences, encode, select_lowest
 
 
@@ -85,28 +85,21 @@ class Feed:
             return self.count - 1
         return int(self.nodes.searchsorted(time, "right")) - 1
 
-    def append(self, time: float) -> int:
-        """Add a node at the end; the signals of the cell before it are the caller's to write."""
-        node = self.count
-        if node > self.capacity:
-            raise ValueError(f"there is no room for more than {self.capacity} times: raise capacity=, or set window=.")
-        self._nodes[node] = time
-        self.count += 1
-        for first, *_ in self._samples:
-            first[node + 1] = first[node]
-        return node
-
     def insert(self, time: float) -> int:
-        """Put a node between two others, and return it; later ones move on. A cell is cut in two."""
-        node = self.find(time) + 1
-        self.append(self.last)
-        end = self.count
-        self._nodes[node + 1 : end] = self._nodes[node : end - 1].copy()
-        self.signals[node : end - 1] = self.signals[node - 1 : end - 2].copy()
+        """Put a node where it belongs, and return it. A cell between two others is cut in two; the signals of one at
+        the end are the caller's to write.
+        """
+        node, end = self.find(time) + 1, self.count
+        if end > self.capacity:
+            raise ValueError(f"there is no room for more than {self.capacity} times: raise capacity=, or set window=.")
+        if node < end:
+            self._nodes[node + 1 : end + 1] = self._nodes[node:end].copy()
+            self.signals[node:end] = self.signals[node - 1 : end - 1].copy()
+            self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
         self._nodes[node] = time
-        self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
         for first, *_ in self._samples:
-            first[node + 1 : end + 1] = first[node:end].copy()
+            first[node + 1 : end + 2] = first[node : end + 1].copy()
+        self.count += 1
         return node
 
     def add(self, k: int, node: int, value: FloatArray, weight: FloatArray) -> None:
@@ -531,22 +524,14 @@ class Tracker:
         self, kept: Sequences, moved: FloatArray, times: FloatArray, births: Any, last: int, *, recentres: bool
     ) -> Hypotheses:
         """Return hypotheses from the start of the window anew to a node, with so many births (B,) at times (B, S)."""
-        beam, (rules, S, A, _, _) = self.beam, self.settings
-        B, start = len(kept.mode), self.start
+        start, (_, S, A, _, _) = self.start, self.settings
         moved = moved.copy()
         # Births are where they have moved; the entries e and the parameters stay moved, and the start follows them.
         moved[:, A : A + S] = 0.0
         # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
         begun = self._pass.build_start(moved) if start is None else start.build(moved, self._artificial)
-        counts = np.empty((B, 2), dtype=np.int64)
-        counts[:, 0], counts[:, 1] = births, rules.modes[kept.modes[:, 0]]
-        children, padded = np.empty((B, beam.births, len(Column)), dtype=np.int64), np.empty((B, beam.births))
-        if counts[:, 0].any():  # no others are read
-            children[:, :S], padded[:, :S] = self._pass.steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
-            children[:, :S, SLOT] = A + self._slots
-        p = self._parameters + moved[:, beam.births :]
         first = None if start is None else self.first
-        return beam.engine.replay(begun, p, counts, children, padded, last, first, recentres=recentres)
+        return self._pass.propagate(begun, kept, births, times, last, first, recentres=recentres)
 
     def polish(self) -> None:
         """Propagate the hypotheses that decide anew, from where they have moved."""
@@ -787,12 +772,14 @@ def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> Non
 
 
 def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
-    """Return the updates of a journal; the last one may have been cut off, and is left out then."""
+    """Return the updates of a journal, none without a file; a last one that was cut off is taken out of it."""
+    whole = path.read_bytes().rpartition(b"\n") if path.exists() else (b"", b"", b"")
     found = []
-    for line in path.read_bytes().split(b"\n")[:-1]:
+    for line in whole[0].splitlines():
         try:
             each = json.loads(line)
             found.append((each["t"], {int(k): values for k, values in each["y"].items()}, each["u"]))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} is not the journal of an online estimator ({error}).") from error
+    path.write_bytes(b"".join(whole[:2]))
     return found
