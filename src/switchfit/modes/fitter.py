@@ -40,7 +40,7 @@ from switchfit.engine.native.engine import (
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
-from switchfit.optimize import LinearConstraints
+from switchfit.optimize import LinearConstraints, lapack
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.inspection import find_targets
@@ -467,10 +467,7 @@ class Fitter:
         parameters : (M,)
         """
         found = self.fit(schedules, parameters)
-        while not found.failed:
-            shorter = self.collapse(found)
-            if shorter is None:
-                return found
+        while not found.failed and (shorter := self.collapse(found)) is not None:
             found = self.fit(shorter, found.parameters)
         return found
 
@@ -498,16 +495,13 @@ class Fitter:
         try:
             with np.errstate(all="ignore"):
                 here = self.get_evaluator(schedules)(theta)
-                lower = np.linalg.cholesky(here.hessian[np.ix_(free, free)])
-        except np.linalg.LinAlgError:
-            return -np.inf
         except (ValueError, ArithmeticError):
             return np.inf
         self.evaluations += 1
         if not np.isfinite(here.cost):
             return np.inf
-        whitened = np.linalg.solve(lower, here.gradient[free])
-        return here.cost - 0.5 * float(whitened @ whitened)
+        _, step, has_no_minimum = lapack.dposv(here.hessian[np.ix_(free, free)], -here.gradient[free])
+        return -np.inf if has_no_minimum else here.cost + 0.5 * float(here.gradient[free] @ step)
 
     def _find_acting(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
         """Return which parameters and initial states act in the modes of the sequences: (M,)."""

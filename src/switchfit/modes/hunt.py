@@ -127,9 +127,8 @@ class Pool:
     def by_switches(self) -> dict[int, Fitted]:
         """The fit of the lowest cost for each number of switches, ascending."""
         found: dict[int, Fitted] = {}
-        for fitted in self:
-            if fitted.switches not in found or fitted.cost < found[fitted.switches].cost:
-                found[fitted.switches] = fitted
+        for fitted in sorted(self, key=lambda fitted: fitted.cost):
+            found.setdefault(fitted.switches, fitted)
         return dict(sorted(found.items()))
 
     def measure_probability(self, fitted: Fitted) -> float:
@@ -277,10 +276,9 @@ class Improver:
         first.
         """
         found: dict[tuple[int, tuple[str, ...]], Move] = {}
-        for move in moves:
-            key = move.e, move.schedule.sequence
-            if np.isfinite(move.cost) and (key not in found or move.cost < found[key].cost):
-                found[key] = move
+        for move in sorted(moves, key=lambda move: move.cost):
+            if np.isfinite(move.cost):
+                found.setdefault((move.e, move.schedule.sequence), move)
         pairs = [(move.cost, self.place(best, move.e, move.schedule)) for move in found.values()]
         return sorted(pairs, key=lambda pair: self._expect(best, *pair))
 
