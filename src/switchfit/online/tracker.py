@@ -581,10 +581,10 @@ class Tracker:
         # Without a transition, hypotheses of earlier nodes that disagree are dropped once they have come to the last.
         count, followed = (self.node - following + 1 if pasts else 1), deque[Kept](maxlen=KEPT)
         while self.kept and len(followed) < count:
-            there = self._follow(self.kept.pop(), pasts, modes, times[0, :gone], end)
-            if there is None:
+            agreeing = self._follow(self.kept.pop(), pasts, modes, times[0, :gone], end)
+            if agreeing is None:
                 break
-            followed.appendleft(there)
+            followed.appendleft(agreeing)
         self.kept = followed if pasts else self.kept + followed
         self.first = following
         if gone:
@@ -714,7 +714,7 @@ class Tracker:
             return {key.removeprefix(begin): array for key, array in arrays.items() if key.startswith(begin)}
 
         self.feed.set_arrays(part("feed"))
-        self.declared, self.shift = arrays["declared"], arrays["shift"]
+        self.declared, self.shift = arrays["declared"].astype(np.int64), arrays["shift"]
         self.kept.clear()
         while own := part(f"kept {len(self.kept)}"):
             records, shift = own.pop("records"), own.pop("shift")
