@@ -188,7 +188,9 @@ class OnlineEstimator:
         self._settings = Settings(rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         pairs = [(k, own) for k, item in enumerate(self._sensors) for own in enumerate(item.names or ())]
-        self._channels = {name: (k, column) for k, (column, name) in pairs}
+        self._channels: dict[str, tuple[int, int]] = {}
+        for k, (column, name) in pairs:
+            self._channels.setdefault(name, (k, column))
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]

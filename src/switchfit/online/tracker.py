@@ -137,7 +137,7 @@ class Feed:
         lengths = {"nodes": self.count, "signals": self.count}
         for k, (first, *_) in enumerate(self._samples):
             lengths |= {f"{k} 0": self.count + 1} | {f"{k} {i}": int(first[self.count]) for i in (1, 2, 3)}
-        return {name: self._arrays[name][:length] for name, length in lengths.items()}
+        return {name: array[: lengths[name]] for name, array in self._arrays.items()}
 
     def set_arrays(self, given: dict[str, FloatArray]) -> None:
         """Replace the log by one that was copied."""
@@ -458,10 +458,10 @@ class Tracker:
         that are.
         """
         late = self.node + 1 - changed
-        if late > 0 and late >= len(self.kept) > 0:
+        if changed and late >= len(self.kept) > 0:
             self.repeat(*self.latest)
             return
-        for _ in range(late):
+        for _ in range(min(late, len(self.kept))):
             self.kept.pop()
         self.node = min(self.node, changed - 1)
         while self.node + 1 < self.feed.count:
@@ -773,13 +773,15 @@ def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> Non
 
 def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
     """Return the updates of a journal, none without a file; a last one that was cut off is taken out of it."""
-    whole = path.read_bytes().rpartition(b"\n") if path.exists() else (b"", b"", b"")
+    written = path.read_bytes() if path.exists() else b""
+    whole, _, cut_off = written.rpartition(b"\n")
     found = []
-    for line in whole[0].splitlines():
+    for line in whole.splitlines():
         try:
             each = json.loads(line)
             found.append((each["t"], {int(k): values for k, values in each["y"].items()}, each["u"]))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} is not the journal of an online estimator ({error}).") from error
-    path.write_bytes(b"".join(whole[:2]))
+    with path.open("ab") as file:
+        file.truncate(len(written) - len(cut_off))
     return found
