@@ -226,8 +226,8 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "a switch counts once in mBIC": swap("modes/criterion.py", 'each = 2 if name == "mbic" else 1', "each = 1"),
         "what follows a pulse": swap(
             "modes/schedule.py",
-            "append(name, max(knots[k], end), knots[k + 1])",
-            "append(name, knots[k], knots[k + 1])",
+            "names[j if closes else j + 1 :]",
+            "names[j + 1 :]",
         ),
         "reset maps of another sequence": swap(
             "engine/native/engine.py",

@@ -188,7 +188,6 @@ def made(name):
 def find_quietly(**given):
     """Search without the warning that min_duration leaves no room for so many switches."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "max_switches is .* leave room", UserWarning)
         return sf.find_modes(**given)
 
 

@@ -410,10 +410,10 @@ def test_different_data_are_refused_wherever_they_differ():
     changed = y + 1e-9 * (np.arange(12) == 4)
     twice = sf.Experiment([sf.Measurements(TIMES, y, sigma=SIGMA)] * 2, ("m",), (), 0.0, 4.0)
     for runs, said in (
-        (run(TIMES, changed), r"model1 and model2 were fitted to different data, .*: values differ first at"),
+        (run(TIMES, changed), r"model1 and model2 were fitted to different data, .*: values differ\."),
         ([run(TIMES, y), run(TIMES, values(TIMES, 1))], "1 and 2 experiments"),
-        (run(TIMES[1:], y[1:]), r"values of shape \(12, 1\) and \(11, 1\)"),
-        (run(TIMES - 0.01, y), r"times differ first at index 0, 0.3 and 0.29"),
+        (run(TIMES[1:], y[1:]), r"times of shape \(12,\) and \(11,\)"),
+        (run(TIMES - 0.01, y), r"times differ"),
         (twice, "1 and 2 Measurements"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -125,22 +125,16 @@ def _start(
     loaded: ProblemFile, settings: dict[str, Any], alarms: dict[str, Any], state: Path | None, journal: Path | None
 ) -> OnlineEstimator:
     """Return the estimator: a new one, or that of a state and a journal."""
-    from switchfit.online.tracker import read_journal
-
-    written = journal if journal is not None and journal.exists() else None
     if state is not None and state.exists():
-        estimator = sf.OnlineEstimator.load(state, loaded.problem, journal=written, **settings)
+        estimator = sf.OnlineEstimator.load(state, loaded.problem, **settings)
     else:
         estimator = sf.OnlineEstimator(loaded.problem, **settings, **alarms)
-        for t, y, u in [] if written is None else read_journal(written):
-            with contextlib.suppress(ValueError):  # the update that was refused then
-                estimator.update(t, y, u=u)
+    if journal is not None:
+        estimator.keep_journal(journal)
     if estimator.now is not None:
         terminal.print_note(f"going on from t = {estimator.now.time:.6g}, with the threshold {estimator.threshold:.4g}")
     elif alarms["false_alarms"] is not None:
         terminal.print_note(f"threshold {estimator.threshold:.4g}")
-    if journal is not None:
-        estimator.keep_journal(journal)
     return estimator
 
 

@@ -79,16 +79,16 @@ def look_around(improver: Improver) -> list[ModeWarning]:
         best = improver.pool.best
         if best is None:
             break
-        found = {}
-        _fit_neighbours(improver, best, found)
+        found = _fit_neighbours(improver, best)
         if improver.pool.best is best:
             break
         improver.improve()
     return list(found.values())
 
 
-def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, str], ModeWarning]) -> None:
-    """Fit the neighbours of each sequence, each from its best times; add modes that leave no trace."""
+def _fit_neighbours(improver: Improver, best: Fitted) -> dict[tuple[int, str], ModeWarning]:
+    """Fit the neighbours of each sequence, each from its best times; return the modes that leave no trace."""
+    untraced: dict[tuple[int, str], ModeWarning] = {}
     known = {fitted.sequences: fitted.cost for fitted in improver.pool}
     problem, several = improver.fitter.problem, len(best.schedules) > 1
     every = improver.simulate(best, list_neighbours)
@@ -107,6 +107,7 @@ def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, 
             if improver.fitter.collapse(fitted) is None:  # one that has is a shorter sequence
                 improver.pool.add(fitted)
             improver.report("fits of neighbouring sequences")
+    return untraced
 
 
 def _find_change(schedule: Schedule, changed: Schedule) -> tuple[str, float, float]:

@@ -40,7 +40,7 @@ from switchfit.engine.native.engine import (
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
-from switchfit.optimize import LinearConstraints
+from switchfit.optimize import LinearConstraints, lapack
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.inspection import find_targets
@@ -227,10 +227,10 @@ class Fitter:
         self.fits = self.evaluations = 0
         self._evaluators: dict[Any, Evaluator] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
-        self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
-        self._sequences: dict[tuple[int, tuple[str, ...]], tuple[Structure, dict[str, NDArray[np.int64]]]] = {}
         self._trace = cache(lambda e, pair: trace_transition(self.problem, self.problem.experiments[e], pair))
+        self._build_structure = cache(self._place_functions)
+        self.find_acting = cache(self._find_acting)
         counts = [len(run.times) + len(run.jump_times) for run in self.problem.experiments]
         self._places = [places[N:] - self.first for places, N in zip(self.problem.places, counts, strict=True)]
 
@@ -351,12 +351,9 @@ class Fitter:
         if native is not None:
             # Those of one sequence together: to assign one takes half as long as J.
             for i, schedule in sorted(enumerate(schedules), key=lambda each: each[1].sequence):
-                key = e, schedule.sequence
-                if key not in self._sequences:
-                    structure = self._build_structure(*key)
-                    self._sequences[key] = structure, places_in_library(structure)
-                if self._sequences[key][0] is not native.structure:
-                    native.assign_sequence(*self._sequences[key])
+                structure = self._build_structure(e, schedule.sequence)
+                if structure is not native.structure:
+                    native.assign_sequence(structure, places_in_library(structure))
                 with suppress(FailedCheckError):
                     found[i] = native.cost(schedule.times, p)
         return found
@@ -371,7 +368,7 @@ class Fitter:
         times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
         return self.get_evaluator(schedules).cost(np.concatenate([*times, parameters]))
 
-    def _build_structure(self, e: int, sequence: tuple[str, ...]) -> Structure:
+    def _place_functions(self, e: int, sequence: tuple[str, ...]) -> Structure:
         """Return the structure of an experiment with another sequence."""
         base = self.problem.structures[e]
         modes = tuple(base.mode_names.index(mode) for mode in sequence)
@@ -409,7 +406,7 @@ class Fitter:
         given = tuple(schedules)
         moved = [spread(schedule, self.library) for schedule in given]
         start = np.clip(parameters, *self.bounds)
-        acting = self.find_acting([schedule.sequence for schedule in given])
+        acting = self.find_acting(tuple(schedule.sequence for schedule in given))
         guards = self.problem.system.guards
         guarded = sum(pair in guards for schedule in given for pair in pairwise(schedule.sequence))
         failed = Fitted(given, start, acting, np.inf, guarded)
@@ -470,10 +467,7 @@ class Fitter:
         parameters : (M,)
         """
         found = self.fit(schedules, parameters)
-        while not found.failed:
-            shorter = self.collapse(found)
-            if shorter is None:
-                return found
+        while not found.failed and (shorter := self.collapse(found)) is not None:
             found = self.fit(shorter, found.parameters)
         return found
 
@@ -494,33 +488,22 @@ class Fitter:
         parameters : (M,)
         """
         theta = np.concatenate([*(schedule.times for schedule in schedules), parameters])
-        acting = self.find_acting([schedule.sequence for schedule in schedules])
+        acting = self.find_acting(tuple(schedule.sequence for schedule in schedules))
         free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
         if not free.any():
             return self.cost(schedules, parameters)
         try:
             with np.errstate(all="ignore"):
                 here = self.get_evaluator(schedules)(theta)
-                lower = np.linalg.cholesky(here.hessian[np.ix_(free, free)])
-        except np.linalg.LinAlgError:
-            return -np.inf
         except (ValueError, ArithmeticError):
             return np.inf
         self.evaluations += 1
         if not np.isfinite(here.cost):
             return np.inf
-        whitened = np.linalg.solve(lower, here.gradient[free])
-        return here.cost - 0.5 * float(whitened @ whitened)
+        _, step, has_no_minimum = lapack.dposv(here.hessian[np.ix_(free, free)], -here.gradient[free])
+        return -np.inf if has_no_minimum else here.cost + 0.5 * float(here.gradient[free] @ step)
 
-    def find_acting(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
-        """Return which parameters and initial states act in the modes of the sequences: (M,).
-
-        Parameters
-        ----------
-        sequences : sequence of tuple of str, one for each experiment
-        """
-        key = tuple(sequences)
-        if key not in self._acting:
-            structures = [self._build_structure(e, sequence) for e, sequence in enumerate(key)]
-            self._acting[key] = find_read(self.problem, structures, library=False)
-        return self._acting[key]
+    def _find_acting(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
+        """Return which parameters and initial states act in the modes of the sequences: (M,)."""
+        structures = [self._build_structure(e, sequence) for e, sequence in enumerate(sequences)]
+        return find_read(self.problem, structures, library=False)

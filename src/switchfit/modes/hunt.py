@@ -32,6 +32,7 @@ from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.rates import compute_rates
 from switchfit.modes.schedule import (
     Schedule,
+    drop_empty,
     list_insertions,
     list_removals,
     list_substitutions,
@@ -126,9 +127,8 @@ class Pool:
     def by_switches(self) -> dict[int, Fitted]:
         """The fit of the lowest cost for each number of switches, ascending."""
         found: dict[int, Fitted] = {}
-        for fitted in self:
-            if fitted.switches not in found or fitted.cost < found[fitted.switches].cost:
-                found[fitted.switches] = fitted
+        for fitted in sorted(self, key=lambda fitted: fitted.cost):
+            found.setdefault(fitted.switches, fitted)
         return dict(sorted(found.items()))
 
     def measure_probability(self, fitted: Fitted) -> float:
@@ -145,21 +145,15 @@ FITTED_MOVES = 3
 FITTED_PROPOSALS = 3
 """Proposals of a generator that are fitted for each run."""
 
-MARGIN = 10.0
-"""A move is ruled out where the model's lowest cost is above the best by ten times what a switch costs."""
-
-HOPELESS = 5.0
-"""The same of a generator's proposal, in units of J: its linear model was fitted to the data already."""
-
 FITTED_REMOVALS = 2
-"""Removals that are fitted for each number of switches below the best; one where the data are explained, and the lowest
-is far above the best: it is then for the table alone."""
+"""Removals that are fitted for each number of switches below the best; one where the data are explained: it is then for
+the table alone."""
 
 PLACES = (0.25, 0.5, 0.75)
 """Places between its neighbours, as parts of the distance, to which a transition is moved."""
 
 FAR = 20.0
-"""Difference of the criterion from the best above which a neighbour is not fitted, of several runs."""
+"""Difference of the criterion from the best, by the quadratic model, above which a move is not fitted."""
 
 ROUNDS = 12
 """Most rounds of moves."""
@@ -220,19 +214,11 @@ class Improver:
         taken: set[tuple[tuple[str, ...], ...]] = set()
         most = FITTED_PROPOSALS * len(self.spans)
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
-            if proposal.sequences not in taken and len(taken) < most and not self._is_hopeless(proposal):
+            if proposal.sequences not in taken and len(taken) < most:
                 taken.add(proposal.sequences)
                 given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
                 schedules = [Schedule(sequence, times, *span) for sequence, times, span in given]
                 self.polish(schedules, proposal.parameters, "fits of proposals")
-
-    def _is_hopeless(self, proposal: Proposal) -> bool:
-        """Return whether data that are explained leave a proposal no hope: its linear model's cost is far above J."""
-        best = self.pool.best
-        if best is None or not self.pool.is_explained():
-            return False
-        penalty = self.pool.score.measure_penalty(self.pool.criterion)
-        return proposal.cost > best.cost + penalty * best.switches + HOPELESS * (penalty + 1.0)
 
     def improve(self) -> None:
         """Move from the best until no move lowers the criterion."""
@@ -290,21 +276,21 @@ class Improver:
         first.
         """
         found: dict[tuple[int, tuple[str, ...]], Move] = {}
-        for move in moves:
-            key = move.e, move.schedule.sequence
-            if np.isfinite(move.cost) and (key not in found or move.cost < found[key].cost):
-                found[key] = move
+        for move in sorted(moves, key=lambda move: move.cost):
+            if np.isfinite(move.cost):
+                found.setdefault((move.e, move.schedule.sequence), move)
         pairs = [(move.cost, self.place(best, move.e, move.schedule)) for move in found.values()]
         return sorted(pairs, key=lambda pair: self._expect(best, *pair))
 
     def _fit_lowest(self, list_moves: ListMoves, what: str, screened: bool, best: Fitted) -> None:
         """Simulate all moves of a kind, and fit those of the lowest expected criterion, one of each sequence.
 
-        `screened` fits only those that the quadratic model does not rule out.
+        `screened` fits only those that the quadratic model does not rule out, where the best explains the data: a move
+        that lowers the criterion then changes little, and the model is good.
         """
-        limit = self._limit(best) if screened else np.inf
+        screened = screened and self.pool.is_explained() is True
         for _, given in self.choose_lowest(best, self.simulate(best, list_moves))[:FITTED_MOVES]:
-            if limit == np.inf or self.fitter.predict(given, best.parameters) <= limit:
+            if not (screened and self.is_ruled_out(best, given)):
                 self.polish(given, best.parameters, what)
 
     def _expect(self, best: Fitted, cost: float, given: Sequence[Schedule]) -> float:
@@ -316,17 +302,6 @@ class Improver:
         """Return whether the criterion of schedules is far above the best by the quadratic model, without a fit."""
         expected = self._expect(best, self.fitter.predict(given, best.parameters), given)
         return expected > self.pool.compute(best) + FAR
-
-    def _limit(self, best: Fitted) -> float:
-        """Return the cost above which the quadratic model of a move rules it out; infinite if nothing is ruled out.
-
-        Where the best explains the data, a move that lowers the criterion changes little, and the model is good.
-        """
-        probability = self.pool.measure_probability(best)
-        if not probability >= EXPLAINED:
-            return np.inf
-        penalty = self.pool.score.compute(self.pool.criterion, 0.0, 0, 1)
-        return best.cost + MARGIN * (abs(penalty) + 1.0)
 
     def fill_numbers(self) -> None:
         """Fit schedules with fewer switches than the best, each from the next longer one without a mode.
@@ -366,9 +341,7 @@ class Improver:
     def _fit_removals(self, fitted: Fitted) -> None:
         """Fit the schedules without one of the modes whose removal costs least."""
         found = sorted(self.simulate(fitted, list_removals), key=lambda move: move.cost)
-        best = self.pool.best
-        count = FITTED_REMOVALS if best is None or not found or found[0].cost <= self._limit(best) else 1
-        for move in found[:count]:
+        for move in found[: 1 if self.pool.is_explained() else FITTED_REMOVALS]:
             self.polish(self.place(fitted, move.e, move.schedule), fitted.parameters, "fits with fewer switches")
 
 
@@ -408,7 +381,7 @@ def list_pulses(
     theta = np.concatenate([*(schedule.times for schedule in schedules), parameters])
     found: list[tuple[float, list[Schedule]]] = []
     for e, rate in enumerate(compute_rates(fitter.get_evaluator(schedules), theta)):
-        schedule = schedules[e]
+        schedule = drop_empty(schedules[e])
         for pulse in rate.minima(MINIMA):
             for begin, length in _place_pulse(schedule, pulse.time):
                 changed = splice(schedule, pulse.mode, begin, begin + length)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
+from functools import cache
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -88,23 +90,23 @@ def collapse(schedule: Schedule, library: Library, shortest: float) -> Schedule:
 
 
 def splice(schedule: Schedule, mode: str, begin: float, end: float) -> Schedule:
-    """Return the schedule with a mode active from `begin` to `end`, whatever was active there."""
-    sequence: list[str] = []
-    starts: list[float] = []
+    """Return the schedule, whose modes have durations, with a mode active from `begin` to `end`, two times inside the
+    horizon, whatever was active there.
+    """
+    names, starts = schedule.sequence, [schedule.t0, *schedule.times.tolist()]
+    i = bisect_left(starts, begin)  # modes that begin before
+    j = bisect_right(starts, end) - 1 if end < schedule.tf else len(names)  # the mode that is active after
+    opens, closes = not i or names[i - 1] != mode, j < len(names) and names[j] != mode
+    sequence = (*names[:i], *[mode] * opens, *names[j if closes else j + 1 :])
+    times = [*starts[:i], *[begin] * opens, *[end] * closes, *starts[j + 1 :]][1:]
+    return schedule.replace(sequence, np.array(times))
 
-    def append(name: str, start: float, stop: float) -> None:
-        if stop > start and not (sequence and sequence[-1] == name):
-            sequence.append(name)
-            starts.append(start)
 
-    knots = schedule.knots
-    begin, end = max(begin, schedule.t0), min(end, schedule.tf)
-    for k, name in enumerate(schedule.sequence):
-        append(name, knots[k], min(knots[k + 1], begin))
-        if knots[k] <= begin < knots[k + 1]:
-            append(mode, begin, end)
-        append(name, max(knots[k], end), knots[k + 1])
-    return schedule.replace(tuple(sequence), np.array(starts[1:]))
+def drop_empty(schedule: Schedule) -> Schedule:
+    """Return the schedule without modes of no duration."""
+    there = np.flatnonzero(schedule.durations > 0).tolist()
+    sequence = tuple(schedule.sequence[i] for i in there)
+    return merge_neighbours(schedule.replace(sequence, schedule.knots[there[1:]]))
 
 
 def list_removals(schedule: Schedule, library: Library) -> Iterator[Schedule]:
@@ -142,27 +144,13 @@ def list_insertions(schedule: Schedule, library: Library, cells: int = CELLS) ->
     """
     grid = np.linspace(schedule.t0, schedule.tf, cells + 1)
     times = np.unique(np.concatenate([grid, schedule.times])).tolist()
-    whole = splice(schedule, schedule.sequence[0], schedule.t0, schedule.t0)  # without modes of no duration
-    own, close, (t0, tf) = whole.times.tolist(), 1e-12 * (schedule.tf - schedule.t0), (schedule.t0, schedule.tf)
-    starts, count = [t0, *own], len(whole.sequence)
-    known: dict[tuple[int, int, str], tuple[tuple[str, ...], bool]] = {}
-    for a, begin in enumerate(times[:-1]):
-        i = bisect_left(starts, begin)  # modes that begin before
-        for end in times[a + 1 :]:
-            j = bisect_right(starts, end) - 1 if end < tf else count  # the mode that is active after
-            for mode in library.modes:
-                opens, closes = not i or whole.sequence[i - 1] != mode, j < count and whole.sequence[j] != mode
-                if (i, j, mode) not in known:
-                    after = whole.sequence[j if closes else j + 1 :]
-                    sequence = (*whole.sequence[:i], *[mode] * opens, *after)
-                    known[i, j, mode] = sequence, library.admits(sequence)
-                sequence, admitted = known[i, j, mode]
-                if not admitted:
-                    continue
-                changed = [*starts[:i], *[begin] * opens, *[end] * closes, *starts[j + 1 :]][1:]
-                same = sequence == schedule.sequence and len(changed) == len(own)
-                if not same or any(abs(one - other) > close for one, other in zip(changed, own, strict=True)):
-                    yield schedule.replace(sequence, np.array(changed))
+    whole, close, admits = drop_empty(schedule), 1e-12 * (schedule.tf - schedule.t0), cache(library.admits)
+    for begin, end in combinations(times, 2):
+        for mode in library.modes:
+            changed = splice(whole, mode, begin, end)
+            is_other = changed.sequence != schedule.sequence or np.any(np.abs(changed.times - schedule.times) > close)
+            if is_other and admits(changed.sequence):
+                yield changed
 
 
 def spread(schedule: Schedule, library: Library, room: float = 1e-9) -> Schedule | None:

@@ -5,7 +5,6 @@ the data.
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_args
@@ -224,7 +223,6 @@ def find_modes(
         problem, library, first=first, last=last, successions=successions, min_duration=min_duration,
         max_switches=max_switches,
     )  # fmt: skip
-    _check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
     method = as_choice(method, "method", METHODS)
     width = as_count(width, "width", at_least=len(modes.modes))  # each of which may come first
@@ -249,19 +247,6 @@ def _check_experiments(problem: Problem) -> None:
                     f"transition time {i} of {name} is fixed, or has bounds, a prior or a logarithmic scale, but "
                     "find_modes looks for the number of transitions as well: give transition times as numbers."
                 )
-
-
-def _check_room(problem: Problem, library: Library) -> None:
-    """Warn if the shortest durations leave no room for the largest number of switches."""
-    shortest = min(library.durations.values())
-    length = min(run.end - run.t0 for run in problem.experiments)
-    if shortest > 0 and (library.max_switches + 1) * shortest > length:
-        warnings.warn(
-            f"max_switches is {library.max_switches}, but modes that last {shortest:g} or longer leave room for "
-            f"{max(int(np.ceil(length / shortest)) - 2, 0)} switches in a horizon of {length:g}. Lower max_switches or "
-            "min_duration.",
-            stacklevel=3,
-        )
 
 
 def _check_grid(grid: Any, problem: Problem) -> float:

@@ -46,6 +46,7 @@ from switchfit.problem.validation import (
     as_array,
     as_count,
     as_finite,
+    as_index,
     as_instance,
     as_names,
     as_number,
@@ -59,7 +60,7 @@ from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
 from switchfit.strategy.choice import estimate
-from switchfit.strategy.library import Rules, Sequences, build_library
+from switchfit.strategy.library import Rules, build_library
 
 THRESHOLD = 12.0
 """Of 200 drives of 20 s without a change 5 % exceed it."""
@@ -186,6 +187,10 @@ class OnlineEstimator:
         rules = Rules.of(library, self._beam.modes)
         self._settings = Settings(rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
+        pairs = [(k, own) for k, item in enumerate(self._sensors) for own in enumerate(item.names or ())]
+        self._channels: dict[str, tuple[int, int]] = {}
+        for k, (column, name) in pairs:
+            self._channels.setdefault(name, (k, column))
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
@@ -329,10 +334,9 @@ class OnlineEstimator:
         samples = self._read(y)
         if self._journal is not None:
             append_update(self._journal, t, samples, u)
-        before = None if self.now is None else self._tracker.at(self._feed.count - 1)
         changed = self._place(t, samples, u)
         try:
-            complete = self._follow(changed, before, began)
+            complete = self._follow(changed, began)
             self.now = self._judge(t, began, complete=complete)
         except StoppedError as error:
             self._stopped = error.t
@@ -341,14 +345,10 @@ class OnlineEstimator:
             raise
         return self.now
 
-    def _follow(self, changed: int, before: tuple[Sequences, Hypotheses] | None, began: float) -> bool:
+    def _follow(self, changed: int, began: float) -> bool:
         """Take the hypotheses to the last node; return whether there was time for all of the work."""
         births = self._may("births", began)
-        if before is None or changed == 0 or self._tracker.has(changed - 1):
-            for node in range(changed, self._feed.count):
-                self._tracker.step(node, births)
-        else:
-            self._tracker.repeat(*before)
+        self._tracker.advance(changed, births)
         self._charge("births", began, births)
         self._slide()
         middle = clock.perf_counter()
@@ -379,16 +379,13 @@ class OnlineEstimator:
         found: dict[int, FloatArray] = {}
         for key, value in ({} if y is None else y).items():
             if isinstance(key, str):
-                k = next((k for k, item in enumerate(self._sensors) if key in (item.names or ())), -1)
-                if k < 0:
-                    known = ", ".join(name for item in self._sensors for name in item.names or ()) or "none has a name"
+                if key not in self._channels:
+                    known = ", ".join(self._channels) or "none has a name"
                     raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
-                row = found.setdefault(k, np.full(len(self._weights[k]), np.nan))
-                row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
+                k, column = self._channels[key]
+                found.setdefault(k, np.full(len(self._weights[k]), np.nan))[column] = as_number(value, key)
                 continue
-            k = as_count(key, "the position of a sensor")
-            if k >= len(self._sensors):
-                raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
+            k = as_index(key, "the position of a sensor", len(self._sensors))
             found[k] = as_array(value, f"y of sensor {k}").reshape(-1)
             if found[k].size != len(self._weights[k]):
                 raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
@@ -420,7 +417,7 @@ class OnlineEstimator:
                 self._tracker = self._start_tracking()
             count = ceil(min(gap / (LONGEST_GAP * (self.spacing or gap)), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
-                node = feed.append(time)
+                node = feed.insert(time)
                 self._write_signal(node - 1, held)
         elif feed.nodes[feed.find(t)] != t:
             changed = min(changed, feed.insert(t))
@@ -565,7 +562,8 @@ class OnlineEstimator:
             write_atomically(b"", self._journal)  # the saved state has what was in it
 
     def keep_journal(self, path: str | Path) -> None:
-        """Write each update to a file before it is done, so that nothing is lost if the process is killed.
+        """Take the samples of a journal, if there is one, and write each update to it before it is done, so that
+        nothing is lost if the process is killed.
 
         `save` empties it: a saved state and a journal together are always all samples.
 
@@ -591,15 +589,14 @@ class OnlineEstimator:
         ...     (Path(folder) / "journal").read_text()
         '{"t": 0.1, "y": {"0": [0.5]}, "u": null}\\n'
         """
-        self._journal = as_path(path, "path")
-        written = self._journal.read_bytes() if self._journal.exists() else b""
-        with self._journal.open("ab") as file:
-            file.truncate(written.rfind(b"\n") + 1)  # without a line that was cut off
+        self._journal, file = None, as_path(path, "path")
+        for t, y, u in read_journal(file):
+            with suppress(ValueError):  # the update that was refused then
+                self.update(t, y, u=u)
+        self._journal = file
 
     @classmethod
-    def load(
-        cls, path: str | Path, problem: Problem, *, journal: str | Path | None = None, **settings: Any
-    ) -> OnlineEstimator:
+    def load(cls, path: str | Path, problem: Problem, **settings: Any) -> OnlineEstimator:
         """Return the estimator that was saved.
 
         Parameters
@@ -607,8 +604,6 @@ class OnlineEstimator:
         path : path
         problem : Problem
             The same as then: a file has no functions.
-        journal : path, optional
-            Of `keep_journal`: its samples are taken, too.
         settings
             Those of the estimator that was saved, but for its threshold.
 
@@ -643,14 +638,11 @@ class OnlineEstimator:
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
-        online._tracker.step(0, births=False)  # gives the engine its settings
+        online._tracker.step(births=False)  # gives the engine its settings
         online._tracker.unpack(numbers, arrays, file)
-        if online._tracker.has(online._feed.count - 1):  # it has had a sample
+        if online._tracker.kept:  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
         online._fitted, online._lost, online._recent = (numbers[name] for name in ("_fitted", "_lost", "_recent"))
-        for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
-            with suppress(ValueError):  # the update that was refused then
-                online.update(t, y, u=u)
         return online
 
     def _collect(self, now: Now) -> tuple[list[Measurements], dict[str, Any]]:
@@ -700,7 +692,7 @@ class OnlineEstimator:
     def _judge(self, t: float, began: float, *, complete: bool) -> Now:
         """Compare the hypotheses, declare or retract changes, and return what is known."""
         tracker, penalty = self._tracker, self._settings.penalty
-        kept, found = tracker.at(self._feed.count - 1)
+        kept, found = tracker.latest
         value = tracker.value(kept.switches, found)
         b, exact, more = tracker.find_best(kept, value)
         without = np.inf if exact is None else float(value[exact])
@@ -753,15 +745,13 @@ class OnlineEstimator:
         if count:
             del self._alarms[-count:]
         self._tracker.declared = modes.copy()
-        mode = self._beam.modes[modes[-1]]
-        if common < len(modes) and len(times):
-            error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
-            alarm = Alarm(t, mode, float(times[-1]), error, statistic)
-        elif common < len(modes) and self._tracker.left:  # another mode than was declared since what left the window
-            before = self._tracker.left[-1]
-            alarm = Alarm(t, mode, before.time, before.error, statistic)
-        else:
+        if common == len(modes) or not (len(times) or self._tracker.left):
             return None, retracted
+        if len(times):
+            time, error = float(times[-1]), float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
+        else:  # another mode than was declared since what left the window
+            _, time, error = self._tracker.left[-1]
+        alarm = Alarm(t, self._beam.modes[modes[-1]], time, error, statistic)
         self._alarms += [alarm] * (len(modes) - common)  # it declares so many changes
         return alarm, retracted
 

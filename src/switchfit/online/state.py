@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import compare
+from switchfit.modes.schedule import Schedule, drop_empty
 from switchfit.online.tracker import Start, drop_artificial, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.parameter import Parameter
@@ -447,23 +448,11 @@ def build_kept_problem(
         initial = [
             entry if value is None else replace(entry, value=value) for entry, value in zip(own, values, strict=True)
         ]
-    times = np.clip(given["transition_times"], given["t0"], given["tf"]).tolist()
-    sequence, times = _drop_empty_modes(given["mode_sequence"], times, given["t0"], given["tf"])
-    begins = given | {"mode_sequence": sequence, "transition_times": times, "initial_state": initial}
+    t0, tf = given["t0"], given["tf"]
+    # A wrong model or outliers make modes of no duration.
+    there = drop_empty(Schedule(given["mode_sequence"], np.clip(given["transition_times"], t0, tf), t0, tf))
+    begins = given | {"mode_sequence": there.sequence, "transition_times": tuple(there.times), "initial_state": initial}
     return replace(problem, experiments=(replace(run, data=tuple(data), **begins),), parameters=parameters)
-
-
-def _drop_empty_modes(
-    sequence: tuple[str, ...], times: list[float], t0: float, tf: float
-) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """Return a sequence and its times without modes of no length, which a wrong model or outliers make."""
-    names: list[str] = []
-    begins: list[float] = []
-    for name, begin, end in zip(sequence, [t0, *times], [*times, tf], strict=True):
-        if end > begin and names[-1:] != [name]:
-            names.append(name)
-            begins.append(begin)
-    return tuple(names), tuple(begins[1:])
 
 
 def _describe_arrival(problem: Problem, arrival: Start, t0: float) -> tuple[Any, Measurements]:

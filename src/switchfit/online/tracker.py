@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections import deque
 from itertools import accumulate
 from math import nextafter
 from pathlib import Path
@@ -33,7 +34,7 @@ from numpy.typing import NDArray
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.protocol import Column, Hypotheses, Limits
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.beam import SLOT, Beam, Pass
+from switchfit.strategy.beam import Beam, Pass
 from switchfit.strategy.library import Integers, Rules, Sequences, encode, select_lowest
 
 
@@ -84,28 +85,21 @@ class Feed:
             return self.count - 1
         return int(self.nodes.searchsorted(time, "right")) - 1
 
-    def append(self, time: float) -> int:
-        """Add a node at the end; the signals of the cell before it are the caller's to write."""
-        node = self.count
-        if node > self.capacity:
-            raise ValueError(f"there is no room for more than {self.capacity} times: raise capacity=, or set window=.")
-        self._nodes[node] = time
-        self.count += 1
-        for first, *_ in self._samples:
-            first[node + 1] = first[node]
-        return node
-
     def insert(self, time: float) -> int:
-        """Put a node between two others, and return it; later ones move on. A cell is cut in two."""
-        node = self.find(time) + 1
-        self.append(self.last)
-        end = self.count
-        self._nodes[node + 1 : end] = self._nodes[node : end - 1].copy()
-        self.signals[node : end - 1] = self.signals[node - 1 : end - 2].copy()
+        """Put a node where it belongs, and return it. A cell between two others is cut in two; the signals of one at
+        the end are the caller's to write.
+        """
+        node, end = self.find(time) + 1, self.count
+        if end > self.capacity:
+            raise ValueError(f"there is no room for more than {self.capacity} times: raise capacity=, or set window=.")
+        if node < end:
+            self._nodes[node + 1 : end + 1] = self._nodes[node:end].copy()
+            self.signals[node:end] = self.signals[node - 1 : end - 1].copy()
+            self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
         self._nodes[node] = time
-        self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
         for first, *_ in self._samples:
-            first[node + 1 : end + 1] = first[node:end].copy()
+            first[node + 1 : end + 2] = first[node : end + 1].copy()
+        self.count += 1
         return node
 
     def add(self, k: int, node: int, value: FloatArray, weight: FloatArray) -> None:
@@ -140,21 +134,22 @@ class Feed:
 
     def copy_arrays(self) -> dict[str, Any]:
         """Return what is in the log, by name, for `set_arrays`."""
-        found: dict[str, Any] = {"nodes": self.nodes.copy(), "signals": self.signals[: self.count].copy()}
+        lengths = {"nodes": self.count, "signals": self.count}
         for k, (first, *_) in enumerate(self._samples):
-            arrays = zip(("times", "values", "weights"), self.samples(k), strict=True)
-            found |= {f"{name} {k}": array.copy() for name, array in arrays}
-            found[f"first {k}"] = first[: self.count + 1].copy()
-        return found
+            lengths |= {f"{k} 0": self.count + 1} | {f"{k} {i}": int(first[self.count]) for i in (1, 2, 3)}
+        return {name: array[: lengths[name]] for name, array in self._arrays.items()}
 
     def set_arrays(self, given: dict[str, FloatArray]) -> None:
         """Replace the log by one that was copied."""
         self.count = len(given["nodes"])
-        self._nodes[: self.count], self.signals[: self.count] = given["nodes"], given["signals"]
-        for k, (first, *arrays) in enumerate(self._samples):
-            for name, array in zip(("times", "values", "weights"), arrays, strict=True):
-                array[: len(given[f"{name} {k}"])] = given[f"{name} {k}"]
-            first[: self.count + 1] = given[f"first {k}"]
+        for name, array in self._arrays.items():
+            array[: len(given[name])] = given[name]
+
+    @property
+    def _arrays(self) -> dict[str, Any]:
+        """All arrays by name; only the beginning of each is in use."""
+        samples = {f"{k} {i}": array for k, arrays in enumerate(self._samples) for i, array in enumerate(arrays)}
+        return {"nodes": self._nodes, "signals": self.signals, **samples}
 
 
 def shift_cubic(coefficients: FloatArray, s: float) -> FloatArray:
@@ -349,6 +344,14 @@ class Left(NamedTuple):
     error: float
 
 
+class Kept(NamedTuple):
+    """Hypotheses at a node, and the `shift` of the tracker, (A,), from which the entries e of their `moved` count."""
+
+    sequences: Sequences
+    found: Hypotheses
+    shift: FloatArray
+
+
 class Settings(NamedTuple):
     """How hypotheses are followed.
 
@@ -382,8 +385,12 @@ class Tracker:
 
     Attributes
     ----------
-    first : int
-        Node at which the window begins.
+    first, node : int
+        Node at which the window begins, and the last one to which hypotheses were taken; -1 before there are any.
+    kept : deque of Kept
+        Those at the last nodes.
+    shift : (A,)
+        By how much the entries e have moved on with the start of the window.
     declared : (k + 1,) int
         Places of the modes since then that were declared.
     left : list of Left
@@ -393,23 +400,16 @@ class Tracker:
         Second derivative of the cost along a time that a birth begins with.
     artificial : (D,)
         What the diagonal of H has that is no knowledge.
-    behind : (KEPT, A)
-        What has yet to be added to the entries e of `moved` of the hypotheses that are kept.
     """
 
     def __init__(self, beam: Beam, settings: Settings, parameters: FloatArray, feed: Feed) -> None:
         self.beam, self.settings, self.feed = beam, settings, feed
-        self.first, self.spacing = 0, beam.grid
+        self.first, self.node, self.spacing = 0, -1, beam.grid
         self.declared: NDArray[np.int64] = settings.rules.first[:1]
         self.left: list[Left] = []
-        self.dropped = 0
         self.start: Start | None = None
-        self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
-        self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
-        self.behind = np.zeros((KEPT, settings.entries))
-        self._views = [beam.engine.view(records[: settings.width]) for records in self.records]
-        self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
-        self._coded: tuple[Any, list[int]] = (None, [])
+        self.kept: deque[Kept] = deque(maxlen=KEPT)
+        self.shift = np.zeros(settings.entries)
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
         self.birth_information = float(12.0 * (beam.noise / beam.reaches[0]) ** 2)
@@ -422,35 +422,21 @@ class Tracker:
 
     # --- one step --------------------------------------------------------------------------------------------------
 
-    def at(self, node: int) -> tuple[Sequences, Hypotheses]:
-        """Return the hypotheses at a node, whose arrays may be written to."""
-        place = (node + self.dropped) % KEPT
-        there = self.kept[place]
-        if there is None:
-            raise LookupError("no hypotheses are kept at this node")
-        self.catch_up(place, there[1])
-        return there
+    @property
+    def latest(self) -> tuple[Sequences, Hypotheses]:
+        """The hypotheses at the last node, whose arrays may be written to."""
+        self.kept[-1] = there = self._catch_up(self.kept[-1])
+        return there.sequences, there.found
 
-    def catch_up(self, place: int, found: Hypotheses) -> None:
-        """Let the entries e of the hypotheses at a place begin where the window does now."""
-        found.moved[:, : self.settings.entries] += self.behind[place]
-        self.behind[place] = 0.0
+    def _catch_up(self, there: Kept) -> Kept:
+        """Let the entries e of hypotheses begin where the window does now."""
+        if there.shift is not self.shift:
+            there.found.moved[:, : len(self.shift)] += self.shift - there.shift
+        return there._replace(shift=self.shift)
 
-    def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
-        """Return hypotheses whose records are at a place."""
-        count = len(kept.mode)
-        usual = count == self.settings.width
-        return kept, self._views[place] if usual else self.beam.engine.view(self.records[place, :count])
-
-    def has(self, node: int) -> bool:
-        """Return whether the hypotheses at a node are kept."""
-        return node > self.feed.count - KEPT and self.kept[(node + self.dropped) % KEPT] is not None
-
-    def keep(self, node: int, kept: Sequences, records: FloatArray, chosen: NDArray[np.intp]) -> None:
-        """Keep hypotheses at a node, with the chosen ones of some records."""
-        place = (node + self.dropped) % KEPT
-        np.take(records, chosen, axis=0, out=self.records[place, : len(chosen)], mode="clip")  # "raise" makes a copy
-        self.kept[place], self.behind[place] = self.view(place, kept), 0.0
+    def _keep(self, sequences: Sequences, records: FloatArray) -> Kept:
+        """Return hypotheses as they are kept, with records of their own."""
+        return Kept(sequences, self.beam.engine.view(records), self.shift)
 
     def value(self, switches: Integers, found: Hypotheses) -> FloatArray:
         """Return the cost of hypotheses with the price of their switches; not finite where they have failed."""
@@ -461,24 +447,38 @@ class Tracker:
         """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
         which of those that have more after it.
         """
-        if self._known[0] is not kept or self._known[1] is not self.declared:
-            last = len(self.declared) - 1
-            same = (kept.modes[:, : last + 1] == self.declared).all(1)
-            ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
-            self._known = kept, self.declared, ways
-        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in self._known[2])
+        last = len(self.declared) - 1
+        same = (kept.modes[:, : last + 1] == self.declared).all(1)
+        ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
+        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in ways)
         return int(value.argmin()), exact, more
 
-    def step(self, node: int, births: bool) -> None:
-        """Take all hypotheses to a node, from the one before."""
+    def advance(self, changed: int, births: bool) -> None:
+        """Take all hypotheses to the last node of the feed, of which those from `changed` on are new, or have samples
+        that are.
+        """
+        late = self.node + 1 - changed
+        if changed and late >= len(self.kept) > 0:
+            self.repeat(*self.latest)
+            return
+        for _ in range(min(late, len(self.kept))):
+            self.kept.pop()
+        self.node = min(self.node, changed - 1)
+        while self.node + 1 < self.feed.count:
+            self.step(births)
+
+    def step(self, births: bool) -> None:
+        """Take all hypotheses to the next node."""
         beam, (rules, S, A, _, _) = self.beam, self.settings
+        node = self.node + 1
         if node == 0:
             kept = Sequences.start(rules.first, S, float(self.feed.nodes[0]))
             start = self._pass.build_start(np.zeros((1, beam.births + len(beam.places))))
             found = beam.engine.begin(self._parameters, start, beam.tolerances, self._build_limits())
-            self.keep(0, kept, found.records, np.zeros(len(kept.mode), dtype=np.intp))
+            self.kept.append(self._keep(kept, found.records))
+            self.node = 0
             return
-        kept, found = self.at(node - 1)
+        kept, found = self.latest
         t, B = float(self.feed.nodes[node - 1]), len(kept.mode)
         parents, after = rules.list_births(kept, t, np.inf)
         children = kept.list_children(parents, after) if births else kept.list_children(parents[:0], after[:0])
@@ -489,17 +489,16 @@ class Tracker:
         chosen = self._select(self.value(children.switches, found), children.code, children.switches)
         if not len(chosen):
             raise StoppedError(t)
-        self.keep(node, kept.follow(children, chosen, t), found.records, chosen)
+        self.kept.append(self._keep(kept.follow(children, chosen, t), found.records[chosen]))
+        self.node = node
 
     def _select(self, value: FloatArray, code: Integers, switches: Integers) -> Integers:
         """Return the best hypotheses, those that are always kept among them."""
         chosen = select_lowest(value, code, switches, self.settings.width, PER_SEQUENCE)
-        if self._coded[0] is not self.declared:
-            # What was declared, and where there is more than one mode in the window, that without the last one.
-            modes = [*(each.mode for each in self.left), *self.declared.tolist()]
-            self._coded = self.declared, [encode(modes), encode(modes[:-1])][: len(self.declared)]
+        # What was declared, and where there is more than one mode in the window, that without the last one.
+        modes = [*(each.mode for each in self.left), *self.declared.tolist()]
         there = code[chosen].tolist()  # if any of a sequence, then its best
-        for own in self._coded[1]:
+        for own in [encode(modes), encode(modes[:-1])][: len(self.declared)]:
             if own not in there:
                 same = np.flatnonzero((code == own) & np.isfinite(value))
                 chosen = np.append(chosen, same[value[same].argsort(kind="stable")[:1]])
@@ -525,29 +524,21 @@ class Tracker:
         self, kept: Sequences, moved: FloatArray, times: FloatArray, births: Any, last: int, *, recentres: bool
     ) -> Hypotheses:
         """Return hypotheses from the start of the window anew to a node, with so many births (B,) at times (B, S)."""
-        beam, (rules, S, A, _, _) = self.beam, self.settings
-        B, start = len(kept.mode), self.start
+        start, (_, S, A, _, _) = self.start, self.settings
         moved = moved.copy()
         # Births are where they have moved; the entries e and the parameters stay moved, and the start follows them.
         moved[:, A : A + S] = 0.0
         # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
         begun = self._pass.build_start(moved) if start is None else start.build(moved, self._artificial)
-        counts = np.empty((B, 2), dtype=np.int64)
-        counts[:, 0], counts[:, 1] = births, rules.modes[kept.modes[:, 0]]
-        children, padded = np.empty((B, beam.births, len(Column)), dtype=np.int64), np.empty((B, beam.births))
-        if counts[:, 0].any():  # no others are read
-            children[:, :S], padded[:, :S] = self._pass.steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
-            children[:, :S, SLOT] = A + self._slots
-        p = self._parameters + moved[:, beam.births :]
         first = None if start is None else self.first
-        return beam.engine.replay(begun, p, counts, children, padded, last, first, recentres=recentres)
+        return self._pass.propagate(begun, kept, births, times, last, first, recentres=recentres)
 
     def polish(self) -> None:
         """Propagate the hypotheses that decide anew, from where they have moved."""
-        last = self.feed.count - 1
+        last = self.node
         if last <= self.first:
             return
-        kept, found = self.at(last)
+        kept, found = self.latest
         best = self.find_best(kept, self.value(kept.switches, found))
         chosen = np.array(sorted({b for b in best if b is not None}))
         own, moved = kept.take(chosen), found.moved[chosen]
@@ -563,8 +554,8 @@ class Tracker:
     def leave(self) -> None:
         """Move the start of the window to the next node."""
         feed, (_, S, A, _, _) = self.feed, self.settings
-        last, following = feed.count - 1, self.first + 1
-        kept, found = self.at(last)
+        following = self.first + 1
+        kept, found = self.latest
         b = int(self.value(kept.switches, found).argmin())
         own, moved = kept.take(slice(b, b + 1)), found.moved[b : b + 1].copy()
         end = float(feed.nodes[following])
@@ -586,34 +577,37 @@ class Tracker:
         self.start = Start(there.moved[0].copy(), float(there.costs[0]), g, H, x, Z)
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
-        self.behind -= moved[:, :A]
-        # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
-        for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
-            self._follow(node, pasts, modes, times[0, :gone], end)
+        self.shift = self.shift - moved[0, :A]
+        # Without a transition, hypotheses of earlier nodes that disagree are dropped once they have come to the last.
+        count, followed = (self.node - following + 1 if pasts else 1), deque[Kept](maxlen=KEPT)
+        while self.kept and len(followed) < count:
+            agreeing = self._follow(self.kept.pop(), pasts, modes, times[0, :gone], end)
+            if agreeing is None:
+                break
+            followed.appendleft(agreeing)
+        self.kept = followed if pasts else self.kept + followed
         self.first = following
         if gone:
             self.declared = self.declared[gone:]
 
-    def _follow(self, node: int, pasts: list[Past], modes: NDArray[np.int64], times: FloatArray, end: float) -> None:
-        """Drop the hypotheses of a node that disagree about what has left the window, and express the others by its
-        new start.
+    def _follow(
+        self, there: Kept, pasts: list[Past], modes: NDArray[np.int64], times: FloatArray, end: float
+    ) -> Kept | None:
+        """Return the hypotheses of a node that agree about what has left the window, by its new start; None without.
 
         Parameters
         ----------
-        node : int
+        there : Kept
         pasts : list of Past, for each of k transitions that have left
         modes, times : (k + 1,) int, (k,)
         end : float, time of the start
         """
-        place, A, k = (node + self.dropped) % KEPT, self.settings.entries, len(pasts)
-        there = self.kept[place]
-        if there is None:
-            return
-        kept, found = there
-        self.catch_up(place, found)
+        A, k = self.settings.entries, len(pasts)
+        there = self._catch_up(there)
+        kept, found, _ = there
         is_early = kept.times[:, 0] + found.moved[:, A] < end
         if not pasts and not kept.switches[is_early].any():
-            return
+            return there
         own = self.times(kept, found.moved)
         is_born = self._slots < kept.switches[:, None]
         # The same modes before the new start, at about the same times, and no birth of the others before it.
@@ -623,9 +617,8 @@ class Tracker:
         agrees &= ~(is_born & (own < end))[:, k:].any(1)
         chosen = np.flatnonzero(agrees)
         if not len(chosen):
-            self.kept[place] = None
-            return
-        kept, found = kept.take(chosen), self.beam.engine.view(found.records[chosen])
+            return None
+        kept, found, shift = self._keep(kept.take(chosen), found.records[chosen])
         # Times that have left are measured from those of the best hypothesis, at which the new start was made.
         found.moved[:, A : A + k] = own[chosen, :k] - times
         for past in pasts:
@@ -635,7 +628,7 @@ class Tracker:
             for array in rolled:
                 array[:, -k:] = 0
             kept = kept._replace(modes=rolled[0], times=rolled[1], switches=kept.switches - k)
-        self.keep(node, kept, found.records, np.arange(len(chosen)))
+        return Kept(kept, found, shift)
 
     def renew(self, chosen: NDArray[np.intp], variances: FloatArray) -> None:
         """Give parameters new values from the start of the window on, which differ from the old ones by `variances`.
@@ -653,7 +646,7 @@ class Tracker:
         begun = self._pass.build_start(center[None])  # of new values, their priors are known
         self.start.gradient[new] += begun.gradients[0, new]
         self.start.matrix[new, new] += (np.diag(begun.matrices[0]) - self.artificial)[new]
-        kept, found = self.at(self.feed.count - 1)
+        kept, found = self.latest
         found.moved[:, :A] = np.hstack([found.moved[:, :A], found.moved[:, chosen] - center[chosen]]) @ turn
         self.repeat(kept, found)
 
@@ -667,9 +660,9 @@ class Tracker:
         good = np.flatnonzero(np.isfinite(anew.scores))
         if not len(good):
             raise StoppedError(float(self.feed.nodes[self.first]))
-        self.kept = [None] * KEPT
-        kept = kept._replace(times=times, last=latest)
-        self.keep(last, kept.take(good), anew.records, good)
+        self.kept.clear()
+        self.kept.append(self._keep(kept._replace(times=times, last=latest).take(good), anew.records[good]))
+        self.node = last
 
     def _place_births(self, kept: Sequences, moved: FloatArray, end: float) -> tuple[FloatArray, FloatArray]:
         """Return where births have `moved` (B, D) between the start of the window and an end, in order, (B, S), and
@@ -687,29 +680,33 @@ class Tracker:
     def drop_nodes(self) -> None:
         """Give back the room of the nodes before the window."""
         self.feed.drop(self.first)
-        self.dropped += self.first
+        self.node -= self.first
         self.first = 0
 
     # --- files -----------------------------------------------------------------------------------------------------
 
+    @property
+    def _shape(self) -> list[int]:
+        """What has to be the same where the hypotheses are taken up again."""
+        return [self.settings.width, self.settings.births, self.beam.engine.record_size]
+
     def pack(self, others: dict[str, Any]) -> bytes:
         """Return all arrays, and other numbers, as a file."""
         arrays: dict[str, Any] = {f"feed {name}": array for name, array in self.feed.copy_arrays().items()}
-        for place, there in enumerate(self.kept):
-            if there is not None:
-                self.catch_up(place, there[1])
-                arrays |= {f"kept {place} {name}": array for name, array in there[0]._asdict().items()}
-        arrays |= {"records": self.records, "declared": self.declared}
+        for k, (sequences, found, shift) in enumerate(self.kept):
+            own = sequences._asdict() | {"records": found.records, "shift": shift}
+            arrays |= {f"kept {k} {name}": array for name, array in own.items()}
+        arrays |= {"shift": self.shift, "declared": self.declared, "shape": self._shape}
         if self.start is not None:
             arrays |= {f"start {name}": np.asarray(array) for name, array in self.start._asdict().items()}
-        numbers = others | {"format": FORMAT, "first": self.first, "dropped": self.dropped, "left": self.left}
+        numbers = others | {"format": FORMAT, "first": self.first, "node": self.node, "left": self.left}
         buffer = io.BytesIO()
         np.savez(buffer, numbers=np.frombuffer(json.dumps(numbers).encode(), dtype=np.uint8), **arrays)
         return buffer.getvalue()
 
     def unpack(self, numbers: dict[str, Any], arrays: dict[str, FloatArray], path: Path) -> None:
         """Take what was saved; ValueError if that is of another problem or other settings."""
-        if arrays["records"].shape != self.records.shape:
+        if arrays["shape"].tolist() != self._shape:
             raise ValueError(f"{path} was saved for another problem, or with other settings: give the same ones.")
 
         def part(name: str) -> dict[str, Any]:
@@ -717,14 +714,14 @@ class Tracker:
             return {key.removeprefix(begin): array for key, array in arrays.items() if key.startswith(begin)}
 
         self.feed.set_arrays(part("feed"))
-        self.records[:] = arrays["records"]
-        self.declared = arrays["declared"].astype(np.int64)
-        for place in range(len(self.kept)):
-            found = part(f"kept {place}")
-            self.kept[place] = self.view(place, Sequences(**found)) if found else None
+        self.declared, self.shift = arrays["declared"].astype(np.int64), arrays["shift"]
+        self.kept.clear()
+        while own := part(f"kept {len(self.kept)}"):
+            records, shift = own.pop("records"), own.pop("shift")
+            self.kept.append(Kept(Sequences(**own), self.beam.engine.view(records), shift))
         if start := part("start"):
             self.start = Start(**start)._replace(cost=float(start["cost"]))
-        self.first, self.dropped = numbers["first"], numbers["dropped"]
+        self.first, self.node = numbers["first"], numbers["node"]
         self.left = [Left(*each) for each in numbers["left"]]
 
 
@@ -751,7 +748,7 @@ def invert(matrix: FloatArray) -> FloatArray:
     return found
 
 
-FORMAT = "switchfit online 2"
+FORMAT = "switchfit online 3"
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
@@ -775,12 +772,16 @@ def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> Non
 
 
 def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
-    """Return the updates of a journal; the last one may have been cut off, and is left out then."""
+    """Return the updates of a journal, none without a file; a last one that was cut off is taken out of it."""
+    written = path.read_bytes() if path.exists() else b""
+    whole, _, cut_off = written.rpartition(b"\n")
     found = []
-    for line in path.read_bytes().split(b"\n")[:-1]:
+    for line in whole.splitlines():
         try:
             each = json.loads(line)
             found.append((each["t"], {int(k): values for k, values in each["y"].items()}, each["u"]))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} is not the journal of an online estimator ({error}).") from error
+    with path.open("ab") as file:
+        file.truncate(len(written) - len(cut_off))
     return found

@@ -142,10 +142,11 @@ class Quadratic(NamedTuple):
             g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
         return Quadratic(self.center[places], g, Q)
 
-    def cost(self, parameters: FloatArray) -> float:
-        """Return the cost of parameters and initial states (M,)."""
+    def evaluate(self, parameters: FloatArray) -> tuple[Any, FloatArray]:
+        """Return the cost of parameters and initial states (..., M), and its gradient."""
         step = parameters - self.center
-        return float(self.g @ step + 0.5 * step @ self.Q @ step)
+        rise = step @ self.Q
+        return ((self.g + 0.5 * rise) * step).sum(-1), self.g + rise
 
 
 class Proposal(NamedTuple):
@@ -223,10 +224,8 @@ def follow_order(
     found, run = prepare(problem, e), problem.experiments[e]
     modes = np.array([found.modes.index(mode) for mode in run.mode_sequence])
     shortest = np.array([get_min_duration(problem.min_duration, mode) for mode in run.mode_sequence])
-    count = len(modes) - 1
-    # A birth moves by up to the grid.
-    earliest, latest = found.limits[:count, 0] - found.grid, found.limits[:count, 1] + found.grid
-    rules = Rules.of_order(modes, shortest, earliest, latest)
+    reach = np.array([[-found.grid], [found.grid]])  # a birth moves by up to the grid
+    rules = Rules.of_order(modes, shortest, found.limits[: len(modes) - 1].T + reach)
     return found.run(rules, parameters, 0.0, PER_SEQUENCE * len(modes), replays, evidence)
 
 
@@ -459,10 +458,11 @@ class Pass:
     @cached_property
     def order(self) -> OrderTables | None:
         """The order of modes, where it is given; else None."""
-        rules, windows = self.rules, self.rules.list_windows()
-        if windows is None:
+        rules = self.rules
+        if rules.between is None:
             return None
-        places = np.arange(len(rules.modes))
+        places, windows = np.arange(len(rules.modes)), np.zeros((len(rules.modes), 4))
+        windows[:, 0], windows[:-1, 1:3], windows[:-1, 3] = rules.least, rules.between.T, rules.shortest[1:]
         children = self.steps[places, np.minimum(places + 1, places[-1])]
         children[:, SLOT] = places
         counts = np.zeros((2, len(places), 3), dtype=np.int64)
@@ -488,13 +488,25 @@ class Pass:
         # The births are where they have moved: from now on `moved` counts from there. The parameters go on from the
         # first p.
         moved[:, :S] = 0.0
-        children = self.steps[kept.modes[:, :-1], kept.modes[:, 1:]]
-        children[..., SLOT] = np.arange(S)
-        counts = np.empty((B, 2), dtype=np.int64)
-        counts[:, 0], counts[:, 1] = kept.switches, self.rules.modes[kept.modes[:, 0]]
-        p = self.parameters[beam.places] + moved[:, S:]
-        found = beam.engine.replay(self.build_start(moved), p, counts, children, times, stop)
+        found = self.propagate(self.build_start(moved), kept, kept.switches, times, stop)
         return kept._replace(times=times, last=last), found
+
+    def propagate(
+        self, start: Hypotheses, kept: Sequences, births: Any, times: FloatArray, stop: int, first: int | None = None,
+        *, recentres: bool = True,
+    ) -> Hypotheses:  # fmt: skip
+        """Return hypotheses from a start, at node `first` or at t0, anew to another node, with so many births (B,) at
+        times (B, S'), whose slots are the last ones.
+        """
+        beam, (B, S) = self.beam, times.shape
+        entries, counts = beam.births - S, np.empty((B, 2), dtype=np.int64)
+        counts[:, 0], counts[:, 1] = births, self.rules.modes[kept.modes[:, 0]]
+        children, padded = np.empty((B, beam.births, COLUMNS), dtype=np.int64), np.empty((B, beam.births))
+        if counts[:, 0].any():  # no others are read
+            children[:, :S], padded[:, :S] = self.steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
+            children[:, :S, SLOT] = entries + np.arange(S)
+        p = self.parameters[beam.places] + start.moved[:, beam.births :]
+        return beam.engine.replay(start, p, counts, children, padded, stop, first, recentres=recentres)
 
     def build_start(self, moved: FloatArray) -> Hypotheses:
         """Return the priors as B hypotheses that have `moved` (B, D): their J and g there, and H_0.
@@ -511,11 +523,8 @@ class Pass:
             J, g, h = beam.priors.evaluate(q, gauss_newton=True)
             matrices.reshape(B, D * D)[:, (D + 1) * beam.births :: D + 1] += h[:, beam.places]
         if self.evidence is not None:
-            # What other experiments say, J_e(q) = slope . (q - center) + (q - center)' Q (q - center) / 2, is not only
-            # curvature.
-            step = q - self.evidence.center
-            rise = step @ self.evidence.Q
-            J, g = J + ((self.evidence.g + 0.5 * rise) * step).sum(1), g + self.evidence.g + rise
+            rise, slope = self.evidence.evaluate(q)  # what other experiments say is not only curvature
+            J, g = J + rise, g + slope
         gradients[:, beam.births :] = g[:, beam.places]
         return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
 

@@ -21,7 +21,7 @@ from switchfit.fit.result import Step
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.problem import Problem, keep_with_problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
@@ -120,18 +120,12 @@ def is_explained(problem: Problem, cost: float, least: float = UNLIKELY) -> bool
     """
     items = [item for run in problem.experiments for item in run.data]
     if all(isinstance(item, ReferenceSignal) for item in items):
-        return cost <= (1 - NEARLY_ALL) * _compute_cost_of_means(problem)
+        return cost <= (1 - NEARLY_ALL) * float(measure_variation(problem).sum())
     if not (problem.is_sigma_known and problem.is_least_squares):
         return False
     count = sum(item.count for item in items if isinstance(item, Measurements))
     freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
     return freedom > 0 and bool(compare_with_sigma(2 * cost, freedom)[0] >= least)
-
-
-@keep_with_problem
-def _compute_cost_of_means(problem: Problem) -> float:
-    """Return J of references that are met by their means."""
-    return float(measure_variation(problem).sum())
 
 
 def is_doubted(fit: Estimate) -> bool:
@@ -433,17 +427,6 @@ class Search:
         size = self.problem.smallest_cost
         return max(LOWER * abs(cost), size if self.problem.is_least_squares else LOWER * size)
 
-    def _fit_at(self, theta: FloatArray, name: str) -> Estimate | None:
-        """Return the full fit from theta (d,), on meshes made for it; None where the model cannot be integrated there.
-
-        A short fit on the meshes of its start may end where the adaptive solve for new meshes gets stuck.
-        """
-        try:
-            return self.fit(theta, f"{name}, fit of its end", np.nan_to_num(self.first_cost))
-        except NotIntegrableError as error:
-            logger.info("the end of the strategy is no start of a fit: %s", error)
-            return None
-
     def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
         """Run one strategy; a full fit follows where its end is lower than the best so far. Return whether to go on."""
         began = time.perf_counter()
@@ -454,8 +437,8 @@ class Search:
         try:
             end = find(theta)
             evaluations = end.evaluations
-            fit = self._fit_at(end.theta, name) if self._is_lower(end.cost) else None
-            if fit is not None:
+            if self._is_lower(end.cost):
+                fit = self.fit(end.theta, f"{name}, fit of its end", np.nan_to_num(self.first_cost))
                 evaluations += fit.evaluations
                 if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                     self.best = fit

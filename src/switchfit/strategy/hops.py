@@ -167,19 +167,15 @@ def _minimize(
     """Return the lowest value of a quadratic model with the unknown at `place` between two values, and the step (d,);
     None if it has no minimum.
     """
-    step, places = np.zeros(len(gradient)), np.flatnonzero(free)
+    step, places = np.zeros(len(gradient)), np.flatnonzero(free | (np.arange(len(free)) == place))
     factor, step[places], failed = lapack.dposv(hessian[places[:, None], places], -gradient[places])
     if failed:
         return None
     if not low <= step[place] <= high:
         # Along the way on which the others follow the unknown to its limit.
-        away = np.clip(step[place], low, high) - step[place]
-        if free[place]:
-            along = lapack.dpotrs(factor, (places == place).astype(float))[0]
-            step[places] += along * (away / along[places == place])
-        else:
-            step[place] = away
-            step[places] -= lapack.dpotrs(factor, hessian[places, place] * away)[0]
+        away, is_it = np.clip(step[place], low, high) - step[place], places == place
+        along = lapack.dpotrs(factor, is_it.astype(float))[0]
+        step[places] += along * (away / along[is_it])
     return float((gradient + 0.5 * hessian @ step) @ step), step
 
 

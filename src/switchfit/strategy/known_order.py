@@ -70,13 +70,12 @@ class Beams:
             found.append([] if e in settled else follow_run(e, q, self._sum_others(e, q)))
             for best in found[e][:1]:
                 moved[own] = best.parameters[own]
-                self._add(e, best.evidence)
+                if best.evidence is not None:  # what the data of the run say about shared parameters
+                    mine, at = self._locate(e)
+                    center, g, Q = best.evidence.restrict(mine)
+                    self.matrices[e][np.ix_(at, at)], self.slopes[e][at] = Q, Q @ center - g
         moved[self.shared] = self.combine(q)[self.shared]
         return found, moved
-
-    def count_followed(self) -> int:
-        """Return of how many runs the data have said something about shared parameters."""
-        return int(np.any(self.matrices, axis=(1, 2)).sum())
 
     def join(self, found: Sequence[Sequence[Proposal]], q: FloatArray) -> list[Proposal]:
         """Return proposals for all runs together, at shared parameters of q (P,): the best of each run, then those in
@@ -86,10 +85,9 @@ class Beams:
             return []
         best = [proposals[0] for proposals in found]
         others = [[*best[:e], other, *best[e + 1 :]] for e, own in enumerate(found) for other in own[1:]]
-        return [self._join(chosen, q) for chosen in (best, *others)]
+        return [self._join(chosen, q.copy()) for chosen in (best, *others)]
 
-    def _join(self, chosen: Sequence[Proposal], q: FloatArray) -> Proposal:
-        moved = q.copy()
+    def _join(self, chosen: Sequence[Proposal], moved: FloatArray) -> Proposal:
         for own, proposal in zip(self.own, chosen, strict=True):
             private = np.setdiff1d(own, self.shared)
             moved[private] = proposal.parameters[private]
@@ -101,14 +99,6 @@ class Beams:
         """Return which of a run's parameters are shared, and their positions among the shared ones."""
         mine = np.flatnonzero(np.isin(self.own[e], self.shared))
         return mine, np.searchsorted(self.shared, self.own[e][mine])
-
-    def _add(self, e: int, evidence: Quadratic | None) -> None:
-        """Keep what the data of a run say about the shared parameters."""
-        if evidence is None:
-            return
-        mine, at = self._locate(e)
-        center, g, Q = evidence.restrict(mine)
-        self.matrices[e][np.ix_(at, at)], self.slopes[e][at] = Q, Q @ center - g
 
     def _sum_others(self, e: int, q: FloatArray) -> Quadratic | None:
         """Return what all other runs have said about a run's parameters so far, with 0 as its lowest cost.
@@ -212,7 +202,8 @@ def _follow_run(
     problem: Problem, beams: Beams, e: int, q: FloatArray, evidence: Quadratic | None, *, is_fitted: bool
 ) -> list[Proposal]:
     """Return the proposals of one run, from parameters q (P,) that are or are not those of a fit."""
-    if not len(beams.shared) or (not is_fitted and beams.count_followed() < KNOWN):
+    followed = np.any(beams.matrices, axis=(1, 2)).sum()  # runs that have said something about shared parameters
+    if not len(beams.shared) or (not is_fitted and followed < KNOWN):
         return follow_order(problem, e, q, evidence, REPLAYS_OF_ORDER)
     return follow_order(problem, e, q if is_fitted else beams.combine(q), evidence, REPLAYS)
 
@@ -229,7 +220,7 @@ def _list_settled(problem: Problem, beams: Beams, found: Sequence[Sequence[Propo
         for best in proposals[:1]:
             away = np.abs(end.theta[where] - best.transition_times[0])[where >= 0].max(initial=0.0)
             q = end.theta[beams.first + beams.own[e]]
-            rise = np.inf if best.evidence is None else best.evidence.cost(q)
+            rise = np.inf if best.evidence is None else best.evidence.evaluate(q)[0]
             if away < SETTLED * prepare(problem, e).grid and rise < len(q) * noise:
                 settled.add(e)
     return settled

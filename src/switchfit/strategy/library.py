@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint, TransitionCost
+from switchfit.problem.data import FloatArray, TerminalConstraint, TransitionCost
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, check_durations
 from switchfit.problem.structure import Function, Structure, select_kind, trace_structure
@@ -62,19 +62,12 @@ class Library:
             return False
         return all(self.allows(a, b) for a, b in pairwise(sequence))
 
-    def list_sequences(self, switches: int) -> Iterator[tuple[str, ...]]:
-        """Yield all sequences with that number of switches."""
-        for mode in self.first:
-            yield from self._continue((mode,), switches)
-
-    def _continue(self, prefix: tuple[str, ...], switches: int) -> Iterator[tuple[str, ...]]:
-        if prefix[-1] not in self.ends_after[switches]:
-            return
-        if switches == 0:
-            yield prefix
-            return
-        for mode in self.successions[prefix[-1]]:
-            yield from self._continue((*prefix, mode), switches - 1)
+    def list_sequences(self, switches: int, before: str | None = None) -> Iterator[tuple[str, ...]]:
+        """Yield all sequences with that number of switches, from the beginning or after a mode."""
+        for mode in self.first if before is None else self.successions[before]:
+            if mode in self.ends_after[switches]:
+                rest = self.list_sequences(switches - 1, mode) if switches else iter([()])
+                yield from ((mode, *modes) for modes in rest)
 
     @cached_property
     def ends_after(self) -> list[frozenset[str]]:
@@ -180,18 +173,16 @@ def refuse_unsupported(problem: Problem, e: int) -> None:
     """Raise ValueError for an experiment that a beam cannot follow."""
     run = problem.experiments[e]
     name = f"experiment {problem.run_names[e]!r}" if len(problem.experiments) > 1 else "the experiment"
-    late = [item.delay for item in select_kind(run.data, Measurements) if isinstance(item.delay, str)]
-    what = ""
-    if run.has_free_tf:
-        what = "a free tf: give tf a number"
-    elif late:
-        what = f"the delay {late[0]!r}, which is a parameter: give the delay a number"
-    elif select_kind(run.data, TerminalConstraint):
-        what = "terminal constraints: leave them out of the search"
-    if what:
-        raise ValueError(
-            f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'."
-        )
+    wrong = {
+        "a free tf: give tf a number": run.has_free_tf,
+        "a delay that is a parameter: give it a number": problem.estimates_delays,
+        "terminal constraints: leave them out of the search": bool(select_kind(run.data, TerminalConstraint)),
+    }
+    for what, is_there in wrong.items():
+        if is_there:
+            raise ValueError(
+                f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'."
+            )
 
 
 def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -> tuple[Function | None, ...]:
@@ -289,20 +280,20 @@ class Rules(NamedTuple):
         shortest = np.array([library.durations[mode] for mode in modes])
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
-        return cls(np.arange(len(modes)), shortest, begins, ends[0], _list_follows(allowed, ends), None)
+        follows = np.zeros((len(ends), *allowed.shape), dtype=bool)
+        follows[:-1] = allowed & ends[-2::-1, None]
+        return cls(np.arange(len(modes)), shortest, begins, ends[0], follows, None)
 
     @classmethod
-    def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:
+    def of_order(cls, modes: Integers, shortest: FloatArray, between: FloatArray) -> Rules:
         """Return the rules of a given order of modes (N + 1,), each of which lasts at least some time."""
         count = len(modes)
-        allowed = np.eye(count, k=1, dtype=bool)
-        first, last = np.zeros(1, dtype=np.int64), np.arange(count) == count - 1
-        ends = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
-        return cls(modes, shortest, first, last, _list_follows(allowed, ends), np.array([earliest, latest]))
+        follows = np.repeat(np.eye(count, k=1, dtype=bool)[None], count, axis=0)
+        return cls(modes, shortest, np.zeros(1, dtype=np.int64), np.arange(count) == count - 1, follows, between)
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
-        may_leave = t - kept.last >= self._list_least()[kept.mode]
+        may_leave = t - kept.last >= self.least[kept.mode]
         if self.between is not None and self.between.size:
             earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
             may_leave &= (earliest < t) & (t < latest)
@@ -312,26 +303,10 @@ class Rules(NamedTuple):
         parents, after = (follows & may_leave[:, None] & may_enter).nonzero()
         return parents, after
 
-    def list_windows(self) -> FloatArray | None:
-        """Return what limits when places of a given order are left, see `OrderTables`; None without such an order."""
-        if self.between is None:
-            return None
-        limits = np.zeros((len(self.modes), 4))
-        limits[:, 0], limits[:-1, 1:3], limits[:-1, 3] = self._list_least(), self.between.T, self.shortest[1:]
-        return limits
-
-    def _list_least(self) -> FloatArray:
-        """Return how long a hypothesis stays in each place: its mode's shortest time, and more than an instant."""
+    @property
+    def least(self) -> FloatArray:
+        """How long a hypothesis stays in each place, (K,): its mode's shortest time, and more than an instant."""
         return np.maximum(self.shortest * (1 - 1e-9), SMALLEST)
-
-
-def _list_follows(allowed: NDArray[np.bool_], ends: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which places may follow each, (most + 1, K, K), from those `allowed` after each, and those (most + 1, K)
-    from which a sequence can end within so many more switches.
-    """
-    found = np.zeros((len(ends), *allowed.shape), dtype=bool)
-    found[:-1] = allowed & ends[-2::-1, None]
-    return found
 
 
 class Sequences(NamedTuple):

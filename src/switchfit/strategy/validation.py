@@ -219,11 +219,14 @@ def whiten_residuals(
     freedom = sum(item.count for item in problem.measurements)
     Z = np.zeros((d, 0))
     if refit is not None:
-        where = _find_places(problem, refit)
+        where = np.flatnonzero(np.isin(problem.theta_names, refit.theta_names))
         Z = np.zeros((d, refit.free_basis.shape[1]))
         Z[where] = refit.free_basis
         freedom += len(refit.priors) - Z.shape[1]
-    C = _expand_covariance(estimate, kept, d)
+    here = [i for name, i in kept.items() if name in estimate.theta_names]
+    there = [estimate.theta_names.index(problem.theta_names[i]) for i in here]
+    C = np.zeros((d, d))
+    C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
     # Residuals over sigma are then no normal numbers, or their derivatives are not known. A sigma may be a parameter.
     robust = any(item.loss != "linear" for item in problem.measurements) or problem.estimates_delays
     if robust or problem.is_sigma_known is None or not (np.isfinite(C).all() and np.isfinite(noise)):
@@ -238,9 +241,8 @@ def whiten_residuals(
     for e, run in enumerate(comparisons):
         measured = [k for k, c in enumerate(run) if c.kind == "measurements"]
         for k, item in enumerate(measured):
-            there = np.isfinite(run[item].residuals)
-            here = (samples.experiment == e) & (samples.item == k)
-            found[e][item][there] = (z[: len(sigma)] * sigma)[here]
+            own = (samples.experiment == e) & (samples.item == k)
+            found[e][item][np.isfinite(run[item].residuals)] = (z[: len(sigma)] * sigma)[own]
     if refit is not None:
         # The exact Hessian, as of any fit: a transition time at which the vector field does not jump has no first
         # derivative, and would have no error.
@@ -280,27 +282,13 @@ def _remove_error(
 
 def _weigh_priors(problem: Problem, refit: Estimate) -> tuple[FloatArray, FloatArray]:
     """Return the priors of own unknowns as further residuals: their derivatives (m, d), and their values (m,)."""
-    where = np.array(_find_places(problem, refit))
+    where = np.flatnonzero(np.isin(problem.theta_names, refit.theta_names))
     priors = PriorTerms(*(values[where] for values in problem.unknowns.priors))
     _, g, h = priors.evaluate(refit.theta, gauss_newton=True)  # of r = g / sqrt(h), whose derivative is sqrt(h)
     has, root = h > 0, np.sqrt(h[h > 0])
     rows = np.zeros((len(root), len(problem.theta_names)))
     rows[np.arange(len(root)), where[has]] = root
     return rows, g[has] / root
-
-
-def _find_places(problem: Problem, refit: Estimate) -> list[int]:
-    """Return where the unknowns that were estimated are in theta."""
-    return [problem.theta_names.index(name) for name in refit.theta_names]
-
-
-def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:
-    """Return the covariance of the parameters of a fit at their places in another theta: (d, d)."""
-    shared = {name: i for name, i in kept.items() if name in estimate.theta_names}
-    here, there = list(shared.values()), [estimate.theta_names.index(name) for name in shared]
-    C = np.zeros((d, d))
-    C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
-    return C
 
 
 class InputCorrelation(NamedTuple):
@@ -561,8 +549,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     if asked:
         held = [name for name in problem.theta_names if name not in asked]
         found = fit_problem(fix_unknowns(problem, held))
-        places = [problem.theta_names.index(name) for name in found.theta_names]
-        theta[places] = found.theta
+        theta[np.isin(problem.theta_names, found.theta_names)] = found.theta
     evaluator = Evaluator(problem, theta)
     trajectories, comparisons = compare(evaluator, theta)
     sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
