@@ -33,14 +33,14 @@ def init(name: NewFolder, log: FirstLog = None) -> None:
     the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
     estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
     """
-    from switchfit.io.command_line import describe_experiments
     from switchfit.io.problem_file.writing import write_first_problem
+    from switchfit.report.text import write_experiments
 
     folder = Path(name)
     written = write_first_problem(folder, log)
     loaded = terminal.load(folder / "problem.toml")
     terminal.print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
-    terminal.print_text(describe_experiments(loaded.problem.experiments))
+    terminal.print_text(write_experiments(loaded.problem.experiments))
     terminal.print_text(
         f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
         f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
@@ -130,13 +130,14 @@ def check(
         return
     loaded = terminal.load(problem)
     from switchfit.fit.evaluator import evaluator_of
-    from switchfit.io.command_line import describe, describe_steps, summarize_check
+    from switchfit.io.command_line import summarize_check
+    from switchfit.report.text import write_problem, write_steps
     from switchfit.report.uncertainty import write_orders
 
-    terminal.print_text(f"{describe(loaded.problem, full=full)}\n")
+    terminal.print_text(f"{write_problem(loaded.problem, full=full)}\n")
     terminal.print_list("Logs", loaded.issues)
-    terminal.print_text(f"{describe_steps(loaded.problem, full=full)}\n")
     evaluator = evaluator_of(loaded.problem)
+    terminal.print_text(f"{write_steps(evaluator, full=full)}\n")
     if terminal.is_asked("verbose"):
         terminal.print_note(evaluator.engine)
     derivatives = sf.check_derivatives(loaded.problem, paper=full)
@@ -157,10 +158,10 @@ def _check_files(problem: Path, full: bool) -> None:
     from switchfit.io.problem_file import read_experiments
 
     runs = read_experiments(problem)
-    from switchfit.io.command_line import describe_experiments
+    from switchfit.report.text import write_experiments
 
     if runs.experiments:
-        terminal.print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
+        terminal.print_text(f"{write_experiments(runs.experiments, full=full)}\n")
         terminal.print_list("Logs", runs.issues)
     terminal.print_text("No Python file was run: modes, states, functions and names of parameters are not checked.")
     names = [run.name for run in runs.experiments]

@@ -15,18 +15,15 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.experiment_design import Design, DesignRecord
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.io.logs import find_logs, name_files
 from switchfit.modes.result import ModeSearch
 from switchfit.online.state import Now
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import as_date
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.parameter import unit_suffix
-from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Structure
 from switchfit.problem.validation import shorten
 from switchfit.report import formats
 from switchfit.report.frames import ERROR
@@ -106,138 +103,6 @@ def _fill(y: Any) -> Any:
     if isinstance(y, dict):
         return {name: np.nan if value is None else value for name, value in y.items()}
     return [np.nan if value is None else value for value in y] if isinstance(y, list) else y
-
-
-MOST_EXPERIMENTS = 3
-"""Experiments that are described on one screen."""
-
-MOST_UNKNOWNS = 10
-
-
-def describe(problem: Problem, *, full: bool = False) -> str:
-    """Return experiments, data and unknowns of a problem as text.
-
-    Parameters
-    ----------
-    problem : Problem
-    full : bool
-        All of them, not one screen.
-    """
-    unknowns, rows = problem.unknowns, []
-    numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
-    columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
-    dated = formats.list_dated(problem)
-    for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
-        first, least, most = (formats.format_time(number, run) for number in (value, lower, upper))
-        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{least}, {most}]"
-        known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
-        rows.append((name, f"{first}{'' if run else unit_suffix(unit)}", bounds, known, scale))
-    if not full and len(rows) > MOST_UNKNOWNS:
-        left = len(rows) - MOST_UNKNOWNS + 2
-        rows[-left:] = [(f"and {left} more", "", "", "", "")]
-    experiments = describe_experiments(problem.experiments, full=full)
-    return "\n".join([experiments, "Unknowns, first guess and bounds", *formats.format_table(rows, "<<<<<")])
-
-
-def describe_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
-    """Return modes, horizon and data of experiments as text.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    full : bool
-        All of them, not one screen.
-    """
-    shown = experiments if full else experiments[:MOST_EXPERIMENTS]
-    lines = []
-    for k, experiment in enumerate(shown, start=1):
-        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
-        lines += [f"  {line}" for line in _describe_experiment(experiment)]
-    if left := len(experiments) - len(shown):
-        lines.append(f"and {left} more experiments: --full lists them")
-    return "\n".join(lines)
-
-
-def describe_steps(problem: Problem, *, full: bool = False) -> str:
-    """Return which steps the integrator takes in each experiment at the first guess, how many, and why, as text.
-
-    Parameters
-    ----------
-    problem : Problem
-    full : bool
-        For all of them, not one screen.
-
-    Raises
-    ------
-    ValueError
-        If the model cannot be integrated at the guess.
-    """
-    evaluator = evaluator_of(problem)
-    rows = []
-    for name, structure, mesh in zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True):
-        run = "" if len(problem.experiments) == 1 else f"{name}: "
-        rows.append("; ".join([f"  {run}{mesh.cells:,} {_describe_method(structure)}", *map(str, mesh.stiffness)]))
-    if not full and len(rows) > MOST_EXPERIMENTS:
-        total = sum(mesh.cells for mesh in evaluator.meshes)
-        rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
-    return "\n".join(["Integration at the first guess", *rows])
-
-
-def _describe_method(structure: Structure) -> str:
-    """Return the kind of steps that the modes take, with the names of the implicit ones if they are not all."""
-    implicit = structure.list_implicit_modes()
-    if not implicit:
-        return "explicit steps"
-    if structure.has_one_method:
-        return "implicit steps"
-    return f"steps, implicit ones in {' and '.join(map(repr, implicit))}, else explicit"
-
-
-def _describe_experiment(experiment: Experiment) -> list[str]:
-    unit = formats.suffix_time(experiment)
-    ends = experiment.ends_of_modes(experiment.initial_times)
-    start, *times, end = (formats.format_time(time, experiment) for time in ends)
-    sequence = f"{' -> '.join(experiment.mode_sequence)} on [{start}, {end}]{unit}"
-    if experiment.has_free_tf:
-        sequence += " (tf is estimated)"
-    if experiment.taken_from_data:
-        sequence += f" ({' and '.join(experiment.taken_from_data)} from the data)"
-    lines = [f"{sequence}, at {', '.join(times)}{unit}" if times else sequence]
-    lines.append(formats.list_jumps(experiment.jump_times, experiment))
-    lines += [f"times in {text}"] if (text := formats.describe_origin(experiment)) else []
-    lines += [_describe_data(item, experiment) for item in experiment.data]
-    return [line for line in lines if line]
-
-
-def _describe_data(item: Any, experiment: Experiment) -> str:
-    """Return the channels of data, their span and number, and what is known of the sensor."""
-    if isinstance(item, ReferenceSignal):
-        knots, names = item.signal.knots, _join_channel_names(item.names, item.units, item.signal.channels)
-        span = formats.format_span(knots[0], knots[-1], experiment)
-        return f"reference signal of {names}, {span}, {len(knots)} knots"
-    if not isinstance(item, Measurements):
-        return type(item).__name__
-    unit = unit_suffix(experiment.time_unit)
-    step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
-    named = sorted({name for name in item.sigma_names if name})
-    said = [
-        f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}",
-        formats.format_span(item.times[0], item.times[-1], experiment),
-        f"typically {step:.4g}{unit} apart",
-        f"{item.values.size - item.count} values missing",
-        f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",
-        "noise unknown" if item.sigma is None else "",
-        f"sigma: {', '.join(named)}" if named else "",
-        f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
-    ]
-    return ", ".join(filter(None, said))
-
-
-def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
-    """Return names with their units, or the number of channels where they have no names."""
-    if names is None:
-        return f"{channels} channels"
-    return ", ".join(map(formats.label_quantity, names, units or ("",) * channels))
 
 
 KEYS = {
@@ -719,12 +584,6 @@ def write_logs(rows: Sequence[Mapping[str, Any]], path: Path) -> str | bytes:
         return write_rows(rows, columns)
     import pyarrow.parquet
 
-    def find_unit(column: str) -> str:  # of an unknown, which has it in parentheses
-        name = column.removesuffix(ERROR.format(""))
-        return name[:-1].rpartition(" (")[2] if ERROR.format(name) in columns and name.endswith(")") else ""
-
     table, file = pyarrow.table({name: [row.get(name) for row in rows] for name in columns}), io.BytesIO()
-    units = map(find_unit, columns)
-    fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
-    pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
+    pyarrow.parquet.write_table(table, file)
     return file.getvalue()

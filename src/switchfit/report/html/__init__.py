@@ -12,22 +12,17 @@ import io
 from html import escape
 from typing import Any
 
-import numpy as np
-
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
 from switchfit.problem.problem import Problem
-from switchfit.report.formats import describe_origin, format_span, format_table, format_time, format_unit, list_dated
 from switchfit.runtime.errors import MissingExtraError
-from switchfit.runtime.presentation import Displayed, format_html, format_page
+from switchfit.runtime.presentation import Displayed, format_html, format_page, format_text
 from switchfit.uncertainty.prediction import Prediction
 
 DOTS = 64
 """Dots per inch of the figures in a notebook."""
 LARGEST_FIGURE = 4
 """Experiments or outputs up to which a result shows its figure; with more of them it is no small one."""
-MOST_ROWS = 20
-"""Experiments or unknowns of a problem in a table."""
 
 
 @format_page.register(Estimate)
@@ -84,19 +79,4 @@ def show_problem(problem: Problem) -> str:
     ----------
     problem : Problem
     """
-    runs, rows = [], []
-    for name, experiment in zip(problem.run_names, problem.experiments, strict=True):
-        ends = experiment.ends_of_modes(experiment.initial_times)
-        samples = sum(getattr(item, "count", 0) for item in experiment.data)
-        horizon = f"{format_span(ends[0], ends[-1], experiment)} {describe_origin(experiment)}".rstrip()
-        runs.append([name, " -> ".join(experiment.mode_sequence), horizon, f"{samples}" if samples else ""])
-    own = problem.unknowns
-    columns = zip(own.names, own.initial, own.lower, own.upper, own.units, own.priors.texts(), strict=True)
-    for run, (name, value, lower, upper, unit, prior) in zip(list_dated(problem), columns, strict=True):
-        bounds = [format_time(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
-        rows.append([name, format_time(value, run), *bounds, "" if run else format_unit(unit), prior])
-    lines = format_table(runs, "<<<>", ["experiment", "modes", "horizon", "samples"], most=MOST_ROWS)
-    titles = ["unknown", "first guess", "lower", "upper", "", "prior"]
-    lines += ["", *format_table(rows, "<>>><<", titles, most=MOST_ROWS)]
-    text = escape("\n".join(lines))
-    return f"<div><pre>{text}</pre></div>"
+    return f"<div><pre>{escape(format_text(problem))}</pre></div>"
