@@ -157,7 +157,6 @@ def test_compare_says_what_compare_of_the_estimates_says(project):
     assert (result.exit_code, result.stdout) == (0, f"{expected}\n")
     assert result.stdout.startswith("problem has the smallest BIC")
     assert (project / "cmp" / "comparison.txt").read_text() == result.stdout
-    assert (project / "cmp" / "comparison.png").read_bytes().startswith(b"\x89PNG")
     found = json.loads(succeed("compare", NEVER, FIT, "--json"))  # the best model comes first
     assert [(row["name"], row["bic"]) for row in found["models"]] == list(zip(names, expected.bic, strict=True))
     assert (found["best"], found["values"]) == ("problem", 23)

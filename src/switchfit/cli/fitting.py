@@ -314,7 +314,7 @@ SavedPaths = Annotated[
     list[Path],
     argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", exists=True, dir_okay=False),
 ]
-ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
+ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt")]
 
 
 @terminal.command("json", "quiet")
@@ -355,7 +355,6 @@ def compare(
     saved: SavedPaths,
     out: ComparisonFolder = None,
     folder: terminal.Folder = None,
-    figures: terminal.FigureFormat = "png",
 ) -> None:
     """Compare models that were fitted to the same data.
 
@@ -378,7 +377,7 @@ def compare(
         changes += [f"{name}: {change}" for change in changed]
     terminal.print_list("Changed since", changes)
     found = sf.compare(estimates, names=names)
-    terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", figures)
+    terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", "")
     failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
     if failed:
         terminal.end_unreliable(

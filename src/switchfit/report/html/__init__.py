@@ -57,13 +57,12 @@ def show_result(result: Any) -> str:
     Parameters
     ----------
     result : object
-        With a method ``plot()``.
     """
     is_forecast = isinstance(result, Prediction)
     size = len(result.output_names if is_forecast else getattr(result, "trajectories", ()))
     is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
     image = ""
-    if not is_empty and size <= LARGEST_FIGURE:
+    if hasattr(result, "plot") and not is_empty and size <= LARGEST_FIGURE:
         picture = io.BytesIO()
         result.plot().savefig(picture, format="png", dpi=DOTS)
         source = f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"
