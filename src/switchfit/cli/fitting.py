@@ -86,12 +86,11 @@ def fit(
     estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
     write_estimate(estimate, loaded, output)
     from switchfit.io.command_line import summarize_estimate
-    from switchfit.report.formats import add_dates
 
     terminal.print_json(summarize_estimate(estimate) | {"out": out})
     terminal.fail_for_refused(loaded.issues)
     if not estimate.status.successful:
-        terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
+        terminal.end_unreliable(f"not converged. {estimate.message}")
     if not estimate.success:
         terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
@@ -134,9 +133,8 @@ class Output:
 def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.io.command_line import list_tables
-    from switchfit.report.formats import add_dates
 
-    checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
+    checked = f"\n\nCertificate\n{estimate.certificate}" if output.certificate else ""
     folder, files = output.folder, {}
     if folder is not None:
         files = {name: (folder / f"{name}.csv", table) for name, table in list_tables(estimate).items()}

@@ -128,8 +128,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
         "converged": estimate.status.successful,
-        "message": formats.add_dates(estimate.message, estimate),
-        **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
+        **_pick(estimate, "message", "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
         "unknowns": [{KEYS.get(name, name): cell for name, cell in row.items()} for row in list_unknowns(estimate)],
@@ -529,7 +528,7 @@ def describe_fit(log: str, estimate: Estimate | None, error: str) -> dict[str, A
     """
     if estimate is None:
         return {"log": log, "verdict": "refused", "message": error}
-    message = "" if estimate.status.successful else formats.add_dates(estimate.message, estimate)
+    message = "" if estimate.status.successful else estimate.message
     if not message and not estimate.success:
         message = write_reason(estimate.verdict.reasons[0])
     quality, trajectory = measure_quality(estimate), estimate.trajectories[0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, Step, disagreement
+from switchfit.fit.result import Fit, Step
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
@@ -30,10 +30,10 @@ from switchfit.report.formats import (
 from switchfit.report.frames import list_holds
 from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
-from switchfit.runtime.presentation import format_count, format_text
+from switchfit.runtime.presentation import format_count, format_text, join_first
 from switchfit.uncertainty.certificate import WEAK
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel, list_channels
-from switchfit.uncertainty.verdict import DIFFERENT, find_issues
+from switchfit.uncertainty.verdict import find_issues
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which the report calls it asymmetric."""
@@ -50,15 +50,6 @@ SCREEN = {"experiments": 3, "channels": 6, "unknowns": 10, "fixed": 4, "directio
 
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
-METHODS = {
-    "auto": "SQP with the exact Hessian in a trust region",
-    "exact": "SQP with the exact Hessian and a line search",
-    "descent-first": "steepest descent until the Hessian is positive definite, then SQP with it",
-    "block-diagonal": "SQP with the block-diagonal Hessian",
-    "gauss-newton": "SQP with the Gauss-Newton matrix",
-    "none": "steepest descent",
-    "sharp": "SQP with the Gauss-Newton matrix, since the model is sharp",
-}
 
 
 @format_text.register(Estimate)
@@ -144,13 +135,13 @@ def _format_data(comparison: Comparison) -> str:
 
 
 def list_course(fit: Fit) -> list[Row]:
-    """Return the method, the effort, the engine, the strategies with the lowest J after each, and how the fit ended.
+    """Return the kind of Hessian, the effort, the engine, the strategies with the lowest J after each, and how the fit ended.
 
     Parameters
     ----------
     fit : Fit
     """
-    rows = [("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))]
+    rows = [("method", f"SQP, hessian = {fit.hessian_kind!r}")]
     iterations, evaluations = format_count(fit.iterations, "iteration"), format_count(fit.evaluations, "evaluation")
     effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
     if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
@@ -161,7 +152,7 @@ def list_course(fit: Fit) -> list[Row]:
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
         rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
-    return [*rows, ("status", formats.add_dates(fit.message, fit))]
+    return [*rows, ("status", fit.message)]
 
 
 _ENDED = {
@@ -296,8 +287,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
     has_sandwich = isinstance(fit, Estimate) and fit.has_sandwich
     other = ": covariance_from('sandwich') does not." if has_sandwich else "."
-    exact = f"the exact Hessian{_compare_covariances(fit)}"
-    matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else exact
+    matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else "the exact Hessian"
     return table, f"Standard errors from {matrix}.{ROBUST + other if robust else ''}"
 
 
@@ -332,14 +322,6 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
     return formats.select_unknowns(fit.is_time.tolist(), most, marked)
 
 
-def _compare_covariances(fit: Fit) -> str:
-    """Return how the standard errors from the Gauss-Newton matrix compare; "" if that is unknown or a warning."""
-    found = disagreement(fit)
-    if found is None:
-        return ""
-    return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
-
-
 def _mark_unknown(fit: Fit, name: str) -> str:
     """Return what holds an unknown, in capitals; "" if nothing does."""
     held = "mode does not occur" if name in fit.absent else next(list_holds(fit, name), "")
@@ -360,11 +342,9 @@ def tabulate_fixed(fit: Fit) -> Table:
         time, unit = format_time(t.time, run, digits=8), format_unit(t.unit) if run.origin is None else ""
         rows.append([t.name, time, unit, f"{t.before} -> {t.after}"])
     for name in fit.fixed:
-        text = np.array2string(
-            np.asarray(fit.parameters[name]), threshold=6, edgeitems=2, separator=", ",
-            formatter={"float_kind": lambda number: f"{number:.8g}"},
-        )  # fmt: skip
-        rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
+        numbers = [f"{number:.8g}" for number in np.ravel(fit.parameters[name])]
+        text = join_first(numbers) if len(numbers) == 1 else f"[{join_first(numbers)}]"
+        rows.append([name, text, format_unit(fit.parameter_units[name]), ""])
     return Table(rows, "<<<<")
 
 
@@ -421,7 +401,7 @@ def list_warnings(estimate: Estimate) -> list[str]:
     """
     reasons = {reason.kind for reason in estimate.verdict.reasons}
     covered = reasons.union(*(_COVERED.get(kind, set()) for kind in reasons))
-    return [formats.add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
+    return [str(issue) for issue in find_issues(estimate) if issue.kind not in covered]
 
 
 # --- a problem before its fit -----------------------------------------------------------------------------------------

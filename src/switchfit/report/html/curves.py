@@ -24,11 +24,10 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
-from switchfit.report.formats import describe_clock, format_estimate, format_unit, get_unit, list_dated
+from switchfit.report.formats import describe_clock, format_unit, get_unit, list_dated
 from switchfit.report.plot import find_plane, has_bands, replace_infinities
-from switchfit.report.text import format_end
 from switchfit.uncertainty.prediction import Points, predict
-from switchfit.uncertainty.residuals import correct_errors, find_transition_intervals
+from switchfit.uncertainty.residuals import find_transition_intervals
 
 MOST_POINTS, FEWEST_POINTS = 800, 80
 """Points of one curve: with more of them a figure looks the same."""
@@ -240,26 +239,18 @@ def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
 
 
 def list_transitions(fit: Fit, e: int) -> Columns:
-    """Return the transitions of one run: x, ends of the interval, both as the table has them, places in theta.
+    """Return the transitions of one run: x, the ends of its interval, names, places in theta.
 
     Parameters
     ----------
     fit : Fit
     e : int, from 0
     """
-    errors, run, intervals = correct_errors(fit), fit.trajectories[e], find_transition_intervals(fit, e)
+    low, high = find_transition_intervals(fit, e).T
     own = [t for t in fit.transitions if t.experiment == e]
-    values, shown = [], []
-    for t, ends in zip(own, intervals, strict=True):
-        value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], run)
-        unit = format_unit(t.unit) if run.origin is None or error else ""
-        values.append(" ".join(filter(None, (value, error, unit))))
-        low, high = (format_end(end, ends, run) for end in ends)
-        shown.append(f"{low} to {high}" if low and high else "not known")
-    numbers = {"x": np.array([t.time for t in own], dtype=float), "low": intervals[:, 0], "high": intervals[:, 1]}
-    words: dict[str, Any] = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
-    words |= {"value": values, "interval": shown}
-    return {**numbers, **words, "place": [-1 if t.index is None else t.index for t in own]}
+    words = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
+    times = np.array([t.time for t in own], dtype=float)
+    return {"x": times, "low": low, "high": high, **words, "place": [-1 if t.index is None else t.index for t in own]}
 
 
 SIDE_POINTS = 20

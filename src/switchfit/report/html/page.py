@@ -33,7 +33,7 @@ from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.formats import Timed, add_dates, describe_clock, format_span, label_quantity, label_time
+from switchfit.report.formats import Timed, describe_clock, format_span, label_quantity, label_time
 from switchfit.report.html.curves import (
     Columns,
     Curves,
@@ -146,8 +146,7 @@ def _make_time_figure(
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
     line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
     if height > RESIDUAL_HEIGHT:
-        tips = [("transition", "@name"), ("modes", "@modes"), ("time", "@value"), ("95 %", "@interval")]
-        _add_hover(plot, line, tips)
+        _add_hover(plot, line, [("transition", "@name"), ("modes", "@modes")])
     return plot
 
 
@@ -273,7 +272,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    functions: list[Any] = [add_dates, certify, find_issues, format_span, join_words, list_reasons, unit_suffix]
+    functions: list[Any] = [certify, find_issues, format_span, join_words, list_reasons, unit_suffix]
     functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
     environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
