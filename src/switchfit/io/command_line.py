@@ -6,7 +6,7 @@ import contextlib
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,6 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.experiment_design import Design, DesignRecord
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.io.logs import find_logs, name_files
 from switchfit.modes.result import ModeSearch
@@ -34,7 +33,7 @@ from switchfit.runtime.frames import describe_frame
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.certificate import DerivativeCheck, Identifiability
-from switchfit.uncertainty.residuals import UNLIKELY, ChannelQuality, measure_quality
+from switchfit.uncertainty.residuals import measure_quality
 from switchfit.uncertainty.verdict import Verdict
 
 MOST_TIMES = 10_000_000
@@ -385,7 +384,6 @@ def write_runs(estimate: Estimate) -> str:
             "values": sum(channel.count for channel in here),
             "chi2": sum(channel.chi_square for channel in here) if here else np.nan,
             "explained": min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan),
-            "flags": "; ".join(_list_flags(estimate, name, here, len(quality.channels))),
         }
         if trajectory.origin is not None:
             row["origin"] = trajectory.origin.date
@@ -423,18 +421,6 @@ def write_trajectories(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
         for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
             table.writerow([name, t, *([date] if dated else []), mode, *x])
     return text.getvalue()
-
-
-def _list_flags(fit: Fit, run: str, channels: Sequence[ChannelQuality], tested: int) -> Iterator[str]:
-    """Yield the flags of a run; the false alarms of chi-square are shared among all channels `tested`."""
-    words = {"model": "residuals of {} correlated", "outliers": "outliers in {}", "sigma": "chi2 of {} too large"}
-    for channel in channels:
-        failed = [name for name, probability in channel.tests.items() if probability * tested < UNLIKELY]
-        yield from (words[name].format(channel.label) for name in failed)
-    for constraint in fit.active:
-        if constraint.position is not None and constraint.run == run:
-            state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
-            yield f"mode {constraint.mode} {state}"
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], columns: Iterable[str] = ()) -> str:
