@@ -169,39 +169,27 @@ def _check_files(problem: Path, full: bool) -> None:
     terminal.fail_for_refused(runs.issues)
 
 
-OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
+OutputFile = Annotated[Path, option("--out", metavar="FILE.csv", help="CSV file to write.")]
 Times = Annotated[
     str,
     option(metavar="STEP", help="A step, such as 0.1, or 'samples': times of the data. Default: the integrator's."),
 ]
 
 
-@terminal.command("json", "quiet")
-def simulate(
-    problem: terminal.ProblemPath,
-    out: OutputFile = None,
-    times: Times = "",
-) -> None:
+@terminal.command("quiet")
+def simulate(problem: terminal.ProblemPath, out: OutputFile, times: Times = "") -> None:
     """Integrate the model at the first guess.
 
     Writes times, modes and states as CSV. The column of times is named t, or for example "t (min)" if the
     experiments' time_unit is "min" instead of "s". Where times are dates, a column "date" has them, in the time zone of
     the experiment.
     """
-    if out is None and not terminal.is_asked("json"):
-        terminal.fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
     loaded = terminal.load(problem)
-    from switchfit.io.command_line import choose_times, tabulate_trajectory
+    from switchfit.io.command_line import choose_times, write_trajectories
 
     given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
     runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
-    names = loaded.problem.run_names
-    terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
-    if out is None:
-        return
-    from switchfit.io.command_line import write_trajectories
-
-    table = write_trajectories(names, runs)
+    table = write_trajectories(loaded.problem.run_names, runs)
     terminal.make_folder(out.parent)
     write_atomically(table, out)
 

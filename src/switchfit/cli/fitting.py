@@ -135,19 +135,15 @@ def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: 
     from switchfit.io.command_line import list_tables
 
     checked = f"\n\nCertificate\n{estimate.certificate}" if output.certificate else ""
-    folder, files = output.folder, {}
-    if folder is not None:
-        files = {name: (folder / f"{name}.csv", table) for name, table in list_tables(estimate).items()}
-    paths = {name: str(path) for name, (path, _) in files.items()}
     # The report after the certificate, which is part of the verdict.
-    report = f"{format_text(estimate, full=output.full, files=paths)}{checked}"
+    report, folder = f"{format_text(estimate, full=output.full)}{checked}", output.folder
     if show:
         terminal.print_text(report)
     if folder is None:
         return
     write_atomically(report + "\n", folder / "report.txt")
-    for path, table in files.values():
-        write_atomically(table, path)
+    for name, table in list_tables(estimate).items():
+        write_atomically(table, folder / f"{name}.csv")
     provenance = estimate.describe_provenance(replace(loaded.provenance, options=loaded.options))
     _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:

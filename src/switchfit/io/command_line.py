@@ -182,23 +182,6 @@ def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
     return found | {"origin": trajectory.origin.date, "jump_dates": dates}
 
 
-def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
-    """Return all nodes of a trajectory.
-
-    Parameters
-    ----------
-    name : str
-    trajectory : Trajectory
-    """
-    names = trajectory.state_names
-    return {
-        "name": name,
-        **_pick(trajectory, "time_unit", "times", "modes"),
-        "states": dict(zip(names, trajectory.states.T, strict=True)),
-        "units": dict(zip(names, trajectory.state_units, strict=True)),
-    }
-
-
 def summarize_validation(found: Validation) -> dict[str, Any]:
     """Return how well the parameters of a fit predict another run; standard errors allow for correlated residuals.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,7 @@ SMALL_CORRELATION = 0.1
 
 
 @format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
+def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
     """Return the report: the verdict, the problem, the course of the fit, its quality, the unknowns, the warnings.
 
     Parameters
@@ -63,8 +63,6 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     full : bool
         All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
         screen.
-    files : mapping of str to str, optional
-        Names of the files with all "runs" and all "unknowns", for the lines that count what was left out.
 
     Returns
     -------
@@ -72,15 +70,13 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
         Several lines without a newline at the end; the verdict first.
     """
     limits = dict.fromkeys(SCREEN, sys.maxsize) if full else SCREEN
-    runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    course = [*list_experiments(estimate, limits["experiments"], runs), *list_course(estimate)]
-    where = f", of which more is explained{runs}"
-    channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=where)
+    course = [*list_experiments(estimate, limits["experiments"]), *list_course(estimate)]
+    channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=", of which more is explained")
     correlations = format_table(*tabulate_correlations(estimate), most=limits["others"])
     sections = {
         "Fit": _format_rows(course),
         "Quality of the fit": [*_format_rows(list_quality(estimate)), *([""] if channels else []), *channels],
-        "Unknowns": _format_unknowns(estimate, limits["unknowns"], unknowns),
+        "Unknowns": _format_unknowns(estimate, limits["unknowns"]),
         "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
         f"Correlations above {SMALL_CORRELATION:g}": correlations,
         "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
@@ -94,7 +90,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
+def list_experiments(fit: Fit, most: int) -> list[Row]:
     """Return each experiment's modes, its horizon, its data, and what its times are counted from.
 
     Parameters
@@ -102,8 +98,6 @@ def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
     fit : Fit
     most : int
         Number of experiments that are listed; the others are counted.
-    where : str, optional
-        Where to find the others, as the end of a sentence.
     """
     rows: list[Row] = []
     names = ["experiment"] if len(fit.trajectories) == 1 else fit.run_names
@@ -118,7 +112,7 @@ def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
         if origins[e] and origins[e] not in origins[e - 1 : e]:
             rows.append(("times", origins[e]))
     if len(names) > most:
-        rows.append(("", f"and {len(names) - most} more experiments{where}"))
+        rows.append(("", f"and {len(names) - most} more experiments"))
     return rows
 
 
@@ -135,7 +129,7 @@ def _format_data(comparison: Comparison) -> str:
 
 
 def list_course(fit: Fit) -> list[Row]:
-    """Return the kind of Hessian, the effort, the engine, the strategies with the lowest J after each, and how the fit ended.
+    """Return the kind of Hessian, the effort, the engine, the strategies with the lowest J each, and how the fit ended.
 
     Parameters
     ----------
@@ -233,11 +227,11 @@ def _format_size(values: FloatArray, digits: int) -> str:
     return f"{np.sqrt(np.mean(known**2)):.{digits}g}" if len(known) else ""
 
 
-def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
+def _format_unknowns(fit: Fit, most: int) -> list[str]:
     """Return the table of the unknowns as lines; those that are left out are counted."""
     table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
     more = len(fit.theta) - len(shown)
-    lines = format_table(*table) + ([f"  and {more} more unknowns{where}"] if more else [])
+    lines = format_table(*table) + ([f"  and {more} more unknowns"] if more else [])
     return [*lines, *wrap_text(note, "  ", "  ")] if note else lines
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
 from switchfit.problem.problem import Problem
-from switchfit.runtime.errors import MissingExtraError
+from switchfit.runtime.errors import import_library
 from switchfit.runtime.presentation import Displayed, format_html, format_page, format_text
 from switchfit.uncertainty.prediction import Prediction
 
@@ -40,12 +40,10 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     MissingExtraError
         If Bokeh or Jinja2 are not installed.
     """
-    try:
-        from switchfit.report.html.page import build_page
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"an HTML report needs {error.name}, not installed here: pip install 'switchfit[report]'"
-        ) from error
+    for library in ("bokeh", "jinja2"):
+        import_library(library, "an HTML report", "'switchfit[report]'")
+    from switchfit.report.html.page import build_page
+
     return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem(estimate))
 
 
