@@ -1,12 +1,6 @@
-"""The page: what the templates show, and the JSON that the page's script turns into figures.
+"""The page: what the templates show, and the JSON from which the page's script draws figures with Bokeh.
 
 Import this only where Bokeh and Jinja2 are installed.
-
-Figures of a page, drawn with Bokeh. Import this only where Bokeh is installed.
-
-The figures of runs are drawn without numbers, which the page's script puts into the sources by their names. Colours
-that have to change with the reader's light or dark background carry the tag "ink", "muted" or "edge"; the script sets
-them, and those of axes.
 """
 
 from __future__ import annotations
@@ -15,16 +9,11 @@ import base64
 import gzip
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jinja2
 import numpy as np
-from bokeh import models
-from bokeh.core.serialization import Serializer
-from bokeh.embed import json_item
-from bokeh.layouts import column
-from bokeh.plotting import figure
 from bokeh.resources import Resources
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -33,7 +22,7 @@ from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.formats import Timed, describe_clock, format_span, label_quantity, label_time
+from switchfit.report.formats import describe_clock, format_span, label_quantity, label_time
 from switchfit.report.html.curves import (
     Columns,
     Curves,
@@ -51,199 +40,6 @@ from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate,
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.residuals import explain_worst, rank_runs
 from switchfit.uncertainty.verdict import find_issues
-
-FIT, DATA = "#d0392b", "#5b6470"
-"""Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
-HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SLICE_HEIGHT = 270, 130, 420, 230
-LEFT = 78
-"""Pixels to the left of all axes, so that figures below one another share their times."""
-UNBROKEN = {"break-inside": "avoid"}
-"""A channel is printed on one page."""
-WIDE: dict[str, Any] = {"sizing_mode": "stretch_width"}
-TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
-UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
-DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
-DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
-"""Of shades below the curves, of what was measured, and of what it is compared with."""
-DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
-"""Of up to so many samples."""
-LABELS = {"measurements": "measured", "reference": "reference"}
-
-
-def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> Any:
-    """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
-
-    Parameters
-    ----------
-    curves : sequence of Curves
-        Of one of the runs that share the drawing.
-    columns : mapping of name to columns
-        Of the same run, by the names of their sources.
-    run : Timed
-    """
-    sources = {name: make_source(name, own) for name, own in columns.items()}
-    times = models.Range1d(name="times")
-    blocks: list[Any] = []
-    for c, own in enumerate(curves):
-        curve, samples = sources[f"curve-{c}"], sources.get(f"samples-{c}")
-        for k, name in enumerate(own.names):
-            panel = _make_time_figure(HEIGHT, times, label_quantity(name, own.units[k]), sources, run)
-            line = _draw_curve(panel, own, k, curve)
-            parts = [panel]
-            if samples is not None:
-                _draw_samples(panel, own, k, samples, run)
-                below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual", sources, run)
-                below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
-                _draw_residuals(below, own, k, samples)
-                panel.xaxis.visible = False
-                parts.append(below)
-            parts[-1].xaxis.axis_label.text = label_time(run)
-            _add_hover(panel, line, [("fitted", f"@y{k}{{%.6g}}"), ("mode", "@mode")], run)
-            _put_legend_above(panel)
-            blocks.append(column(*parts, name=f"channel-{c}-{k}", spacing=0, styles=UNBROKEN, **WIDE))
-        if samples is not None and (plane := find_plane(own.names, own.units)) is not None:
-            blocks.append(_draw_path(own, plane, curve, samples))
-    return column(*blocks, spacing=6, **WIDE)
-
-
-def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
-    """Return a source with the columns, and those of the fit that the page's script keeps, but none of their numbers.
-
-    Parameters
-    ----------
-    name : str
-    columns : iterable of str
-    """
-    return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
-
-
-def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
-    """Return an empty figure with the labels of its axes."""
-    frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": LEFT, "min_border_right": 10}
-    plot = figure(height=height, tools=TOOLS, active_drag="box_zoom", toolbar_location="right", **frame, **settings)
-    plot.toolbar.logo = None
-    plot.toolbar.autohide = True
-    plot.background_fill_color = plot.outline_line_color = None
-    plot.xaxis.axis_label, plot.yaxis.axis_label = models.PlainText(text=x), models.PlainText(text=y)
-    return plot
-
-
-def _make_time_figure(
-    height: int, times: models.Range1d, label: str, sources: Mapping[str, models.ColumnDataSource], run: Timed
-) -> Any:
-    """Return a figure over time with the modes shaded, and the transition times in their intervals."""
-    plot = _make_figure(height, "", label, x_range=times)
-    plot.xgrid.visible = False
-    plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
-    clock = describe_clock(run)
-    if clock is not None:
-        find = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
-        label = "return switchfitDates.label(tick, ticks, start, length, zone)"
-        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=find)
-        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=label)
-    plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
-    own = sources["transitions"]
-    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
-    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
-    if height > RESIDUAL_HEIGHT:
-        _add_hover(plot, line, [("transition", "@name"), ("modes", "@modes")])
-    return plot
-
-
-def _put_legend_above(plot: Any) -> None:
-    """Move the legend out of the way of the data; a click on an entry hides what it stands for."""
-    plot.legend.click_policy = "hide"
-    plot.legend.orientation = "horizontal"
-    plot.add_layout(plot.legend[0], "above")
-
-
-def _tag(renderer: Any, tag: str) -> Any:
-    """Let the page's script colour a glyph."""
-    renderer.glyph.tags = [tag]
-    return renderer
-
-
-def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
-    """Show (label, column) under the pointer, and the time of a run before them.
-
-    Bokeh escapes what is in columns, but neither labels nor units.
-    """
-    formatters: dict[str, Any] = {text.partition("{")[0]: "printf" for _, text in tips if "%" in text}
-    if run is not None:
-        clock, unit = describe_clock(run), run.time_unit
-        plain = unit if unit.isalnum() and unit != "1" else ""
-        tips = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
-        code = "return switchfitDates.show(value, 0.001, start, length, zone)"
-        formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
-    tool = models.HoverTool(renderers=[renderer], tooltips=list(tips), formatters=formatters, visible=False)
-    plot.add_tools(tool)
-
-
-def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
-    """Draw what is fitted: its band, the fit itself that is shown once something has been moved; return what moves."""
-    if "lo0" in curves.curve:
-        band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
-        plot.varea(x="fit_t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
-    still = _tag(plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED), "muted")
-    still.name, still.visible = "still", False
-    return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
-
-
-def _draw_measured(
-    plot: Any, curves: Curves, x: str, y: str, source: models.ColumnDataSource, *, scale: float = 1.0, **legend: Any
-) -> Any:
-    """Draw what is measured as dots, or a reference signal as a dashed line."""
-    if curves.kind == "reference":
-        return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
-    size = next(size for most, size in DOT_SIZES.items() if len(curves.samples["t"]) <= most)
-    return _tag(plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend), "ink")
-
-
-def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
-    drawn = _draw_measured(plot, curves, "t", f"m{k}", source, legend_label=LABELS[curves.kind])
-    if "o0" in curves.samples:
-        label = "weighed down"
-        plot.scatter("t", f"o{k}", source=source, size=11, fill_color=None, line_color=FIT, legend_label=label)
-    tips = [(LABELS[curves.kind], f"@m{k}{{%.6g}}"), ("residual", f"@y{k}{{%.6g}}")]
-    _add_hover(plot, drawn, tips, run)
-
-
-def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
-    plot.hspan(y=0.0, line_color=FIT, line_width=1)
-    for side in ("s", "n") if "s0" in curves.samples else ():
-        _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
-    _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
-
-
-def _draw_path(
-    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource
-) -> Any:
-    """Draw two positions against one another, with the transitions on the fitted path."""
-    x, y = plane
-    labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
-    plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
-    _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
-    plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
-    mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
-    _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
-    _put_legend_above(plot)
-    return plot
-
-
-def draw_slice() -> Any:
-    """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
-    plot = _make_figure(SLICE_HEIGHT, "", "rise of J")
-    plot.xaxis.axis_label.name = "slice-label"
-    source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
-    plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")
-    _tag(plot.line("x", "quadratic", source=source, legend_label="quadratic", **DASHED), "muted")
-    _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
-    plot.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
-    plot.xaxis.ticker.desired_num_ticks = 4  # labels of dates are long
-    plot.xaxis.formatter = models.CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
-    _put_legend_above(plot)
-    return plot
-
 
 MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
@@ -281,7 +77,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
         drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
     if any(record.optimality > 0 for record in estimate.history):
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
-    library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
+    library = "".join(Resources(mode="inline", components=["bokeh", "bokeh-api"]).js_raw)
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
     content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
@@ -303,8 +99,12 @@ def _compress_svg(figure: Figure) -> str:
 
 
 def _write_json(value: Any) -> str:
-    """Return JSON that can stand inside a script element."""
-    written = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    """Return JSON that can stand inside a script element; arrays as their bytes in base64, with the type of numbers."""
+
+    def pack(array: Any) -> dict[str, str]:
+        return {"dtype": array.dtype.str, "data": base64.b64encode(array.tobytes()).decode()}
+
+    written = json.dumps(value, allow_nan=False, separators=(",", ":"), default=pack)
     return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -318,37 +118,44 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
     curves = {e: collect_curves(estimate, e, places[e], points) for e in order}
     colours = choose_mode_colours(estimate.trajectories, lines=True)
-    templates: dict[str, Any] = {}
-    layouts: dict[Any, str] = {}
-    figures: list[dict[str, Any]] = []
-    for e in order:
-        run, own = estimate.trajectories[e], curves[e]
-        sources = {"modes": list_spans(estimate, e, colours), "transitions": list_transitions(estimate, e)}
-        for c, part in enumerate(own):
-            sources |= {f"curve-{c}": part.curve} | ({f"samples-{c}": part.samples} if part.samples else {})
-        # What two runs have to share to be shown by the same drawing, which takes Bokeh a tenth of a second, while its
-        # numbers take a thousandth; tangents are not drawn.
-        drawn = ((c.names, c.units, c.kind, *(key for key in (*c.curve, *c.samples) if key[0] != "d")) for c in own)
-        template = layouts.setdefault((run.time_unit, run.origin, *drawn), f"run-{len(layouts)}")
-        if template not in templates:
-            templates[template] = json_item(draw_run(own, sources, run=run))
-        first, last = float(run.times[0]), float(run.times[-1])
-        margin = MARGIN * (last - first)
-        written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
-        ranges = {"times": {"start": first - margin, "end": last + margin}}
-        figures.append({"template": template, "sources": written, "ranges": ranges})
     sliders: list[dict[str, Any]] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
         movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
         sliders = build_sliders(estimate, curves, list(movable))
-        templates |= {"slice": json_item(draw_slice())} if sliders else {}
     moved = [slider["place"] for slider in sliders]
     for slider in sliders:
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
     derivatives = {"gradient": estimate.gradient[moved], "hessian": estimate.hessian[np.ix_(moved, moved)]}
     costs = {name: drop_nan(value) for name, value in {"cost": estimate.cost, **derivatives}.items()}
-    payload = {"templates": templates, "runs": figures, "sliders": sliders, **costs}
-    return [_describe_run(estimate, e, curves[e], colours) for e in order], payload
+    figures = [_prepare_run(estimate, e, curves[e], colours) for e in order]
+    return [_describe_run(estimate, e, curves[e], colours) for e in order], {
+        "runs": figures,
+        "sliders": sliders,
+        **costs,
+    }
+
+
+def _prepare_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
+    """Return what the page's script draws of a run: the columns of its sources, and what the curves are."""
+    run = fit.trajectories[e]
+    sources: dict[str, Columns] = {"modes": list_spans(fit, e, colours), "transitions": list_transitions(fit, e)}
+    for c, own in enumerate(curves):
+        sources |= {f"curve-{c}": own.curve} | ({f"samples-{c}": own.samples} if own.samples else {})
+    first, last = float(run.times[0]), float(run.times[-1])
+    margin = MARGIN * (last - first)
+    drawn = [
+        {"kind": c.kind, "labels": list(map(label_quantity, c.names, c.units)), "plane": find_plane(c.names, c.units)}
+        for c in curves
+    ]
+    # Bokeh escapes what is in columns, but no units in tips.
+    unit = run.time_unit if run.time_unit.isalnum() and run.time_unit != "1" else ""
+    times = {
+        "label": label_time(run),
+        "unit": unit,
+        "clock": describe_clock(run),
+        "range": [first - margin, last + margin],
+    }
+    return {"sources": sources, "curves": drawn, "times": times}
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
