@@ -341,7 +341,8 @@ def test_positions_in_a_plane_are_told_by_names_and_units():
     ):
         assert find_plane(names, units) == plane, names
     # Without samples of both there is nothing to draw in it.
-    assert "match_aspect" not in fit_and_page("no data")[1].partition('id="payload"')[2]
+    (run,) = payload_of(fit_and_page("no data")[1])["runs"]
+    assert [curves["plane"] for curves in run["curves"]] == [None]
 
 
 # --- one file ---------------------------------------------------------------------------------------------------------

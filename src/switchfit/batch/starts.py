@@ -77,7 +77,7 @@ class Multistart(Fits):
         """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
         return judge_failed_starts(self) if self.best is None else self.best.verdict
 
-    def plot(self, *, ax: Drawn | None = None) -> Drawn:  # type: ignore[override]  # it has one panel
+    def plot(self, *, ax: Drawn | None = None) -> Drawn:
         """Draw a waterfall: the cost at the end of every start, ascending.
 
         Parameters

@@ -127,12 +127,8 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
     derivatives = {"gradient": estimate.gradient[moved], "hessian": estimate.hessian[np.ix_(moved, moved)]}
     costs = {name: drop_nan(value) for name, value in {"cost": estimate.cost, **derivatives}.items()}
-    figures = [_prepare_run(estimate, e, curves[e], colours) for e in order]
-    return [_describe_run(estimate, e, curves[e], colours) for e in order], {
-        "runs": figures,
-        "sliders": sliders,
-        **costs,
-    }
+    payload = {"runs": [_prepare_run(estimate, e, curves[e], colours) for e in order], "sliders": sliders, **costs}
+    return [_describe_run(estimate, e, curves[e], colours) for e in order], payload
 
 
 def _prepare_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
@@ -143,10 +139,11 @@ def _prepare_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[st
         sources |= {f"curve-{c}": own.curve} | ({f"samples-{c}": own.samples} if own.samples else {})
     first, last = float(run.times[0]), float(run.times[-1])
     margin = MARGIN * (last - first)
-    drawn = [
-        {"kind": c.kind, "labels": list(map(label_quantity, c.names, c.units)), "plane": find_plane(c.names, c.units)}
-        for c in curves
-    ]
+    drawn: list[dict[str, Any]] = []
+    for part in curves:
+        plane = find_plane(part.names, part.units) if part.samples else None
+        labels = list(map(label_quantity, part.names, part.units))
+        drawn.append({"kind": part.kind, "labels": labels, "plane": plane})
     # Bokeh escapes what is in columns, but no units in tips.
     unit = run.time_unit if run.time_unit.isalnum() and run.time_unit != "1" else ""
     times = {

@@ -280,7 +280,7 @@ window.switchfitDates = switchfitDates;
         const whole = { "break-inside": "avoid" }; // printed on one page
         blocks.push(new Bokeh.Column({ children: parts, name: `channel-${c}-${k}`, spacing: 0, styles: whole, ...wide }));
       });
-      if (samples && own.plane) blocks.push(drawPath(own, curve, samples));
+      if (own.plane) blocks.push(drawPath(own, curve, samples));
     });
     return new Bokeh.Column({ children: blocks, spacing: 6, ...wide });
   }
