@@ -24,7 +24,7 @@ import switchfit as sf
 from switchfit import cli
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
-from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, find_range, list_places
+from switchfit.report.html.page import VISIBLE, build_sliders, collect_curves, evaluate_moved, find_range, list_places
 from switchfit.report.plot import find_plane
 from switchfit.report.text import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
