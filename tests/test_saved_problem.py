@@ -15,8 +15,8 @@ from test_many_logs import log_of, run
 
 import switchfit as sf
 from switchfit.estimation.estimator import describe_python_problem
+from switchfit.io.command_line import list_changed_models, load_with_problem
 from switchfit.io.problem_file import load_problem
-from switchfit.io.saved_problem import list_changed_models, load_with_problem
 from switchfit.models import heater_problem
 from switchfit.runtime.errors import InputError
 

@@ -328,8 +328,7 @@ def validate(
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
     from switchfit.estimation.estimator import Estimate
-    from switchfit.io.command_line import summarize_validation
-    from switchfit.io.saved_problem import list_changed_models, load_other_run
+    from switchfit.io.command_line import list_changed_models, load_other_run, summarize_validation
 
     estimate = Estimate.load(saved)
     loaded = load_other_run(saved, estimate.provenance, other, folder)
@@ -358,9 +357,8 @@ def compare(
     Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
     fits to different data.
     """
-    from switchfit.io.command_line import summarize_comparison
+    from switchfit.io.command_line import load_with_problem, summarize_comparison
     from switchfit.io.logs import name_files
-    from switchfit.io.saved_problem import load_with_problem
 
     terminal.make_folder(out)
     names = name_files(saved)
