@@ -172,11 +172,9 @@ def test_simulate(folder, tmp_path):
     assert {row["experiment"] for row in rows} == {"run1"}
     assert times[on].max() == times[~on].min() == 2.0
     np.testing.assert_allclose(states[on], 8 * (1 - np.exp(-0.05 * times[on])), atol=1e-8)
-    (found,) = read_json(run("simulate", folder / "problem.toml", "--json"))["runs"]
-    assert (found["times"], found["states"]["T"]) == (times.tolist(), states.tolist())
     result = run("simulate", folder / "problem.toml")
     assert result.exit_code == 2
-    assert "name the file to write with --out FILE.csv, or give --json" in result.stderr
+    assert "'--out'" in result.stderr
 
 
 def test_version_and_help():
@@ -353,7 +351,6 @@ def test_check_is_one_screen_of_many_runs(tmp_path, folder):
     assert result.exit_code == 0, result.output
     assert len(result.stdout.splitlines()) < 50
     assert "and 9 more experiments: --full lists them" in result.stdout
-    assert "in all 12 experiments" in result.stdout
     assert "Paper's equations" not in result.stdout
     result = run("check", tmp_path / "problem.toml", "--full")
     assert "Experiment 12 (r11)" in result.stdout

@@ -26,7 +26,7 @@ from switchfit.io.command_line import summarize_estimate, write_runs, write_unkn
 from switchfit.io.problem_file import load_problem
 from switchfit.problem.dates import SECONDS, Dates, Origin, from_epoch, make_origin, read_dates
 from switchfit.report.axes import DateLocator
-from switchfit.report.formats import add_dates, format_date, format_time
+from switchfit.report.formats import format_date, format_time
 from switchfit.runtime.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -328,17 +328,6 @@ def test_the_report_shows_dates(fits):
     off = dt.datetime.fromisoformat(shown).replace(tzinfo=BERLIN) - dated.transition_dates[0][0]
     assert abs(off) <= dt.timedelta(seconds=30)
     assert "2020" not in str(plain)
-
-
-def test_sentences_have_dates_beside_numbers(fits):
-    dated, plain = fits
-    text = "Kinks: tau_1 = 9.5, where; tau_1 is at its lower bound 2. run.tau_1 = 3, tau_1 later, k = 3."
-    assert add_dates(text, dated) == (
-        "Kinks: tau_1 = 9.5 (2020-03-29 13:00), where; tau_1 is at its lower bound 2 (2020-03-22). run.tau_1 = 3, "
-        "tau_1 later, k = 3."
-    )
-    assert add_dates("where tau_1 passes 9.5", dated) == "where tau_1 passes 9.5 (2020-03-29 13:00)"
-    assert add_dates(text, plain) == text
 
 
 def test_tables_frames_and_json_have_dates_beside_numbers(fits):

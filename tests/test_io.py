@@ -9,9 +9,9 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.command_line import describe
 from switchfit.io.problem_file import load_problem
 from switchfit.io.user_files import load_object
+from switchfit.report.text import write_problem
 from switchfit.runtime.errors import InputError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -141,7 +141,7 @@ def test_short_forms_and_defaults(folder):
     )
     experiment = loaded.problem.experiments[0]
     assert (experiment.t0, experiment.tf) == (0.0, 6.0)
-    assert "on -> off on [0, 6] s (t0 and tf from the data), at 3 s" in describe(loaded.problem)
+    assert "on -> off on [0, 6] s (t0 and tf from the data), at 3 s" in write_problem(loaded.problem)
     assert experiment.data[0].sigma is None
     assert experiment.data[0].observe is None
     assert loaded.options == {}
@@ -151,7 +151,7 @@ def test_short_forms_and_defaults(folder):
 def test_a_horizon_of_which_one_end_is_left_out(folder):
     problem = changed(folder, ("t0 = 0.0\ntf = 6.0\n", "tf = 7.5\n"), ("sigma = 0.1\n", "delay = 0.25\n")).problem
     assert (problem.experiments[0].t0, problem.experiments[0].tf) == (-0.25, 7.5)
-    assert "on [-0.25, 7.5] s (t0 from the data)" in describe(problem)
+    assert "on [-0.25, 7.5] s (t0 from the data)" in write_problem(problem)
 
 
 def data_of(folder, *changes):
@@ -212,7 +212,7 @@ def test_loss_delay_priors_and_scales(folder):
     priors = dict(zip(names, problem.unknowns.priors.texts(), strict=True))
     assert priors == {"tau_1": "log-normal(3, 0.2)", "heating": "normal(0.4, 0.1)", "d": "", "cooling": ""}
     assert problem.unknowns.log_names == ("cooling",)
-    text = describe(problem)
+    text = write_problem(problem)
     assert "late by d" in text
     assert "loss huber (1.5 sigma)" in text
     assert "prior: normal(0.4, 0.1)" in text
@@ -379,7 +379,7 @@ def test_python_file_is_read_again_when_it_changes(tmp_path):
 
 def test_describe_and_identifiability(folder):
     problem = changed(folder).problem
-    text = describe(problem)
+    text = write_problem(problem)
     assert "Experiment 1 (monday)" in text
     assert "on -> off on [0, 6] s, at 3 s" in text
     assert "7 samples of T, 0 to 6 s, typically 1 s apart, 1 values missing" in text

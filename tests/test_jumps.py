@@ -13,10 +13,11 @@ import switchfit as sf
 from switchfit.engine.native.engine import foreign_derivatives, places_in_library
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import idle_unknowns
-from switchfit.io.command_line import describe_experiments, summarize_estimate
+from switchfit.io.command_line import summarize_estimate
 from switchfit.io.problem_file import load_problem, read_experiments
 from switchfit.problem.functions import use_float64
-from switchfit.report.html.curves import collect_curves
+from switchfit.report.html.page import collect_curves
+from switchfit.report.text import write_experiments
 from switchfit.strategy.known_order import find_times
 
 DOSES = np.array([0.0, 8.0, 16.0, 24.0])
@@ -313,7 +314,7 @@ def test_problem_file(folder, values):
     problem = load_problem(folder / "problem.toml").problem
     assert sf.evaluate(problem).cost == pytest.approx(sf.evaluate(make_problem(values)).cost, rel=1e-9)
     runs = read_experiments(folder / "problem.toml")
-    assert "4 jumps at 0, 8, 16, 24 h" in describe_experiments(runs.experiments)
+    assert "4 jumps at 0, 8, 16, 24 h" in write_experiments(runs.experiments)
 
 
 START = dt.datetime(2024, 5, 1, 6, tzinfo=dt.UTC)
@@ -355,7 +356,7 @@ def test_problem_file_with_dates(folder, values):
     (folder / "problem.toml").write_text(text)
     problem = load_problem(folder / "problem.toml").problem
     np.testing.assert_array_equal(problem.experiments[0].jump_times, DOSES)
-    assert "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00" in describe_experiments(problem.experiments)
+    assert "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00" in write_experiments(problem.experiments)
     (folder / "problem.toml").write_text(f"{text}time_scale = 2.0\n")  # that a jump is a date suffices
     with pytest.raises(ValueError, match="has dates, which are converted to time_unit by themselves"):
         load_problem(folder / "problem.toml")

@@ -80,13 +80,6 @@ PLOTS = {
     "plane": lambda car, starts, **ax: car.plot_plane(**ax),
     "profile": lambda car, starts, **ax: car.profile("v").plot(**ax),
     "waterfall": lambda car, starts, **ax: starts.plot(**ax),
-    "fits": lambda car, starts, **ax: sf.estimate_many([heater_problem()] * 3).plot(unknown="k", **ax),
-    "bootstrap": lambda car, starts, **ax: sf.bootstrap(starts.best, 5).plot(unknown="k", **ax),
-    "monte carlo": lambda car, starts, **ax: sf.monte_carlo(heater_problem(), 5, theta=[2.5, 0.4]).plot(
-        unknown="tau_1", **ax
-    ),
-    "validation": lambda car, starts, **ax: car.validate(car.problem).plot(channel="north", **ax),
-    "forecast": lambda car, starts, **ax: car.predict(np.linspace(0.0, 25.0, 30)).plot(channel="north", **ax),
 }
 
 
@@ -234,42 +227,24 @@ def test_every_result_is_one_line(heater, starts, models):
     assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
 
 
-def test_one_panel_of_several(heater, models):
-    """What is drawn is what the whole figure has there."""
-    fits, found = sf.estimate_many([heater.problem] * 3), heater.validate(heater.problem)
-    whole, alone = fits.plot().axes[1], fits.plot(unknown="k").axes[0]
-    np.testing.assert_array_equal(alone.collections[1].get_offsets(), whole.collections[1].get_offsets())
-    assert (alone.get_xlabel(), alone.get_ylabel()) == (whole.get_xlabel(), "run")
-    assert [text.get_text() for text in alone.get_legend().get_texts()] == ["good"]
-    whole, alone = found.plot(), found.plot(channel="thermometer").axes[0]
+def test_figures_of_several_panels(heater, starts):
+    """What a notebook shows of fits, studies, validations and forecasts."""
+    found = heater.validate(heater.problem)
     (prediction,) = found.predictions
     reach = np.abs(prediction.prediction_band()[:, 0] - prediction.outputs).max()
-    assert whole.axes[1].get_ylim()[0] < -reach, "the band about the residuals' zero is cut off"
-    assert whole.axes[1].get_ylim()[1] > reach
-    np.testing.assert_array_equal(alone.lines[1].get_data(), whole.axes[0].lines[1].get_data())
-    labels = {text.get_text() for text in whole.legends[0].get_texts()}
+    validation = found.plot()
+    assert validation.axes[1].get_ylim()[0] < -reach, "the band about the residuals' zero is cut off"
+    assert validation.axes[1].get_ylim()[1] > reach
+    labels = {text.get_text() for text in validation.legends[0].get_texts()}
     assert {"measured", "predicted", "95 % prediction", "95 % confidence", "± sigma"} < labels
-    ax = models.plot(ax=Figure().subplots())
-    assert [text.get_text() for text in ax.get_yticklabels()] == ["k estimated", "k known"]
-    low, high = ax.get_ylim()
-    assert low > high, "the best is not on top"
-
-
-def test_what_is_wrong_with_a_panel_is_said(car, starts):
-    ax = Figure().subplots()
-    study = sf.bootstrap(starts.best, 5)
-    for call, message in (
-        (
-            lambda: study.plot(ax=ax),
-            r"ax has room for one unknown: name it, such as unknown='tau_1'; there are 'tau_1'",
-        ),
-        (lambda: study.plot(unknown="m"), "unknown must be one of 'tau_1', 'k'; got 'm'"),
-        (lambda: car.validate(car.problem).plot(ax=ax), "name it, such as channel='east'; there are 'east', 'north'"),
-        (lambda: car.predict([1.0, 2.0]).plot(channel="up"), "channel must be one of 'east', 'north'; got 'up'"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            call()
-    assert not ax.has_data()
+    fits = sf.estimate_many([heater.problem] * 3).plot()
+    assert [ax.get_ylabel() for ax in fits.axes] == ["run", ""]
+    assert [text.get_text() for text in fits.legends[0].get_texts()] == ["good"]
+    studies = (sf.bootstrap(starts.best, 5), sf.monte_carlo(heater.problem, 5, theta=[2.5, 0.4]))
+    forecast = heater.predict(np.linspace(0.0, 9.0, 30)).plot()
+    for figure in (validation, fits, forecast, *(study.plot() for study in studies)):
+        assert all(ax.has_data() for ax in figure.axes)
+        assert figure._repr_png_()[:4] == b"\x89PNG"
 
 
 def test_a_legend_has_room_in_the_width_of_a_column(car):

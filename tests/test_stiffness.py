@@ -18,8 +18,8 @@ from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import runs_of
 from switchfit.engine.stiffness import Choice, Look, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.io.command_line import describe_steps
 from switchfit.problem.functions import use_float64
+from switchfit.report.text import write_steps
 
 
 def relax(t, x, p):
@@ -322,8 +322,8 @@ def test_the_choice_is_said():
     assert "explicit steps (limited by stability: |lambda| h is about 3." in str(found)
     assert str(found).endswith("implicit ones were chosen for this mode")
     assert str(engine) == "Evaluated in machine code, with implicit steps in 'm'."
-    assert "implicit steps; mode 'm' is stiff" in describe_steps(problem)
-    assert "explicit steps" in describe_steps(relaxing(1.0))
+    assert "implicit steps; mode 'm' is stiff" in write_steps(evaluator_of(problem))
+    assert "explicit steps" in write_steps(evaluator_of(relaxing(1.0)))
 
 
 def fitted_to(rate, guess, times, sigma=1e-3, **settings):

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.command_line import describe
 from switchfit.io.problem_file import load_problem
+from switchfit.report.text import write_problem
 from switchfit.uncertainty import certificate
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -169,7 +169,7 @@ TEXTS = {
     "monte_carlo": (lambda s: str(s.study), ["run1.tau_1 ({0} %)"]),
     "multistart": (lambda s: str(s.search), ["run1.tau_1 = 42.9702 {0} %, heating = 0.50146 °C/min"]),
     "many": (lambda s: str(sf.estimate_many([s.problem] * 2)), ["run1.tau_1 ({0} %)"]),
-    "summary": (lambda s: describe(s.problem), ["on [0, 120] {0} %, at 30 {0} %", "typically 4 {0} % apart"]),
+    "summary": (lambda s: write_problem(s.problem), ["on [0, 120] {0} %, at 30 {0} %", "typically 4 {0} % apart"]),
     "json": (Said.save, ['"theta_units": [\n"{0} %"', '"time_unit": "{0} %"']),
     "figure": (lambda s: texts_of(s.fit.plot()), ["time ({0} %)"]),
     "figure of residuals": (lambda s: texts_of(s.fit.plot_residuals()), ["time ({0} %)"]),
@@ -198,9 +198,9 @@ def test_times_without_a_unit():
     fit = sf.estimate(problem, strategy="local")
     assert "on -> off, 0 to 120\n" in fit.report(full=True)
     assert [ax.get_xlabel() for ax in fit.plot().axes] == ["", "time"]
-    assert "on [0, 120], at 30\n" in describe(problem)
+    assert "on [0, 120], at 30\n" in write_problem(problem)
     one = sf.Problem(room(), run((), modes=("on",), time_unit="min"), RATES)
-    assert "on on [0, 120] min\n" in describe(one)
+    assert "on on [0, 120] min\n" in write_problem(one)
 
 
 # --- each plot function, and several units at once --------------------------------------------------------------------
@@ -231,7 +231,7 @@ def test_each_experiment_has_its_own_unit(tmp_path):
     residuals = fit.plot_residuals().axes
     assert [ax.get_xlabel() for ax in residuals[::3]] == ["time (min)", "time (h)", "time (h)"]
     assert [ax.get_xlabel() for ax in residuals[1::3]] == ["", "", "lag (samples)"]
-    summary = describe(whole)
+    summary = write_problem(whole)
     assert "typically 4 min apart" in summary
     assert "typically 0.06667 h apart" in summary
     fit.save(tmp_path / "fit.json")

@@ -448,12 +448,6 @@ def test_few_values():
     np.testing.assert_allclose(table.weights, [1.0, 0.0])
 
 
-def test_the_figure_has_the_best_at_the_top():
-    figure = sf.compare([fit(k) for k in (1, 2)], names=("line", "parabola")).plot()
-    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["parabola", "line"]
-    assert figure.axes[0].patches[0].get_width() == 0.0
-
-
 def test_guards_are_equations_between_unknowns():
     """A limit that is an unknown alone gives the same model as a transition time that is free."""
     base = heater_problem()

@@ -41,7 +41,7 @@ from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.files import find_dtype, from_json, parse_document, to_json
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
+from switchfit.runtime.presentation import Displayed, Figure, draw_figure, format_line, join_first
 from switchfit.uncertainty import verdict
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.residuals import HALF, UNLIKELY, compare_with_sigma
@@ -251,16 +251,9 @@ class Fits(Ends, Tabular, Displayed):
         misfit = self.cost / np.maximum(self.samples, 1)
         return np.lexsort((-np.nan_to_num(misfit, nan=np.inf), -ranks, self.success))
 
-    def plot(self, *, unknown: str | None = None, ax: Drawn | None = None) -> Drawn:
+    def plot(self) -> Figure:
         """Draw the unknowns: of each fit with its 95 % interval, the worst fits first; of a study or a bootstrap a
         histogram of the estimates, with the truth or the bootstrap's interval.
-
-        Parameters
-        ----------
-        unknown : str, optional
-            The only one that is drawn; left out, all, or some of many.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
 
         See Also
         --------
@@ -278,7 +271,8 @@ class Fits(Ends, Tabular, Displayed):
         >>> len(sf.monte_carlo(heater_problem(), 20, theta=[2.5, 0.4]).plot().axes)
         2
         """
-        return draw_figure(self, unknown=unknown, ax=ax)
+        figure: Figure = draw_figure(self)
+        return figure
 
     def save(self, path: str | Path) -> None:
         """Write all fits to one file, atomically: a NumPy archive that `load` reads.

@@ -72,7 +72,7 @@ class Multistart(Fits):
         """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
         return judge_many(self) if self.best is None else self.best.verdict
 
-    def plot(self, *, ax: Drawn | None = None) -> Drawn:  # type: ignore[override]  # it is not of one unknown
+    def plot(self, *, ax: Drawn | None = None) -> Drawn:
         """Draw a waterfall: the cost at the end of every start, ascending.
 
         Parameters

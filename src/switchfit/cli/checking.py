@@ -33,14 +33,14 @@ def init(name: NewFolder, log: FirstLog = None) -> None:
     the log are chosen, with a first model that suits any log: each channel approaches a level, another one from an
     estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
     """
-    from switchfit.io.command_line import describe_experiments
     from switchfit.io.problem_file.writing import write_first_problem
+    from switchfit.report.text import write_experiments
 
     folder = Path(name)
     written = write_first_problem(folder, log)
     loaded = terminal.load(folder / "problem.toml")
     terminal.print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
-    terminal.print_text(describe_experiments(loaded.problem.experiments))
+    terminal.print_text(write_experiments(loaded.problem.experiments))
     terminal.print_text(
         f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
         f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
@@ -130,13 +130,14 @@ def check(
         return
     loaded = terminal.load(problem)
     from switchfit.fit.evaluator import evaluator_of
-    from switchfit.io.command_line import describe, describe_steps, summarize_check
+    from switchfit.io.command_line import summarize_check
+    from switchfit.report.text import write_problem, write_steps
     from switchfit.report.uncertainty import write_orders
 
-    terminal.print_text(f"{describe(loaded.problem, full=full)}\n")
+    terminal.print_text(f"{write_problem(loaded.problem, full=full)}\n")
     terminal.print_list("Logs", loaded.issues)
-    terminal.print_text(f"{describe_steps(loaded.problem, full=full)}\n")
     evaluator = evaluator_of(loaded.problem)
+    terminal.print_text(f"{write_steps(evaluator, full=full)}\n")
     if terminal.is_asked("verbose"):
         terminal.print_note(evaluator.engine)
     derivatives = sf.check_derivatives(loaded.problem, paper=full)
@@ -157,10 +158,10 @@ def _check_files(problem: Path, full: bool) -> None:
     from switchfit.io.problem_file import read_experiments
 
     runs = read_experiments(problem)
-    from switchfit.io.command_line import describe_experiments
+    from switchfit.report.text import write_experiments
 
     if runs.experiments:
-        terminal.print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
+        terminal.print_text(f"{write_experiments(runs.experiments, full=full)}\n")
         terminal.print_list("Logs", runs.issues)
     terminal.print_text("No Python file was run: modes, states, functions and names of parameters are not checked.")
     names = [run.name for run in runs.experiments]
@@ -168,39 +169,27 @@ def _check_files(problem: Path, full: bool) -> None:
     terminal.fail_for_refused(runs.issues)
 
 
-OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
+OutputFile = Annotated[Path, option("--out", metavar="FILE.csv", help="CSV file to write.")]
 Times = Annotated[
     str,
     option(metavar="STEP", help="A step, such as 0.1. Default: the integrator's."),
 ]
 
 
-@terminal.command("json", "quiet")
-def simulate(
-    problem: terminal.ProblemPath,
-    out: OutputFile = None,
-    times: Times = "",
-) -> None:
+@terminal.command("quiet")
+def simulate(problem: terminal.ProblemPath, out: OutputFile, times: Times = "") -> None:
     """Integrate the model at the first guess.
 
     Writes times, modes and states as CSV. The column of times is named t, or for example "t (min)" if the
     experiments' time_unit is "min" instead of "s". Where times are dates, a column "date" has them, in the time zone of
     the experiment.
     """
-    if out is None and not terminal.is_asked("json"):
-        terminal.fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
     loaded = terminal.load(problem)
-    from switchfit.io.command_line import choose_times, tabulate_trajectory
+    from switchfit.io.command_line import choose_times, write_trajectories
 
     given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
     runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
-    names = loaded.problem.run_names
-    terminal.print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
-    if out is None:
-        return
-    from switchfit.io.command_line import write_trajectories
-
-    table = write_trajectories(names, runs)
+    table = write_trajectories(loaded.problem.run_names, runs)
     terminal.make_folder(out.parent)
     write_atomically(table, out)
 

@@ -86,12 +86,11 @@ def fit(
     estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
     write_estimate(estimate, loaded, output)
     from switchfit.io.command_line import summarize_estimate
-    from switchfit.report.formats import add_dates
 
     terminal.print_json(summarize_estimate(estimate) | {"out": out})
     terminal.fail_for_refused(loaded.issues)
     if not estimate.status.successful:
-        terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
+        terminal.end_unreliable(f"not converged. {estimate.message}")
     if not estimate.success:
         terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
@@ -134,22 +133,17 @@ class Output:
 def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.io.command_line import list_tables
-    from switchfit.report.formats import add_dates
 
-    checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
-    folder, files = output.folder, {}
-    if folder is not None:
-        files = {name: (folder / f"{name}.csv", table) for name, table in list_tables(estimate).items()}
-    paths = {name: str(path) for name, (path, _) in files.items()}
+    checked = f"\n\nCertificate\n{estimate.certificate}" if output.certificate else ""
     # The report after the certificate, which is part of the verdict.
-    report = f"{format_text(estimate, full=output.full, files=paths)}{checked}"
+    report, folder = f"{format_text(estimate, full=output.full)}{checked}", output.folder
     if show:
         terminal.print_text(report)
     if folder is None:
         return
     write_atomically(report + "\n", folder / "report.txt")
-    for path, table in files.values():
-        write_atomically(table, path)
+    for name, table in list_tables(estimate).items():
+        write_atomically(table, folder / f"{name}.csv")
     provenance = estimate.describe_provenance(replace(loaded.provenance, options=loaded.options))
     _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:
@@ -314,7 +308,7 @@ SavedPaths = Annotated[
     list[Path],
     argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", exists=True, dir_okay=False),
 ]
-ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
+ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt")]
 
 
 @terminal.command("json", "quiet")
@@ -334,8 +328,7 @@ def validate(
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
     from switchfit.estimation.estimator import Estimate
-    from switchfit.io.command_line import summarize_validation
-    from switchfit.io.saved_problem import list_changed_models, load_other_run
+    from switchfit.io.command_line import list_changed_models, load_other_run, summarize_validation
 
     estimate = Estimate.load(saved)
     loaded = load_other_run(saved, estimate.provenance, other, folder)
@@ -355,7 +348,6 @@ def compare(
     saved: SavedPaths,
     out: ComparisonFolder = None,
     folder: terminal.Folder = None,
-    figures: terminal.FigureFormat = "png",
 ) -> None:
     """Compare models that were fitted to the same data.
 
@@ -365,9 +357,8 @@ def compare(
     Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
     fits to different data.
     """
-    from switchfit.io.command_line import summarize_comparison
+    from switchfit.io.command_line import load_with_problem, summarize_comparison
     from switchfit.io.logs import name_files
-    from switchfit.io.saved_problem import load_with_problem
 
     terminal.make_folder(out)
     names = name_files(saved)
@@ -378,7 +369,7 @@ def compare(
         changes += [f"{name}: {change}" for change in changed]
     terminal.print_list("Changed since", changes)
     found = sf.compare(estimates, names=names)
-    terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", figures)
+    terminal.show(found, summarize_comparison(found) | {"changes": changes}, out, "comparison", "")
     failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
     if failed:
         terminal.end_unreliable(

@@ -18,7 +18,6 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -37,31 +36,32 @@ CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 1
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
-_asked: ContextVar[frozenset[str]] = ContextVar("of json, quiet and verbose those that hold", default=frozenset())
+_asked: set[str] = set()
+"""Of --json, --quiet, --verbose and --debug those that the command which runs was given."""
+
+
+def is_asked(name: str) -> bool:
+    """Return whether --json, --quiet, --verbose or --debug was given."""
+    return name in _asked
 
 
 @contextlib.contextmanager
-def _ask(asked: frozenset[str]) -> Iterator[None]:
-    """Return a context in which some of the options --json, --quiet and --verbose hold."""
-    if asked >= {"quiet", "verbose"}:
+def _log_if_verbose() -> Iterator[None]:
+    """Return a context in which --verbose shows the log messages of switchfit, and not together with --quiet."""
+    if not is_asked("verbose"):
+        yield
+        return
+    if is_asked("quiet"):
         fail("--quiet and --verbose contradict each other; give one of them.")
-    token = _asked.set(asked)
     logger, handler = logging.getLogger("switchfit"), logging.StreamHandler()
     level = logger.level
-    if is_asked("verbose"):
-        logger.addHandler(handler)
-        logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
     try:
         yield
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)
-        _asked.reset(token)
-
-
-def is_asked(name: str) -> bool:
-    """Return whether --json, --quiet or --verbose was given."""
-    return name in _asked.get()
 
 
 def print_text(text: object) -> None:
@@ -116,28 +116,25 @@ def interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 @contextlib.contextmanager
-def report_errors(debug: bool, **options: bool) -> Iterator[None]:
-    """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file.
-
-    In this context the options --json, --quiet and --verbose hold, too.
-    """
+def report_errors() -> Iterator[None]:
+    """Turn exceptions into a sentence on stderr and an exit code, including any exception of a model file."""
     try:
-        with _ask(frozenset(name for name, given in options.items() if given)), handle_interrupt(interrupt):
+        with _log_if_verbose(), handle_interrupt(interrupt):
             yield
     except BaseException as error:
         users = find_user_place(error) is not None
         if isinstance(error, typer.Exit) and not users:
             raise
-        if debug:
+        if is_asked("debug"):
             traceback.print_exc()
         if isinstance(error, CtrlC) or (isinstance(error, KeyboardInterrupt) and not users):
             fail("interrupted before there was anything to write.", INTERRUPTED)
         if not (users or isinstance(error, Exception)):
             raise
-        _explain(error, users=users, debug=debug)
+        _explain(error, users=users)
 
 
-def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
+def _explain(error: BaseException, *, users: bool) -> NoReturn:
     """Print the error and exit; `users` is whether it was raised in a file of the user."""
     if users and not isinstance(error, InputError):
         fail(f"{describe_error(error)}. (--debug shows the full traceback.)")
@@ -147,7 +144,7 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
         fail(str(error))
     if isinstance(error, MemoryError):
         fail(f"not enough memory: {str(error) or 'the problem is too large'}.")
-    if not debug:
+    if not is_asked("debug"):
         traceback.print_exception(error)
     fail("this is an error in switchfit itself; please report it with the lines above.", INTERNAL_ERROR)
 
@@ -333,9 +330,12 @@ def command(*options: str) -> Callable[[Callable[..., None]], Callable[..., None
     def decorate(run: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(run)
         def run_command(**given: Any) -> None:
-            common = {name: given.pop(name) for name in names}
-            with report_errors(**common):
-                run(**given)
+            _asked.update(name for name in names if given.pop(name))
+            try:
+                with report_errors():
+                    run(**given)
+            finally:
+                _asked.clear()
 
         kind = inspect.Parameter.KEYWORD_ONLY
         added = [inspect.Parameter(name, kind, default=False, annotation=COMMON[name]) for name in names]

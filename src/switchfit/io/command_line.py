@@ -1,4 +1,4 @@
-"""What the command line reads and shows: times, samples, summaries of problems, results as JSON, tables as CSV."""
+"""What the command line reads and shows: times, samples, saved estimates, results as JSON, tables as CSV."""
 
 from __future__ import annotations
 
@@ -6,28 +6,27 @@ import contextlib
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimator import Estimate, Provenance, load_saved
 from switchfit.experiment_design import Design, DesignRecord
-from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.result import Fit
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
 from switchfit.io.logs import find_logs, name_files
+from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.building import ProblemFile, digest_file
 from switchfit.modes.result import ModeSearch
 from switchfit.online.state import Now
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.dates import as_date
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Structure
-from switchfit.problem.validation import shorten
+from switchfit.problem.validation import join_names, shorten
 from switchfit.report import formats
 from switchfit.report.frames import ERROR
 from switchfit.report.sentences import write_reason, write_step
@@ -37,7 +36,7 @@ from switchfit.runtime.frames import describe_frame
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.certificate import DerivativeCheck, Identifiability
-from switchfit.uncertainty.residuals import UNLIKELY, ChannelQuality, measure_quality
+from switchfit.uncertainty.residuals import measure_quality
 from switchfit.uncertainty.verdict import Verdict
 
 MOST_TIMES = 10_000_000
@@ -108,138 +107,6 @@ def _fill(y: Any) -> Any:
     return [np.nan if value is None else value for value in y] if isinstance(y, list) else y
 
 
-MOST_EXPERIMENTS = 3
-"""Experiments that are described on one screen."""
-
-MOST_UNKNOWNS = 10
-
-
-def describe(problem: Problem, *, full: bool = False) -> str:
-    """Return experiments, data and unknowns of a problem as text.
-
-    Parameters
-    ----------
-    problem : Problem
-    full : bool
-        All of them, not one screen.
-    """
-    unknowns, rows = problem.unknowns, []
-    numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
-    columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
-    dated = formats.list_dated(problem)
-    for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
-        first, least, most = (formats.format_time(number, run) for number in (value, lower, upper))
-        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{least}, {most}]"
-        known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
-        rows.append((name, f"{first}{'' if run else unit_suffix(unit)}", bounds, known, scale))
-    if not full and len(rows) > MOST_UNKNOWNS:
-        left = len(rows) - MOST_UNKNOWNS + 2
-        rows[-left:] = [(f"and {left} more", "", "", "", "")]
-    experiments = describe_experiments(problem.experiments, full=full)
-    return "\n".join([experiments, "Unknowns, first guess and bounds", *formats.format_table(rows, "<<<<<")])
-
-
-def describe_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
-    """Return modes, horizon and data of experiments as text.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    full : bool
-        All of them, not one screen.
-    """
-    shown = experiments if full else experiments[:MOST_EXPERIMENTS]
-    lines = []
-    for k, experiment in enumerate(shown, start=1):
-        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
-        lines += [f"  {line}" for line in _describe_experiment(experiment)]
-    if left := len(experiments) - len(shown):
-        lines.append(f"and {left} more experiments: --full lists them")
-    return "\n".join(lines)
-
-
-def describe_steps(problem: Problem, *, full: bool = False) -> str:
-    """Return which steps the integrator takes in each experiment at the first guess, how many, and why, as text.
-
-    Parameters
-    ----------
-    problem : Problem
-    full : bool
-        For all of them, not one screen.
-
-    Raises
-    ------
-    ValueError
-        If the model cannot be integrated at the guess.
-    """
-    evaluator = evaluator_of(problem)
-    rows = []
-    for name, structure, mesh in zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True):
-        run = "" if len(problem.experiments) == 1 else f"{name}: "
-        rows.append("; ".join([f"  {run}{mesh.cells:,} {_describe_method(structure)}", *map(str, mesh.stiffness)]))
-    if not full and len(rows) > MOST_EXPERIMENTS:
-        total = sum(mesh.cells for mesh in evaluator.meshes)
-        rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
-    return "\n".join(["Integration at the first guess", *rows])
-
-
-def _describe_method(structure: Structure) -> str:
-    """Return the kind of steps that the modes take, with the names of the implicit ones if they are not all."""
-    implicit = structure.list_implicit_modes()
-    if not implicit:
-        return "explicit steps"
-    if structure.has_one_method:
-        return "implicit steps"
-    return f"steps, implicit ones in {' and '.join(map(repr, implicit))}, else explicit"
-
-
-def _describe_experiment(experiment: Experiment) -> list[str]:
-    unit = formats.suffix_time(experiment)
-    ends = experiment.ends_of_modes(experiment.initial_times)
-    start, *times, end = (formats.format_time(time, experiment) for time in ends)
-    sequence = f"{' -> '.join(experiment.mode_sequence)} on [{start}, {end}]{unit}"
-    if experiment.has_free_tf:
-        sequence += " (tf is estimated)"
-    if experiment.taken_from_data:
-        sequence += f" ({' and '.join(experiment.taken_from_data)} from the data)"
-    lines = [f"{sequence}, at {', '.join(times)}{unit}" if times else sequence]
-    lines.append(formats.list_jumps(experiment.jump_times, experiment))
-    lines += [f"times in {text}"] if (text := formats.describe_origin(experiment)) else []
-    lines += [_describe_data(item, experiment) for item in experiment.data]
-    return [line for line in lines if line]
-
-
-def _describe_data(item: Any, experiment: Experiment) -> str:
-    """Return the channels of data, their span and number, and what is known of the sensor."""
-    if isinstance(item, ReferenceSignal):
-        knots, names = item.signal.knots, _join_channel_names(item.names, item.units, item.signal.channels)
-        span = formats.format_span(knots[0], knots[-1], experiment)
-        return f"reference signal of {names}, {span}, {len(knots)} knots"
-    if not isinstance(item, Measurements):
-        return type(item).__name__
-    unit = unit_suffix(experiment.time_unit)
-    step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
-    named = sorted({name for name in item.sigma_names if name})
-    said = [
-        f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}",
-        formats.format_span(item.times[0], item.times[-1], experiment),
-        f"typically {step:.4g}{unit} apart",
-        f"{item.values.size - item.count} values missing",
-        f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",
-        "noise unknown" if item.sigma is None else "",
-        f"sigma: {', '.join(named)}" if named else "",
-        f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
-    ]
-    return ", ".join(filter(None, said))
-
-
-def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
-    """Return names with their units, or the number of channels where they have no names."""
-    if names is None:
-        return f"{channels} channels"
-    return ", ".join(map(formats.label_quantity, names, units or ("",) * channels))
-
-
 KEYS = {
     "unknown": "name",
     "std_error": "standard_error",
@@ -263,8 +130,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
         "converged": estimate.status.successful,
-        "message": formats.add_dates(estimate.message, estimate),
-        **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
+        **_pick(estimate, "message", "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
         "unknowns": [{KEYS.get(name, name): cell for name, cell in row.items()} for row in list_unknowns(estimate)],
@@ -317,23 +183,6 @@ def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
         span |= {f"date_{end}": formats.format_iso(span[end], trajectory) or None for end in ("begin", "end")}
     dates = [formats.format_iso(time, trajectory) for time in trajectory.jump_times.tolist()]
     return found | {"origin": trajectory.origin.date, "jump_dates": dates}
-
-
-def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
-    """Return all nodes of a trajectory.
-
-    Parameters
-    ----------
-    name : str
-    trajectory : Trajectory
-    """
-    names = trajectory.state_names
-    return {
-        "name": name,
-        **_pick(trajectory, "time_unit", "times", "modes"),
-        "states": dict(zip(names, trajectory.states.T, strict=True)),
-        "units": dict(zip(names, trajectory.state_units, strict=True)),
-    }
 
 
 def summarize_validation(found: Validation) -> dict[str, Any]:
@@ -520,7 +369,6 @@ def write_runs(estimate: Estimate) -> str:
             "values": sum(channel.count for channel in here),
             "chi2": sum(channel.chi_square for channel in here) if here else np.nan,
             "explained": min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan),
-            "flags": "; ".join(_list_flags(estimate, name, here, len(quality.channels))),
         }
         if trajectory.origin is not None:
             row["origin"] = trajectory.origin.date
@@ -558,18 +406,6 @@ def write_trajectories(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
         for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
             table.writerow([name, t, *([date] if dated else []), mode, *x])
     return text.getvalue()
-
-
-def _list_flags(fit: Fit, run: str, channels: Sequence[ChannelQuality], tested: int) -> Iterator[str]:
-    """Yield the flags of a run; the false alarms of chi-square are shared among all channels `tested`."""
-    words = {"model": "residuals of {} correlated", "outliers": "outliers in {}", "sigma": "chi2 of {} too large"}
-    for channel in channels:
-        failed = [name for name, probability in channel.tests.items() if probability * tested < UNLIKELY]
-        yield from (words[name].format(channel.label) for name in failed)
-    for constraint in fit.active:
-        if constraint.position is not None and constraint.run == run:
-            state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"
-            yield f"mode {constraint.mode} {state}"
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], columns: Iterable[str] = ()) -> str:
@@ -663,7 +499,7 @@ def describe_fit(log: str, estimate: Estimate | None, error: str) -> dict[str, A
     """
     if estimate is None:
         return {"log": log, "verdict": "refused", "message": error}
-    message = "" if estimate.status.successful else formats.add_dates(estimate.message, estimate)
+    message = "" if estimate.status.successful else estimate.message
     if not message and not estimate.success:
         message = write_reason(estimate.verdict.reasons[0])
     quality, trajectory = measure_quality(estimate), estimate.trajectories[0]
@@ -718,12 +554,130 @@ def write_logs(rows: Sequence[Mapping[str, Any]], path: Path) -> str | bytes:
         return write_rows(rows, columns)
     import pyarrow.parquet
 
-    def find_unit(column: str) -> str:  # of an unknown, which has it in parentheses
-        name = column.removesuffix(ERROR.format(""))
-        return name[:-1].rpartition(" (")[2] if ERROR.format(name) in columns and name.endswith(")") else ""
-
     table, file = pyarrow.table({name: [row.get(name) for row in rows] for name in columns}), io.BytesIO()
-    units = map(find_unit, columns)
-    fields = [f.with_metadata({"unit": unit} if unit else {}) for f, unit in zip(table.schema, units, strict=True)]
-    pyarrow.parquet.write_table(table.cast(pyarrow.schema(fields)), file)
+    pyarrow.parquet.write_table(table, file)
     return file.getvalue()
+
+
+# --- saved estimates, whose problem is built again from what they were made from --------------------------------------
+
+
+def rebuild_problem(
+    path: Path, given: Provenance | None, folder: Path | None = None, log: Path | None = None
+) -> ProblemFile:
+    """Return the problem of a saved estimate, built from the text that was saved with it.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    given : Provenance or None
+        Of the saved estimate.
+    folder : Path, optional
+        Where the files are; left out, where the problem file was, seen from the folder of the saved estimate.
+    log : Path, optional
+        A log in place of that which was fitted.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be built again, or a file is missing or wrong.
+    """
+    if given is None:
+        raise InputError(f"{path} does not say what it was made from: fit its problem file again.")
+    if not given.problem_file:
+        raise InputError(
+            f"{path} does not have its problem, which was built in Python: functions are not saved, only hashes of the "
+            "data. Validate and compare in the script that fitted it: estimate.validate(...), sf.compare([...]). "
+            "switchfit fit PROBLEM.toml --out DIR saves what is needed."
+        )
+    where = Path(given.folder) if folder is None else folder
+    own = where / given.log if given.log else None
+    try:
+        return load_problem(where / given.problem_file, own if log is None else log, text=given.text)
+    except InputError as error:
+        needed = [digest for digest in given.files if log is None or digest.name.endswith(".py")]
+        changed = [each.name for each in needed if digest_file(where, where / each.name).sha256 != each.sha256]
+        if not changed:
+            raise
+        raise InputError(
+            f"{path} cannot be built again, since {join_names(changed)} in {where} is missing or has changed: {error} "
+            "Put the files as they were into a folder, and name it with --folder; or fit again."
+        ) from error
+
+
+def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Path | None) -> ProblemFile:
+    """Return the problem of another run: that of a problem file, or that of the saved estimate with another log.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    given : Provenance or None
+        Of the saved estimate.
+    other : Path
+        A problem file, whose name ends in .toml, or a log.
+    folder : Path or None
+        As in `rebuild_problem`.
+    """
+    if other.suffix.lower() == ".toml":
+        return load_problem(other)
+    return rebuild_problem(path, given, folder, other)
+
+
+def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, list[str]]:
+    """Return a saved estimate with its problem, and the files of the model that have changed, a line for each.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    folder : Path, optional
+        As in `rebuild_problem`.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be built again, or its data are no longer those that were fitted.
+    """
+    given = load_saved(path)[2]
+    loaded = rebuild_problem(path, given, folder)
+    estimate = Estimate.load(path, problem=loaded.problem)
+    if not _has_data(estimate, loaded.problem):
+        raise InputError(
+            f"{path} was fitted to other values than the files in {loaded.path.parent} have now: fit them again."
+        )
+    return estimate, list_changed_models(given, loaded)
+
+
+def _has_data(estimate: Estimate, problem: Problem) -> bool:
+    """Return whether the measurements of a problem are those that an estimate was fitted to."""
+    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
+    fitted = [each for run in estimate.comparisons for each in run if each.kind == "measurements"]
+    return len(items) == len(fitted) and all(
+        np.array_equal(item.times, each.times) and np.array_equal(item.values, each.measured, equal_nan=True)
+        for item, each in zip(items, fitted, strict=True)
+    )
+
+
+def list_changed_models(given: Provenance | None, loaded: ProblemFile) -> list[str]:
+    """Return the Python files that are not as they were when a fit was saved, a line for each.
+
+    Parameters
+    ----------
+    given : Provenance or None
+        Of the saved fit.
+    loaded : ProblemFile
+        The problem that was built again.
+    """
+    if given is None:
+        return []
+    before, now = (
+        {digest.name: digest.sha256 for digest in each.files if digest.name.endswith(".py")}
+        for each in (given, loaded.provenance)
+    )
+
+    def describe(name: str) -> str:
+        return "is new" if name not in before else "has changed" if name in now else "is no longer there"
+
+    return [f"{name} {describe(name)}" for name in {**before, **now} if before.get(name) != now.get(name)]

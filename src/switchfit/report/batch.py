@@ -163,16 +163,12 @@ def _label(fits: Fits, k: int) -> str:
 
 
 @draw_figure.register(Fits)
-def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-    """Draw a panel for each unknown, or for the one that is named: its histogram, or a row for each fit of a log.
+def plot_fits(fits: Fits) -> Figure:
+    """Draw a panel for each unknown: its histogram, or a row for each fit of a log.
 
     Parameters
     ----------
     fits : Fits
-    unknown : str, optional
-        The only one that is drawn.
-    ax : matplotlib.axes.Axes, optional
-        For one unknown.
     """
     shown, width, height, most, title = list(range(len(fits.theta_names))), 3.4, 2.7, 3, ""
     if isinstance(fits, Bootstrap):
@@ -185,13 +181,9 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
         order = fits.worst_first[:DRAWN_FITS]
         draw, title = partial(draw_rows, order=order), formats.count_worst(order, fits, "fits")
         width, height, most = 2.9, 0.9 + 0.2 * max(len(order), 5), DRAWN_UNKNOWNS
-        shown = select_unknowns(fits, DRAWN_UNKNOWNS) if unknown is None and ax is None else shown
+        shown = select_unknowns(fits, DRAWN_UNKNOWNS)
     if isinstance(fits, MonteCarlo | Bootstrap) and fits.success.sum() < 2:
         draw = _say_too_few
-    one = style.choose_panel([fits.theta_names[k] for k in shown], unknown, ax, "unknown")
-    if one is not None:
-        size = 6.4, max(height, 4.2)
-        return style.draw_on(ax, partial(draw, fits, shown[one]), size, legend=1.0, title=title)
     columns = max(min(len(shown), most), 1)
     rows = max(-(-len(shown) // columns), 1)
     figure = style.make_figure(width * columns + 0.5, height * rows + 0.5)

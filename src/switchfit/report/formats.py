@@ -10,11 +10,9 @@ the zone show twice.
 from __future__ import annotations
 
 import datetime
-import re
 import sys
 import textwrap
 from collections.abc import Collection, Iterable, Sequence, Sized
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -90,7 +88,6 @@ def get_unit(comparison: Comparison, channel: int, trajectory: Trajectory) -> st
 
 ENOUGH = 5.0
 """Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""
-_NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 PLACES = ((86400.0, ""), (3600.0, " %Hh"), (60.0, " %H:%M"), (1.0, " %H:%M:%S"))
 """Seconds of the last place that is shown, and what is shown behind the day."""
 
@@ -204,22 +201,6 @@ def list_dated(result: Fit | Problem | Fits) -> list[Timed | None]:
         for place in own[own >= 0].tolist() if run.origin is not None else ():
             found[place] = run
     return found
-
-
-def add_dates(text: str, fit: Fit) -> str:
-    """Return text with the date behind each time that it gives as a number, as in ``tau_1 = 3.5``.
-
-    Sentences are made of issues, which know names and numbers, but not what date a number is.
-    """
-    for name, run in zip(fit.theta_names, list_dated(fit), strict=True):
-        if run is not None:
-            before = rf"(?<![\w.]){re.escape(name)} (?:=|passes|(?:is )?at its (?:lower|upper) bound) "
-            text = re.sub(rf"({before})({_NUMBER})", partial(_append_date, run=run), text)
-    return text
-
-
-def _append_date(match: re.Match[str], run: Timed) -> str:
-    return f"{match[0]} ({format_time(float(match[2]), run)})"
 
 
 def _tell_apart(date: datetime.datetime) -> str:

@@ -384,7 +384,7 @@ def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatA
 
 @format_text.register(Insertion)
 def write_insertion(found: Insertion) -> str:
-    """Return which pulse lowers J fastest, the lowest minima of all modes, and what is not defined.
+    """Return which pulse lowers J fastest, and the lowest minima of all modes.
 
     Parameters
     ----------
@@ -400,14 +400,7 @@ def write_insertion(found: Insertion) -> str:
         interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
         rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
     table = format_table(rows, "<>><", ["mode", label_time(run, "time"), "dJ / d length", "in"])
-    undefined = [
-        f"{mode} in {found.modes[m]}"
-        for m in np.unique(found.active).tolist()
-        for k, mode in enumerate(found.modes)
-        if np.isnan(found.rate[found.active == m, k]).all()
-    ]
-    why = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
-    return formats.join_sections(wrap_text(text), table, wrap_text(why) if undefined else [])
+    return formats.join_sections(wrap_text(text), table)
 
 
 @draw_figure.register(Insertion)

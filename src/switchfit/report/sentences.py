@@ -163,10 +163,9 @@ def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
 _ONLY_UNREAD = "Converged (optimality {optimality:.1e}), but {unread}."
 _ENDINGS = {
     Status.CONVERGED: "Converged: the optimality {optimality:.1e} is below the tolerance {tolerance:.1e}.",
-    Status.CONVERGED_PRECISION: "Converged to the precision of the cost: the optimality {optimality:.1e} is above the "
-    "tolerance {tolerance:.1e}, but the decrease still predicted is below the error of the cost {cost:.6e}, by "
-    "rounding or by integration, or would move no unknown by a quarter of its standard error. Ask for a larger "
-    "tolerance.",
+    Status.CONVERGED_PRECISION: "Converged to the precision of the cost {cost:.6e}: the optimality {optimality:.1e} is "
+    "above the tolerance {tolerance:.1e}, but the decrease still predicted is below the error of the cost, or would "
+    "move no unknown by a quarter of its standard error. Ask for a larger tolerance.",
     Status.CONVERGED_AT_KINK: "Converged at a kink of the cost: {kinks}. The one-sided derivatives have opposite "
     "signs, so this is a minimiser although no gradient vanishes there; covariances do not apply to such an unknown.",
     Status.MAX_ITERATIONS: "Stopped after {iterations}{earlier} with optimality {optimality:.1e} above the tolerance "
@@ -179,9 +178,8 @@ _ENDINGS = {
     "{smallest_eigenvalue:.1e}, and no step along it decreased the cost. Start elsewhere.",
     Status.SINGULAR: "Converged, but the cost is flat to second order along {direction} (scaled eigenvalue "
     "{smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data.",
-    Status.COLLAPSED: "Converged (optimality {optimality:.1e}), with a mode that has no duration: the cost depends "
-    "neither on where it would stand nor on what acts in it alone ({idle}). Leave it out of mode_sequence, start from "
-    "another guess, or give min_duration.",
+    Status.COLLAPSED: "Converged (optimality {optimality:.1e}), with a mode that has no duration: the cost does not "
+    "depend on {idle}. Leave it out of mode_sequence, start from another guess, or give min_duration.",
     Status.INFEASIBLE: "The constraints are not met: {violated}. Start nearer to a point that meets them, or check "
     "that one can.",
     Status.ERROR: "The fit ended with an error, and was left where it was.{reason}",
@@ -310,10 +308,7 @@ EXAMPLES = {
 
 
 """Of a channel."""
-_DELAYED = (
-    " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, and the "
-    "fit may have ended at one. Fix the delay at its estimate to see."
-)
+_DELAYED = " J has a kink where a transition meets a late sample's moment: fix the delay at its estimate to see."
 """Behind why a line search failed if a delay is estimated."""
 
 _BOUND = "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known."
@@ -323,22 +318,22 @@ _ISSUES: dict[str, Sentence] = {
     # Before the numbers are believed
     "lower bound": _BOUND,
     "upper bound": _BOUND,
-    "idle times": "Where the collapsed mode would stand does not matter, since the same mode is active before and "
-    "after it: {names} may lie anywhere in between, and the numbers above say no more than that.",
-    "idle parameters": "{names}: acts only in modes that have collapsed. The data say nothing about it, and its value "
-    "above is where the fit left it, not an estimate.",
-    "no errors: no noise model": "No standard errors: the cost has no noise model. They need a cost that is made of "
-    "Measurements alone, with sigma or without.",
+    "idle times": "{names} may lie anywhere between its neighbours: the same mode is active before and after the "
+    "collapsed one.",
+    "idle parameters": "{names}: acts only in modes that have collapsed, so that its value above is no estimate.",
+    "no errors: no noise model": "No standard errors: they need a cost that is made of Measurements alone.",
     "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
-    "sigma too small": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too small, or the "
-    "model misses something (look at the residuals). If it is sigma, standard errors are too small by the root of "
-    "that.",
-    "sigma too large": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too large, or the "
-    "samples were smoothed before. If it is sigma, standard errors are too large by the root of that.",
-    "correlated residuals": "Neighbouring residuals are correlated in {correlated}: the model misses something there, "
-    "or the samples were smoothed before. The {values:.0f} values are worth about {effective:.0f} independent ones: "
-    "the standard errors, which take them as independent, are too small by a factor of up to {narrowing:.2g}.",
+    "sigma too small": "The reduced chi-square is {chi-square:.3g}, not 1: sigma is too small, or the model misses "
+    "something (look at the residuals). If it is sigma, standard errors are too small by the root of that.",
+    "sigma too large": "The reduced chi-square is {chi-square:.3g}, not 1: sigma is too large, or the samples were "
+    "smoothed before. If it is sigma, standard errors are too large by the root of that.",
+    "correlated residuals": "Neighbouring residuals are correlated in {correlated}: the {values:.0f} values are worth "
+    "about {effective:.0f} independent ones, and standard errors are too small by a factor of up to {narrowing:.2g}.",
+    "known to second order": "To first order the fitted values hardly depend on {names}: its standard errors are "
+    "{exact:.2g} and, from the Gauss-Newton matrix, {Gauss-Newton:.2g}. Trust its profile likelihood more than either.",
+    "covariances differ": "Standard errors from the exact Hessian and the Gauss-Newton matrix differ by up to a factor "
+    "{factor:.3g} (of {names}: {exact:.2g} and {Gauss-Newton:.2g}): trust profile likelihoods more.",
     "large integration error": "The integration error of {names} is {error:.1e}, relative: the numbers have fewer "
     "digits than it seems. Give the Problem a smaller rtol, or solver='stiff' if a mode is stiff.",
     # Failures of a certificate
@@ -349,9 +344,9 @@ _ISSUES: dict[str, Sentence] = {
     "Taylor orders": "the Taylor orders are {orders} instead of (any), 2, 3 or more: gradient or Hessian do not "
     "belong to J",
     # Failures of a derivative check
-    "cost not finite": "J or its derivatives are not finite at this theta or near it, and cannot be checked. The "
-    "states of sf.simulate(problem, theta) are NaN from where the solution breaks down. If a mode is stiff there, "
-    "explicit steps are unstable: give the Problem solver='stiff'. Else check at another theta",
+    "cost not finite": "J or its derivatives are not finite at this theta or near it. The states of "
+    "sf.simulate(problem, theta) are NaN from where the solution breaks down; for a stiff mode, give the Problem "
+    "solver='stiff'",
     "derivatives of another cost": "the derivatives do not belong to the cost",
     # Why a line search failed, or a fit ended with an error
     "wrong slope": "The gradient does not belong to the cost: along that direction it says {before:.3g}, differences "

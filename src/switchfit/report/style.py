@@ -1,9 +1,8 @@
 """The style that all figures share: colours, widths of lines, sizes of text, labels with units.
 
 One rule holds for every plot. A plot of one axes takes ``ax``: given an ``ax``, it draws there and returns it; without
-one, it makes a Figure and returns that. A plot with a panel for each unknown or channel returns a Figure of all, or
-draws the one that is named, with or without ``ax``. One whose panels belong together (a fit with its residuals)
-takes no ``ax``. Nothing touches pyplot or any other global state.
+one, it makes a Figure and returns that. A plot of several panels returns a Figure. Nothing touches pyplot or any other
+global state.
 
 matplotlib is imported where a figure is made: it takes longer to load than half of switchfit.
 """
@@ -13,9 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from switchfit.problem.validation import shorten
 from switchfit.report.formats import Timed, label_quantity, label_time
-from switchfit.runtime.presentation import Axes, Figure, join_first
+from switchfit.runtime.presentation import Axes, Figure
 
 if TYPE_CHECKING:
     from switchfit.report.axes import NotebookFigure
@@ -86,34 +84,6 @@ def draw_on(
     if legend:
         draw_legend_above(panel, title=title, height=legend)
     return turn_off_formulas(panel) if figure is None else turn_off_formulas(figure)
-
-
-def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:
-    """Return which panel of a figure of several to draw alone, in the given axes; None for all of them.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the panels.
-    given : str or None
-        The one that is asked for.
-    ax : matplotlib.axes.Axes or None
-    what : str
-        The argument that has the name.
-
-    Raises
-    ------
-    ValueError
-        If there is no such panel, or if axes are given for several.
-    """
-    listed = join_first(map(repr, names), 12)
-    if given is None:
-        if ax is not None and len(names) != 1:
-            raise ValueError(f"ax has room for one {what}: name it, such as {what}={names[0]!r}; there are {listed}.")
-        return None if ax is None else 0
-    if given not in names:
-        raise ValueError(f"{what} must be one of {listed}; got {shorten(given)}.")
-    return list(names).index(given)
 
 
 def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:

@@ -1,16 +1,21 @@
-"""The report of a fit as plain text, at most 100 columns wide where names allow it."""
+"""The report of a fit, and what a problem is made of, as plain text at most 100 columns wide where names allow it."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, Step
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
 from switchfit.report import formats
 from switchfit.report.formats import (
     Table,
@@ -25,7 +30,7 @@ from switchfit.report.formats import (
 from switchfit.report.frames import list_holds
 from switchfit.report.sentences import ALLOWED, format_share, write_agreement
 from switchfit.report.uncertainty import write_direction
-from switchfit.runtime.presentation import format_count, format_text
+from switchfit.runtime.presentation import format_count, format_text, join_first
 from switchfit.uncertainty.certificate import WEAK
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel, list_channels
 from switchfit.uncertainty.verdict import find_issues
@@ -45,19 +50,10 @@ SCREEN = {"experiments": 3, "channels": 6, "unknowns": 10, "fixed": 4, "directio
 
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
-METHODS = {
-    "auto": "SQP with the exact Hessian in a trust region",
-    "exact": "SQP with the exact Hessian and a line search",
-    "descent-first": "steepest descent until the Hessian is positive definite, then SQP with it",
-    "block-diagonal": "SQP with the block-diagonal Hessian",
-    "gauss-newton": "SQP with the Gauss-Newton matrix",
-    "none": "steepest descent",
-    "sharp": "SQP with the Gauss-Newton matrix, since the model is sharp",
-}
 
 
 @format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str, str] | None = None) -> str:
+def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
     """Return the report: the verdict, the problem, the course of the fit, its quality, the unknowns, the warnings.
 
     Parameters
@@ -67,8 +63,6 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
     full : bool
         All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
         screen.
-    files : mapping of str to str, optional
-        Names of the files with all "runs" and all "unknowns", for the lines that count what was left out.
 
     Returns
     -------
@@ -76,15 +70,13 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
         Several lines without a newline at the end; the verdict first.
     """
     limits = dict.fromkeys(SCREEN, sys.maxsize) if full else SCREEN
-    runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
-    course = [*list_experiments(estimate, limits["experiments"], runs), *list_course(estimate)]
-    where = f", of which more is explained{runs}"
-    channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=where)
+    course = [*list_experiments(estimate, limits["experiments"]), *list_course(estimate)]
+    channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=", of which more is explained")
     correlations = format_table(*tabulate_correlations(estimate), most=limits["others"])
     sections = {
         "Fit": _format_rows(course),
         "Quality of the fit": [*_format_rows(list_quality(estimate)), *([""] if channels else []), *channels],
-        "Unknowns": _format_unknowns(estimate, limits["unknowns"], unknowns),
+        "Unknowns": _format_unknowns(estimate, limits["unknowns"]),
         "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
         f"Correlations above {SMALL_CORRELATION:g}": correlations,
         "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
@@ -98,7 +90,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False, files: Mapping[str
 # --- sections ---------------------------------------------------------------------------------------------------------
 
 
-def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
+def list_experiments(fit: Fit, most: int) -> list[Row]:
     """Return each experiment's modes, its horizon, its data, and what its times are counted from.
 
     Parameters
@@ -106,8 +98,6 @@ def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
     fit : Fit
     most : int
         Number of experiments that are listed; the others are counted.
-    where : str, optional
-        Where to find the others, as the end of a sentence.
     """
     rows: list[Row] = []
     names = ["experiment"] if len(fit.trajectories) == 1 else fit.run_names
@@ -122,7 +112,7 @@ def list_experiments(fit: Fit, most: int, where: str = "") -> list[Row]:
         if origins[e] and origins[e] not in origins[e - 1 : e]:
             rows.append(("times", origins[e]))
     if len(names) > most:
-        rows.append(("", f"and {len(names) - most} more experiments{where}"))
+        rows.append(("", f"and {len(names) - most} more experiments"))
     return rows
 
 
@@ -139,13 +129,13 @@ def _format_data(comparison: Comparison) -> str:
 
 
 def list_course(fit: Fit) -> list[Row]:
-    """Return the method, the effort, the engine, the strategies with the lowest J after each, and how the fit ended.
+    """Return the kind of Hessian, the effort, the engine, the strategies with the lowest J each, and how the fit ended.
 
     Parameters
     ----------
     fit : Fit
     """
-    rows = [("method", METHODS.get(fit.hessian_kind, fit.hessian_kind))]
+    rows = [("method", f"SQP, hessian = {fit.hessian_kind!r}")]
     iterations, evaluations = format_count(fit.iterations, "iteration"), format_count(fit.evaluations, "evaluation")
     effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
     if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
@@ -156,7 +146,7 @@ def list_course(fit: Fit) -> list[Row]:
     if fit.starts is not None and fit.starts[0]:
         ended = next((step.ended for step in reversed(fit.steps) if step.ended), "")
         rows.append(("starts", f"{write_agreement(*fit.starts)}{_ENDED.get(ended, '')}"))
-    return [*rows, ("status", formats.add_dates(fit.message, fit))]
+    return [*rows, ("status", fit.message)]
 
 
 _ENDED = {
@@ -237,11 +227,11 @@ def _format_size(values: FloatArray, digits: int) -> str:
     return f"{np.sqrt(np.mean(known**2)):.{digits}g}" if len(known) else ""
 
 
-def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
+def _format_unknowns(fit: Fit, most: int) -> list[str]:
     """Return the table of the unknowns as lines; those that are left out are counted."""
     table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
     more = len(fit.theta) - len(shown)
-    lines = format_table(*table) + ([f"  and {more} more unknowns{where}"] if more else [])
+    lines = format_table(*table) + ([f"  and {more} more unknowns"] if more else [])
     return [*lines, *wrap_text(note, "  ", "  ")] if note else lines
 
 
@@ -346,11 +336,9 @@ def tabulate_fixed(fit: Fit) -> Table:
         time, unit = format_time(t.time, run, digits=8), format_unit(t.unit) if run.origin is None else ""
         rows.append([t.name, time, unit, f"{t.before} -> {t.after}"])
     for name in fit.fixed:
-        text = np.array2string(
-            np.asarray(fit.parameters[name]), threshold=6, edgeitems=2, separator=", ",
-            formatter={"float_kind": lambda number: f"{number:.8g}"},
-        )  # fmt: skip
-        rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
+        numbers = [f"{number:.8g}" for number in np.ravel(fit.parameters[name])]
+        text = join_first(numbers) if len(numbers) == 1 else f"[{join_first(numbers)}]"
+        rows.append([name, text, format_unit(fit.parameter_units[name]), ""])
     return Table(rows, "<<<<")
 
 
@@ -406,7 +394,119 @@ def list_warnings(estimate: Estimate) -> list[str]:
     """
     reasons = {reason.kind for reason in estimate.verdict.reasons}
     covered = reasons.union(*(_COVERED.get(kind, set()) for kind in reasons))
-    return [formats.add_dates(str(issue), estimate) for issue in find_issues(estimate) if issue.kind not in covered]
+    return [str(issue) for issue in find_issues(estimate) if issue.kind not in covered]
+
+
+# --- a problem before its fit -----------------------------------------------------------------------------------------
+
+
+@format_text.register(Problem)
+def write_problem(problem: Problem, *, full: bool = False) -> str:
+    """Return experiments, data and unknowns of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    full : bool
+        All of them, not one screen.
+    """
+    unknowns, rows = problem.unknowns, []
+    numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
+    columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
+    dated = formats.list_dated(problem)
+    for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
+        first, least, most = (format_time(number, run) for number in (value, lower, upper))
+        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{least}, {most}]"
+        known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
+        rows.append((name, f"{first}{'' if run else unit_suffix(unit)}", bounds, known, scale))
+    lines = format_table(rows, "<<<<<", most=sys.maxsize if full else SCREEN["unknowns"])
+    experiments = write_experiments(problem.experiments, full=full)
+    return "\n".join([experiments, "Unknowns, first guess and bounds", *lines])
+
+
+def write_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
+    """Return modes, horizon and data of experiments.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    full : bool
+        All of them, not one screen.
+    """
+    shown = experiments if full else experiments[: SCREEN["experiments"]]
+    lines = []
+    for k, experiment in enumerate(shown, start=1):
+        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
+        lines += [f"  {line}" for line in _describe_experiment(experiment)]
+    if left := len(experiments) - len(shown):
+        lines.append(f"and {left} more experiments: --full lists them")
+    return "\n".join(lines)
+
+
+def _describe_experiment(experiment: Experiment) -> list[str]:
+    unit = formats.suffix_time(experiment)
+    ends = experiment.ends_of_modes(experiment.initial_times)
+    start, *times, end = (format_time(time, experiment) for time in ends)
+    sequence = f"{' -> '.join(experiment.mode_sequence)} on [{start}, {end}]{unit}"
+    if experiment.has_free_tf:
+        sequence += " (tf is estimated)"
+    if experiment.taken_from_data:
+        sequence += f" ({' and '.join(experiment.taken_from_data)} from the data)"
+    lines = [f"{sequence}, at {', '.join(times)}{unit}" if times else sequence]
+    lines.append(formats.list_jumps(experiment.jump_times, experiment))
+    lines += [f"times in {text}"] if (text := formats.describe_origin(experiment)) else []
+    lines += [_describe_data(item, experiment) for item in experiment.data]
+    return [line for line in lines if line]
+
+
+def _describe_data(item: Any, experiment: Experiment) -> str:
+    """Return the channels of data, their span and number, and what is known of the sensor."""
+    if isinstance(item, ReferenceSignal):
+        knots, names = item.signal.knots, _join_channel_names(item.names, item.units, item.signal.channels)
+        span = formats.format_span(knots[0], knots[-1], experiment)
+        return f"reference signal of {names}, {span}, {len(knots)} knots"
+    if not isinstance(item, Measurements):
+        return type(item).__name__
+    unit = unit_suffix(experiment.time_unit)
+    step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
+    named = sorted({name for name in item.sigma_names if name})
+    said = [
+        f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}",
+        formats.format_span(item.times[0], item.times[-1], experiment),
+        f"typically {step:.4g}{unit} apart",
+        f"{item.values.size - item.count} values missing",
+        f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",
+        "noise unknown" if item.sigma is None else "",
+        f"sigma: {', '.join(named)}" if named else "",
+        f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
+    ]
+    return ", ".join(filter(None, said))
+
+
+def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
+    """Return names with their units, or the number of channels where they have no names."""
+    if names is None:
+        return f"{channels} channels"
+    return ", ".join(map(formats.label_quantity, names, units or ("",) * channels))
+
+
+def write_steps(evaluator: Evaluator, *, full: bool = False) -> str:
+    """Return which steps the integrator takes in each experiment at the first guess, how many, and why.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    full : bool
+        For all of them, not one screen.
+    """
+    rows, names = [], evaluator.problem.run_names
+    for name, structure, mesh in zip(names, evaluator.structures, evaluator.meshes, strict=True):
+        implicit = " and ".join(map(repr, structure.list_implicit_modes()))
+        kind = "implicit steps" if structure.has_one_method else f"steps, implicit ones in {implicit}, else explicit"
+        kind = kind if implicit else "explicit steps"
+        rows.append(("; ".join([f"{mesh.cells:,} {kind}", *map(str, mesh.stiffness)]), name if len(names) > 1 else ""))
+    lines = format_table(rows, "<<", most=sys.maxsize if full else SCREEN["experiments"])
+    return "\n".join(["Integration at the first guess", *lines])
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import formats, style
 from switchfit.report.formats import Table, Timed, format_table, format_time, wrap_text
@@ -39,17 +38,14 @@ def write_certificate(certificate: Certificate) -> str:
     return "\n".join(format_table(*tabulate_certificate(certificate), indent=""))
 
 
-def tabulate_certificate(certificate: Certificate, fit: Fit | None = None) -> Table:
+def tabulate_certificate(certificate: Certificate) -> Table:
     """Return every check with its number, and the verdict, without a header.
 
     Parameters
     ----------
     certificate : Certificate
-    fit : Fit, optional
-        Where it is given, active constraints of times have their dates.
     """
     held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
-    held = held if fit is None else formats.add_dates(held, fit)
     failures = "; ".join(map(str, certificate.failures))
     error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
     rows = [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
 from switchfit.experiment_design import Design
@@ -13,7 +11,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.report import formats, plot, style
 from switchfit.report.formats import Table, format_table, join_sections, label_quantity, wrap_text
 from switchfit.report.sentences import ALLOWED, join_words
-from switchfit.report.style import FIT, LINE, LINE_COLOURS, SHADE, SMALL, THIN, TRANSITION
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, SMALL, THIN, TRANSITION
 from switchfit.report.uncertainty import format_probability
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text, join_first
 from switchfit.strategy.comparison import ModelComparison
@@ -21,66 +19,40 @@ from switchfit.strategy.validation import Validation, convert_to_percent
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.residuals import explain_channel, list_channels
 
-RULED_OUT = 10.0
-"""Difference in BIC from which the evidence against a model is very strong."""
-ABOVE_NAMES = 1.08
-"""Where legends are in the heights of axes whose modes are named above."""
-
-
 # --- forecasts --------------------------------------------------------------------------------------------------------
 
 
 @draw_figure.register(Prediction)
-def plot_prediction(
-    prediction: Prediction, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None
-) -> Axes | Figure:
+def plot_prediction(prediction: Prediction, *, level: float = 0.95) -> Figure:
     """Draw each output over time with its bands, what was measured, the modes, and where the data end.
 
     Parameters
     ----------
     prediction : Prediction
-    channel : str, optional
-        The only one that is drawn.
     level : float, between 0 and 1
-    ax : matplotlib.axes.Axes, optional
-        For one channel.
     """
-    names = [c.names[k] for c, k in plot.list_outputs(prediction.fit, prediction.experiment)]
-    one = style.choose_panel(names, channel, ax, "channel")
-    if one is not None:
-        return style.draw_on(ax, partial(draw_prediction, prediction, one, level), (8.0, 3.5), legend=ABOVE_NAMES)
-    figure = style.make_figure(8.0, 0.9 + 2.6 * len(names))
-    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    for number, panel in enumerate(axes):
-        draw_prediction(prediction, number, level, panel, labels=number == 0)
-        panel.label_outer()
+    outputs = plot.list_outputs(prediction.fit, prediction.experiment)
+    figure = style.make_figure(8.0, 0.9 + 2.6 * len(outputs))
+    axes = figure.subplots(len(outputs), 1, sharex=True, squeeze=False)[:, 0]
+    for number, (comparison, k) in enumerate(outputs):
+        _draw_prediction(prediction, number, comparison, k, level, axes[number])
+        axes[number].label_outer()
     figure.draw_legend(style.collect_handles(axes), loc="outside upper right")
     return style.turn_off_formulas(figure)
 
 
-def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes, *, labels: bool = True) -> None:
-    """Draw one output over time with its bands, what was measured, the modes, and where the data end.
-
-    Parameters
-    ----------
-    prediction : Prediction
-    number : int, from 0
-        Which output.
-    level : float, between 0 and 1
-    ax : matplotlib.axes.Axes
-    labels : bool, optional
-        Whether to name the modes above.
-    """
-    fit, e = prediction.fit, prediction.experiment
-    comparison, k = plot.list_outputs(fit, e)[number]
-    trajectory = fit.trajectories[e]
+def _draw_prediction(
+    prediction: Prediction, number: int, comparison: Comparison, k: int, level: float, ax: Axes
+) -> None:
+    """Draw one output, whose modes are named above the first."""
+    trajectory = prediction.fit.trajectories[prediction.experiment]
     order, end = np.argsort(prediction.times, kind="stable"), trajectory.mode_spans[-1][2]
     times = prediction.times[order]
     y = (prediction.outputs if prediction.output_names else prediction.states)[order, number]
     plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
     plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
-    plot.plot_modes(trajectory, ax, labels=labels)
+    plot.plot_modes(trajectory, ax, labels=number == 0)
     first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
     if last > end:
         colour = plot.choose_mode_colours([trajectory])[trajectory.mode_spans[-1][0]]
@@ -145,60 +117,23 @@ def tabulate_predicted(found: Validation) -> Table:
 
 
 @draw_figure.register(Validation)
-def plot_validation(
-    found: Validation, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None
-) -> Axes | Figure:
+def plot_validation(found: Validation, *, level: float = 0.95) -> Figure:
     """Draw measured against predicted for each channel with bands, and the residuals below.
 
     Parameters
     ----------
     found : Validation
         Of more than ten runs the first ten are shown.
-    channel : str, optional
-        The only one that is drawn, as in ``found.channels``; without its residuals.
     level : float, between 0 and 1
-    ax : matplotlib.axes.Axes, optional
-        For one channel.
     """
-    runs = range(len(found.comparisons))
-    panels = [(e, output) for e in runs for output in range(len(plot.list_outputs(found, e)))]
-    prefixes = [f"{name} " if len(runs) > 1 else "" for name in found.run_names]
-    names = [f"{prefixes[e]}{c.names[k]}" for e in runs for c, k in plot.list_outputs(found, e)]
-    one = style.choose_panel(names, channel, ax, "channel")
-    if one is not None:
-        return style.draw_on(ax, partial(draw_validation, found, *panels[one], level), (8.0, 3.9), legend=ABOVE_NAMES)
-    intervals = {e: _find_intervals(found, e, level) for e in runs[: plot.LARGEST_FIGURE]}
+    runs = range(min(len(found.comparisons), plot.LARGEST_FIGURE))
+    intervals = {e: _find_intervals(found, e, level) for e in runs}
     figure = plot.plot_runs(found, intervals, dict(enumerate(found.predictions)), level=level, label="predicted")
     for e, block in enumerate(figure.subfigs):
         for panel, (comparison, k) in zip(block.axes[::2], plot.list_outputs(found, e), strict=False):
-            _write_percent(comparison, k, panel)
+            text = f"fit {convert_to_percent(explain_channel(comparison, k)):.1f} %"
+            panel.annotate(text, (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
     return figure
-
-
-def draw_validation(found: Validation, e: int, output: int, level: float, ax: Axes) -> None:
-    """Draw measured against predicted for one channel with bands.
-
-    Parameters
-    ----------
-    found : Validation
-    e, output : int, from 0
-        Which run, and which of its outputs.
-    level : float, between 0 and 1
-    ax : matplotlib.axes.Axes
-    """
-    trajectory, (comparison, k) = found.trajectories[e], plot.list_outputs(found, e)[output]
-    plot.plot_comparison(comparison, k, ax, label="predicted")
-    if found.predictions:
-        plot.plot_bands(found.predictions[e], output, level, ax)
-    plot.plot_modes(trajectory, ax, colours=plot.choose_mode_colours(found.trajectories))
-    times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
-    plot.plot_transitions(times, _find_intervals(found, e, level), ax, level=level)
-    _write_percent(comparison, k, ax)
-
-
-def _write_percent(comparison: Comparison, k: int, ax: Axes) -> None:
-    percent = convert_to_percent(explain_channel(comparison, k))
-    ax.annotate(f"fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
 
 
 def _find_intervals(found: Validation, e: int, level: float) -> FloatArray:
@@ -228,7 +163,7 @@ def write_comparison(found: ModelComparison) -> str:
     return join_sections(wrap_text(write_best(found)), lines)
 
 
-_STRENGTHS = ((RULED_OUT, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
+_STRENGTHS = ((10.0, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
 """Words of Kass and Raftery (1995) for differences in BIC."""
 SAME = 0.05
 """Difference in BIC below which models are as good as each other: it would be printed as 0.0."""
@@ -265,32 +200,6 @@ def tabulate_models(found: ModelComparison) -> Table:
         bic = [f"{found.bic[k]:.2f}", f"{found.delta_bic[k]:.2f}"]
         rows.append([found.names[k], f"{found.unknown_counts[k]}", f"{found.log_likelihood[k]:.2f}", *aicc, *bic])
     return Table(rows, "<" + ">" * 7, titles)
-
-
-@draw_figure.register(ModelComparison)
-def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw by how much AICc and BIC of each model exceed the smallest, the best model on top.
-
-    Parameters
-    ----------
-    found : ModelComparison
-    ax : matplotlib.axes.Axes, optional
-    """
-    size = 6.4, 1.3 + 0.42 * len(found.names)
-    return style.draw_on(ax, partial(_draw_differences, found), size, legend=1.0)
-
-
-def _draw_differences(found: ModelComparison, ax: Axes) -> None:
-    order, places = _list_best_first(found), np.arange(len(found.names))
-    ax.barh(places - 0.2, found.delta_bic[order], height=0.36, color=FIT, label="BIC")
-    ax.barh(places + 0.2, found.delta_aicc[order], height=0.36, color=SHADE, label="AICc")
-    if np.nanmax([found.delta_bic, found.delta_aicc]) > 100:  # a hopeless model would hide the others
-        ax.set_xscale("symlog", linthresh=10.0)
-    ax.set_xlim(left=0.0)
-    ax.set_xlabel("difference from the smallest")
-    ax.axvline(RULED_OUT, color=TRANSITION, linewidth=THIN, linestyle=":", label=f"{RULED_OUT:g}: as good as ruled out")
-    ax.set_ylim(len(places) - 0.5, -0.5)
-    ax.set_yticks(places, [found.names[k] for k in order])
 
 
 def _list_best_first(found: ModelComparison) -> list[int]:

@@ -34,7 +34,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import as_instance, as_labels, as_sequence
 from switchfit.runtime import special
-from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
+from switchfit.runtime.presentation import Displayed, format_line, join_first
 
 
 def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comparison]]) -> float:
@@ -169,29 +169,6 @@ class ModelComparison(Displayed):
     def best(self) -> str:
         """Name of the model with the smallest BIC."""
         return self.names[int(np.argmin(self.bic))]
-
-    def plot(self, *, ax: Drawn | None = None) -> Drawn:
-        """Draw the differences in AICc and BIC.
-
-        Parameters
-        ----------
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        compare
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> sf.compare([fit, fit], names=("one", "same")).plot().axes[0].get_xlabel()
-        'difference from the smallest'
-        """
-        return draw_figure(self, ax=ax)
 
     def __repr__(self) -> str:
         models = (f"{name} (BIC +{gap:.3g})" for name, gap in zip(self.names, self.delta_bic.tolist(), strict=True))

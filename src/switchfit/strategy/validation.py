@@ -47,7 +47,7 @@ from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import as_level, as_names, join_names, list_columns, shorten
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
-from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first, validate_on
+from switchfit.runtime.presentation import Displayed, Figure, draw_figure, format_line, join_first, validate_on
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.known_order import fix_unknowns
 from switchfit.uncertainty.prediction import (
@@ -481,17 +481,13 @@ class Validation(Displayed):
         """
         return self.fit.quantile(level)
 
-    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Drawn | None = None) -> Drawn:
+    def plot(self, *, level: float = 0.95) -> Figure:
         """Draw measured against predicted with bands, and the residuals below.
 
         Parameters
         ----------
-        channel : str, optional
-            The only one that is drawn, as in `channels`, without its residuals; left out, all.
         level : float, between 0 and 1
             Level of the bands, and of the intervals of transition times.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one channel.
 
         See Also
         --------
@@ -506,7 +502,8 @@ class Validation(Displayed):
         >>> len(fit.validate(fit.problem).plot().axes)
         2
         """
-        return draw_figure(self, channel=channel, level=as_level(level), ax=ax)
+        figure: Figure = draw_figure(self, level=as_level(level))
+        return figure
 
     def __repr__(self) -> str:
         fits = (f"{name} {percent:.1f} %" for name, percent in self.channels.items())

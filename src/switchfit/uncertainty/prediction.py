@@ -49,7 +49,7 @@ from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_index, as_instance, as_level
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import Drawn, draw_figure, format_html, format_line, join_first
+from switchfit.runtime.presentation import Figure, draw_figure, format_html, format_line, join_first
 
 
 class Points(NamedTuple):
@@ -324,17 +324,13 @@ class Prediction(Tabular):
         """
         return _build_band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
 
-    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Drawn | None = None) -> Drawn:
+    def plot(self, *, level: float = 0.95) -> Figure:
         """Draw the outputs over time with both bands, beside what was measured.
 
         Parameters
         ----------
-        channel : str, optional
-            The only one that is drawn; left out, all.
         level : float, between 0 and 1
             Level of the bands.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one channel.
 
         See Also
         --------
@@ -350,7 +346,8 @@ class Prediction(Tabular):
         >>> len(fit.predict(np.linspace(0.0, 9.0, 200)).plot().axes)
         1
         """
-        return draw_figure(self, channel=channel, level=as_level(level), ax=ax)
+        figure: Figure = draw_figure(self, level=as_level(level))
+        return figure
 
 
 def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """Results as HTML: in a notebook, their text with a small figure below; the report of a fit as one file.
 
 The file needs no network: templates of Jinja2, figures of Bokeh where sliders move them, of Matplotlib elsewhere. Both
-libraries come with the extra ``report``. They, `page`, which puts the file together and draws what moves, and `curves`,
-which prepares its numbers, are imported when a page is made, not with switchfit.
+libraries come with the extra ``report``. They, and `page`, which puts the file together, are
+imported when a page is made, not with switchfit.
 """
 
 from __future__ import annotations
@@ -12,22 +12,17 @@ import io
 from html import escape
 from typing import Any
 
-import numpy as np
-
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
 from switchfit.problem.problem import Problem
-from switchfit.report.formats import describe_origin, format_span, format_table, format_time, format_unit, list_dated
-from switchfit.runtime.errors import MissingExtraError
-from switchfit.runtime.presentation import Displayed, format_html, format_page
+from switchfit.runtime.errors import import_library
+from switchfit.runtime.presentation import Displayed, format_html, format_page, format_text
 from switchfit.uncertainty.prediction import Prediction
 
 DOTS = 64
 """Dots per inch of the figures in a notebook."""
 LARGEST_FIGURE = 4
 """Experiments or outputs up to which a result shows its figure; with more of them it is no small one."""
-MOST_ROWS = 20
-"""Experiments or unknowns of a problem in a table."""
 
 
 @format_page.register(Estimate)
@@ -45,12 +40,10 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     MissingExtraError
         If Bokeh or Jinja2 are not installed.
     """
-    try:
-        from switchfit.report.html.page import build_page
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"an HTML report needs {error.name}, not installed here: pip install 'switchfit[report]'"
-        ) from error
+    for library in ("bokeh", "jinja2"):
+        import_library(library, "an HTML report", "'switchfit[report]'")
+    from switchfit.report.html.page import build_page
+
     return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem())
 
 
@@ -62,13 +55,12 @@ def show_result(result: Any) -> str:
     Parameters
     ----------
     result : object
-        With a method ``plot()``.
     """
     is_forecast = isinstance(result, Prediction)
     size = len(result.output_names if is_forecast else getattr(result, "trajectories", ()))
     is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
     image = ""
-    if not is_empty and size <= LARGEST_FIGURE:
+    if hasattr(result, "plot") and not is_empty and size <= LARGEST_FIGURE:
         picture = io.BytesIO()
         result.plot().savefig(picture, format="png", dpi=DOTS)
         source = f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"
@@ -84,19 +76,4 @@ def show_problem(problem: Problem) -> str:
     ----------
     problem : Problem
     """
-    runs, rows = [], []
-    for name, experiment in zip(problem.run_names, problem.experiments, strict=True):
-        ends = experiment.ends_of_modes(experiment.initial_times)
-        samples = sum(getattr(item, "count", 0) for item in experiment.data)
-        horizon = f"{format_span(ends[0], ends[-1], experiment)} {describe_origin(experiment)}".rstrip()
-        runs.append([name, " -> ".join(experiment.mode_sequence), horizon, f"{samples}" if samples else ""])
-    own = problem.unknowns
-    columns = zip(own.names, own.initial, own.lower, own.upper, own.units, own.priors.texts(), strict=True)
-    for run, (name, value, lower, upper, unit, prior) in zip(list_dated(problem), columns, strict=True):
-        bounds = [format_time(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
-        rows.append([name, format_time(value, run), *bounds, "" if run else format_unit(unit), prior])
-    lines = format_table(runs, "<<<>", ["experiment", "modes", "horizon", "samples"], most=MOST_ROWS)
-    titles = ["unknown", "first guess", "lower", "upper", "", "prior"]
-    lines += ["", *format_table(rows, "<>>><<", titles, most=MOST_ROWS)]
-    text = escape("\n".join(lines))
-    return f"<div><pre>{text}</pre></div>"
+    return f"<div><pre>{escape(format_text(problem))}</pre></div>"
