@@ -20,8 +20,11 @@ from switchfit.discretization.mesh import build_arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
 
+# A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
+SMOOTH_KINDS = ("running", "reference", "terminal")
 VARIATIONS = [("plain", kind) for kind in reversed(KINDS)]
 VARIATIONS += [("resets", kind) for kind in reversed(KINDS)]
+VARIATIONS += [(name, kind) for name in ("stiff", "mixed") for kind in SMOOTH_KINDS]
 
 
 def blocks(N: int, gradient: np.ndarray, hessian: np.ndarray) -> dict[str, float]:
@@ -38,6 +41,8 @@ def blocks(N: int, gradient: np.ndarray, hessian: np.ndarray) -> dict[str, float
 
 
 ORDER = {"tau-tau, i = j": 4.0}
+ROUNDING = {"stiff": 1e-10, "mixed": 1e-10}
+"""Relative gaps that need not close any further; the Jacobian of the stiff mode amplifies rounding."""
 BLOCKS = ("D_tau J", "D_p J", "tau-tau, i = j", "tau-tau, i > j", "tau-p", "p-p")
 
 
@@ -46,7 +51,7 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
     """Gap of each block, relative to the largest entry, on meshes that are halved again and again."""
     this = case(name)
     found = []
-    for halvings in (2, 3):
+    for halvings in (1, 2) if name in ROUNDING else (2, 3):
         given = this.arguments(kind, halvings=halvings), this.tau, P0
         paper, discrete = this.paper(*given), this.discrete(*given)
         assert paper.cost == pytest.approx(discrete.cost, rel=1e-12)
@@ -57,7 +62,7 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
 
 
 SLOW = {v for v in VARIATIONS if v[0] != "resets"} | {("resets", "all")}
-"""What other variations test as well: with resets, with all costs apart."""
+"""What other variations test as well: with resets, with all costs apart; implicit steps are the same equations."""
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -67,7 +72,7 @@ SLOW = {v for v in VARIATIONS if v[0] != "resets"} | {("resets", "all")}
 def test_gap_closes_at_the_order_of_the_integrator(name: str, kind: str, block: str) -> None:
     coarse, fine = (gap[block] for gap in gaps(name, kind))
     at_least = ORDER.get(block, 5.0) - 0.8
-    assert np.log2(coarse / fine) > at_least, f"{block}: {coarse:.1e} to {fine:.1e}"
+    assert fine < ROUNDING.get(name, 0.0) or np.log2(coarse / fine) > at_least, f"{block}: {coarse:.1e} to {fine:.1e}"
 
 
 @pytest.mark.parametrize("kind", KINDS)

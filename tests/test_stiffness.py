@@ -247,7 +247,9 @@ def test_only_the_stiff_mode_takes_implicit_steps():
         assert cells == pytest.approx(expected, rel=0.05)
 
 
-@pytest.mark.parametrize("method", ["auto", pytest.param("forward", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["auto", *(pytest.param(way, marks=pytest.mark.slow) for way in ("forward", "adjoint"))]
+)
 def test_three_modes_have_the_derivatives_of_their_closed_form(method):
     theta = TRUTH + np.array([0.21, -0.13, 0.05])
 

@@ -57,17 +57,21 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 
 from switchfit.discretization.mesh import Arguments, Samples, find_row_ending_cell
 from switchfit.discretization.model import Field, Model, Piece
 from switchfit.discretization.propagation import (
     Path,
     compute_path_cost,
+    find_late_rows,
     pick_at_cells,
     propagate,
+    step_to_late_sample,
+    switch_method,
     switch_mode,
 )
-from switchfit.discretization.rows import EXPLICIT, combine
+from switchfit.discretization.rows import Tableau, combine
 from switchfit.problem.structure import Structure
 
 Array = jax.Array
@@ -177,7 +181,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
 
     Notes
     -----
-    For explicit steps; in stiff modes the adjoints have boundary layers, which a mesh for the state does not resolve.
+    With the stiff solver, each row takes a dense solve of 3 (n + n^2 + n M) unknowns: use it for small n only.
     """
     path = propagate(model, tau, p, side)
     transitions = [evaluate_transition(model, path, i, tau[i], p) for i in range(model.structure.N)]
@@ -276,7 +280,7 @@ def integrate_sensitivities(
     def of_mode(mode: int) -> Callable[..., tuple[Array, Array]]:
         def stages(start: Array, end: Array, piece: Piece, states: Array) -> tuple[Array, Array]:
             jacobians = jax.jacfwd(model.field(mode, piece), argnums=(1, 2))
-            times = start + EXPLICIT.c * (end - start)
+            times = start + model.tableaus[mode].c * (end - start)
             return jax.vmap(lambda t, x: jacobians(t, x, p))(times, states)
 
         return stages
@@ -293,7 +297,10 @@ def integrate_sensitivities(
         now = where(opens, jumped, now)
         jacobians = switch_mode(model, segment, of_mode, start, end, piece, states)
 
-        after = step_linear(rate, end - start, jacobians, now)[1]
+        def step(tableau: Tableau) -> Callable[..., Sensitivities]:
+            return lambda now, jacobians: step_linear(tableau, rate, end - start, jacobians, now)[1]
+
+        after = switch_method(model, segment, step, now, jacobians)
         return after, (now, after)
 
     layout = path.layout
@@ -338,28 +345,32 @@ def sweep_backward(
     `Dp_x_before` and `Dp_x_after` (R, n, M) are D_p x at the start and at the end of each row.
     """
     final, total = add_point_cost(model.terminal, path.after[-1], Dp_x_after[-1], p)
-    jumps, sampled = add_sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
+    jumps, late, sampled = add_sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
     total = add(total, sampled)
 
-    def step(adjoints: Adjoints, total: Quadratures, h: Array, d: Along) -> tuple[Adjoints, Quadratures]:
-        states, adjoints = step_linear(evaluate_adjoint_rate, -h, d, adjoints)
-        rates = jax.vmap(evaluate_integrands)(d, states)
-        return adjoints, jax.tree.map(lambda a, r: a + h * jnp.tensordot(EXPLICIT.b, r, 1), total, rates)
+    def step(tableau: Tableau) -> Callable[..., tuple[Adjoints, Quadratures]]:
+        def back(adjoints: Adjoints, total: Quadratures, h: Array, d: Along) -> tuple[Adjoints, Quadratures]:
+            states, adjoints = step_linear(tableau, evaluate_adjoint_rate, -h, d, adjoints)
+            rates, b = jax.vmap(evaluate_integrands)(d, states), jnp.asarray(tableau.b)
+            return adjoints, jax.tree.map(lambda a, r: a + h * jnp.tensordot(b, r, 1), total, rates)
+
+        return back
 
     def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
-        segment, opens, jump, start, end, *trajectory = given
+        segment, opens, jump, late, start, end, *trajectory = given
         adjoints, total = now
         d = differentiate_along_row(model, segment, p, start, end, *trajectory)
         # Backward through a row: samples at its end add their jumps, then (7), (12) and (15), with (9) and (14) as
         # quadratures of the same stages; at a transition the adjoints at tau_i+ are kept before they go through the map
         # to tau_i-.
-        opened, total = step(add(adjoints, jump), total, end - start, d)
+        opened, total = switch_method(model, segment, step, add(adjoints, jump), total, end - start, d)
+        opened = add(opened, late)
         return (pass_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
 
     layout = path.layout
     Dp_minus = jnp.concatenate([jnp.zeros_like(Dp_x_before[:1]), Dp_x_after[layout.first_row[1:] - 1]])
     rows = (layout.start, layout.end, path.pieces, path.before, path.after, Dp_x_before, Dp_x_after)
-    given = (layout.segment, layout.opens, pick(jumps, slice(1, None)), *rows)
+    given = (layout.segment, layout.opens, pick(jumps, slice(1, None)), late, *rows)
     (start, total), opened = lax.scan(row, (final, total), given, reverse=True)
     return add(start, pick(jumps, 0)), opened, total
 
@@ -372,7 +383,7 @@ def differentiate_along_row(
     `values` are x and D_p x at the start and at the end of the row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
     """
     # Stage j of a row, integrated from its end to its start.
-    parts = 1.0 - jnp.asarray(EXPLICIT.c)
+    parts = jnp.stack([1.0 - tableau.c for tableau in model.tableaus])[model.mode_of_segment[segment]]
     times, directions = start + parts * (end - start), jnp.eye(p.shape[0])
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, Array, Bends]]:
@@ -432,24 +443,41 @@ def add_point_cost(
 
 def add_sample_jumps(
     model: Model, path: Path, Dp_x_before: Array, Dp_x_after: Array, p: Array
-) -> tuple[Adjoints, Quadratures]:
-    """Return the jumps of the adjoints at t0 and at the end of each row (R + 1, ...), and the contributions of samples
-    to (9), (14).
+) -> tuple[Adjoints, Adjoints, Quadratures]:
+    """Return the jumps of the adjoints at t0 and at the end of each row (R + 1, ...), those at the start of each row
+    (R, ...), and the contributions of samples to (9), (14).
+
+    A late sample is a cost of the state at the start of the row that holds ``t - delay``, any other one of that at the
+    end of its row, or at t0.
     """
     (R, n), M = path.after.shape, p.shape[0]
-    jumps = Adjoints(jnp.zeros((R + 1, n)), jnp.zeros((R + 1, n, n)), jnp.zeros((R + 1, n, M)))
-    total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
-    for k, samples in enumerate(model.arguments.samples):
+    ends = Adjoints(jnp.zeros((R + 1, n)), jnp.zeros((R + 1, n, n)), jnp.zeros((R + 1, n, M)))
+    starts, total = pick(ends, slice(1, None)), Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
+    for k, (sensor, samples) in enumerate(zip(model.structure.measurements, model.arguments.samples, strict=True)):
+
+        def add_late(Dp_x: Array, x: Array, sample: Samples, *row: Any, k: int = k) -> tuple[Adjoints, Quadratures]:
+            segment, piece, start = row
+
+            def cost(x: Array, p: Array) -> Array:
+                there, x_s = step_to_late_sample(model, k, sample, segment, piece, start, x, p)
+                return model.sample_cost(k, there, x_s, p)
+
+            return add_point_cost(cost, x, Dp_x, p)
 
         def add_own(Dp_x: Array, x: Array, sample: Samples, k: int = k) -> tuple[Adjoints, Quadratures]:
             return add_point_cost(lambda x, p: model.sample_cost(k, sample, x, p), x, Dp_x, p)
 
-        Dp_x = pick_at_cells(path.layout, Dp_x_before, Dp_x_after, samples.cell)
-        jump, added = jax.vmap(add_own)(Dp_x, path.at_samples(samples.cell), samples)
-        # 0 is t0
-        jumps = scatter(jumps, find_row_ending_cell(path.layout.first_cell, samples.cell) + 1, jump)
+        if sensor.delay is not None:
+            row, *of_rows, x = find_late_rows(model, path, k, p)
+            jump, added = jax.vmap(add_late)(Dp_x_before[row], x, samples, *of_rows)
+            starts = scatter(starts, row, jump)
+        else:
+            Dp_x = pick_at_cells(path.layout, Dp_x_before, Dp_x_after, samples.cell)
+            jump, added = jax.vmap(add_own)(Dp_x, path.at_samples(samples.cell), samples)
+            # 0 is t0
+            ends = scatter(ends, find_row_ending_cell(path.layout.first_cell, samples.cell) + 1, jump)
         total = add(total, jax.tree.map(lambda a: a.sum(0), added))
-    return jumps, total
+    return ends, starts, total
 
 
 def pass_reset(
@@ -487,22 +515,35 @@ def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures
 # Tools
 
 
-def step_linear(rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
+def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
     """Return one Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its
     end.
 
     `given` has the time-dependent arguments of `rate` at the s stages; h < 0 steps backward.
     """
-    states: list[Any] = []
-    slopes: list[Any] = []
+    flat, unravel = ravel_pytree(y)
+    a, b, c = tableau.a, tableau.b, tableau.c
 
-    def follow(weights: Any) -> Any:
-        return jax.tree.map(lambda y, *K: y + h * combine(weights, K), y, *slopes)
+    def slope(given: Any, y: Array) -> Array:
+        return ravel_pytree(rate(given, unravel(y)))[0]
 
-    for j, row in enumerate(EXPLICIT.a):
-        states.append(follow(row))
-        slopes.append(rate(pick(given, j), states[-1]))
-    return jax.tree.map(lambda *each: jnp.stack(each), *states), follow(EXPLICIT.b)
+    if tableau.coupled:
+        # K_j = slope_j(y) + h slope_j' sum_l a_jl K_l, solved for all stages at once
+        s, m = tableau.coupled, flat.shape[0]
+        first = jax.tree.map(lambda g: g[:s], given)
+        known = jax.vmap(slope, in_axes=(0, None))(first, flat)
+        jacobians = jax.vmap(jax.jacfwd(slope, argnums=1), in_axes=(0, None))(first, flat)
+        matrix = jnp.eye(s * m) - h * jnp.einsum("jl,jmk->jmlk", a[:s, :s], jacobians).reshape(s * m, s * m)
+        K = jnp.linalg.solve(matrix, known.reshape(-1)).reshape(s, m)
+        K = jnp.pad(K, ((0, len(c) - s), (0, 0)))
+    else:
+        slopes: list[Array] = []
+        for j in range(len(c)):
+            at_stage = jax.tree.map(lambda g, j=j: g[j], given)
+            inside = combine(a[j], slopes)
+            slopes.append(slope(at_stage, flat if inside is None else flat + h * inside))
+        K = jnp.stack(slopes)
+    return jax.vmap(unravel)(flat[None] + h * (a @ K)), unravel(flat + h * (b @ K))
 
 
 Function = Callable[[Array, Array, Array], Array]

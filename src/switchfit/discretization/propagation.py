@@ -19,7 +19,7 @@ from jax import lax
 from switchfit.discretization import rows
 from switchfit.discretization.mesh import Rows, Samples, build_rows, find_row_ending_cell
 from switchfit.discretization.model import Field, Model, Piece, list_transition_functions
-from switchfit.discretization.rows import Tableau, combine
+from switchfit.discretization.rows import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau, combine
 
 Array = jax.Array
 
@@ -143,6 +143,18 @@ def switch_mode(model: Model, segment: Array | int, branch: Callable[[int], Call
     return lax.switch(model.mode_of_segment[segment], [branch(mode) for mode in range(count)], *operands)
 
 
+def switch_method(model: Model, segment: Array, branch: Callable[[Tableau], Callable[..., Any]], *operands: Any) -> Any:
+    """Call ``branch(tableau)(*operands)`` for the method of the steps in a segment, directly if all modes have one.
+
+    For what depends on the method alone: its program does not grow with the number of modes.
+    """
+    if model.structure.has_one_method:
+        return branch(model.tableaus[0])(*operands)
+    implicit = jnp.asarray(model.structure.implicit)[model.mode_of_segment[segment]]
+    branches = branch(STIFF_BESIDE_EXPLICIT), branch(EXPLICIT)
+    return lax.cond(implicit, *branches, *operands)
+
+
 def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | None = None) -> Path:
     """Integrate from t0 to tf: equation (1), with reset maps at the transitions.
 
@@ -254,16 +266,37 @@ def see_samples(model: Model, path: Path, k: int, p: Array) -> tuple[Samples, Ar
     samples = model.arguments.samples[k]
     if model.structure.measurements[k].delay is None:
         return samples, path.at_samples(samples.cell)
-    there = jax.vmap(lambda sample: model.correct_delay(k, sample, p))(samples)
-    # The row with start < t - delay <= end is found by search, which has no derivative: the step inside it has.
-    layout, ends = path.layout, lax.stop_gradient(path.layout.end)
-    row = jnp.minimum(jnp.searchsorted(ends, lax.stop_gradient(there.time)), ends.shape[0] - 1)
+    _, segment, piece, start, before = find_late_rows(model, path, k, p)
+    late = jax.vmap(partial(step_to_late_sample, model, k), in_axes=(0, 0, 0, 0, 0, None))
+    return late(samples, segment, piece, start, before, p)
 
-    def step_to(time: Array, segment: Array, piece: Piece, start: Array, x: Array) -> Array:
-        def through(mode: int) -> Callable[..., Array]:
-            return lambda time, start, x: step(model.tableaus[mode], model.field(mode, piece), start, time, x, p)[0]
 
-        return switch_mode(model, segment, through, time, start, x)
+def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
+    """Return the rows with ``start < t - delay <= end`` for the late samples of the k-th Measurements.
 
-    pieces = jax.tree.map(lambda a: a[row], path.pieces)
-    return there, jax.vmap(step_to)(there.time, layout.segment[row], pieces, layout.start[row], path.before[row])
+    Returns
+    -------
+    row, segment : (K,) int
+    piece : Piece, of K rows
+    start, x : (K,), (K, n), start of the row and the state there
+    """
+    layout, samples = path.layout, model.arguments.samples[k]
+    # The row is found by search, which has no derivative; the time inside it is differentiated in
+    # `step_to_late_sample`.
+    times = lax.stop_gradient(jax.vmap(lambda s: model.correct_delay(k, s, p).time)(samples))
+    ends = lax.stop_gradient(layout.end)
+    row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)
+    piece = jax.tree.map(lambda a: a[row], path.pieces)
+    return row, layout.segment[row], piece, layout.start[row], path.before[row]
+
+
+def step_to_late_sample(
+    model: Model, k: int, sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array
+) -> tuple[Samples, Array]:
+    """Return one late sample with the time of the state that it saw, and that state, one step from `start`: (n,)."""
+    there = model.correct_delay(k, sample, p)
+
+    def through(mode: int) -> Callable[..., Array]:
+        return lambda time, start, x: step(model.tableaus[mode], model.field(mode, piece), start, time, x, p)[0]
+
+    return there, switch_mode(model, segment, through, there.time, start, x)

@@ -235,9 +235,8 @@ class Evaluator:
         if method == "auto":
             find = self.problem.vectors
             return [engine.derivatives(*find(theta, e), side, matrix) for e, engine in enumerate(self.engines)]
-        if method == "adjoint" and not is_covered_by_paper(self):
-            why = "no TransitionCost, no delay that is estimated and no stiff modes"
-            raise ValueError(f"the paper's equations have {why}: choose another method.")
+        if method == "adjoint" and not is_covered_by_paper(self.problem):
+            raise ValueError("the paper's equations have no TransitionCost: choose another method.")
         found = []
         for e, (tau, p) in enumerate(self._vectors(theta)):
             engine, evaluate = self.engines[e], partial(self._evaluate_by, method, e, p=p, side=side, matrix=matrix)
@@ -287,13 +286,9 @@ def _join_errors(results: Sequence[Evaluation[FloatArray]]) -> tuple[float, ...]
     return tuple(one.row_errors[0] if one.row_errors else np.nan for one in results)
 
 
-def is_covered_by_paper(evaluator: Evaluator) -> bool:
-    """Return whether the paper's equations cover all terms of the cost, and all steps are explicit: in stiff modes they
-    have boundary layers of their own at transitions and samples, which a mesh refined for the state does not resolve.
-    """
-    problem = evaluator.problem
-    has_costs = any(any(f is not None for f in s.transition_costs) for s in problem.structures)
-    return not (has_costs or problem.estimates_delays or evaluator.takes_implicit_steps)
+def is_covered_by_paper(problem: Problem) -> bool:
+    """Return whether the paper's equations cover all terms of the cost."""
+    return not any(any(f is not None for f in s.transition_costs) for s in problem.structures)
 
 
 @keep_with_problem

@@ -64,8 +64,8 @@ class DerivativeCheck(Printed):
         Observed orders in h, which are 1, 2 and 3 if J, g and H are right; NaN where a remainder is rounding.
     theta : (d,) array
     stiff : bool
-        With the stiff solver, the gaps are not measured: the paper's adjoints have boundary layers of their own at
-        transitions and samples, which a mesh refined for the state does not resolve.
+        With the stiff solver, the gaps are reported but do not count: the paper's adjoints have boundary layers of
+        their own at transitions and samples, which a mesh refined for the state does not resolve.
     gradient_gap, hessian_gap : float
         Relative gap between the paper's equations (6)-(17) and the discretized cost's exact derivatives; with half the
         steps if it is above 1e-4 without: integration error of the paper's adjoints closes then, a wrong derivative
@@ -208,7 +208,7 @@ def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[flo
     curvature. Near a minimum the gradient vanishes; its gap is then relative to the gradient after a change of all
     unknowns by 0.1 %.
     """
-    if not is_covered_by_paper(evaluator):
+    if not is_covered_by_paper(evaluator.problem):
         return np.nan, np.nan
     paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
