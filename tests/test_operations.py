@@ -47,7 +47,7 @@ def by_machine_code(operation, points):
     operands = [graph.load("x", k) for k in range(operation.operands)]
     operands = [graph.apply("ne", x, 0.0) if is_truth(operation, k) else x for k, x in enumerate(operands)]
     module = llvm.Module(1)
-    module.write_straight_line("f", [("y", 0, applied(graph, operation, operands))])
+    module.write_straight_line("f", [("y", 0, applied(graph, operation, operands))], ("x", "y"))
     assert graph.nodes[-1].op in (operation.name, "select"), "simplified away"
     program = llvm.compile_modules([module.take()])
     function, y = program.function("f", ctypes.c_void_p, ctypes.c_void_p), np.zeros(1)

@@ -417,11 +417,13 @@ class Module:
         self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
 
-    def write_straight_line(self, name: str, stores: Sequence[tuple[str, int, Node]]) -> None:
+    def write_straight_line(
+        self, name: str, stores: Sequence[tuple[str, int, Node]], pointers: Sequence[str] = ()
+    ) -> None:
         """Write a function that loads, computes, and then stores each ``(pointer, offset, node)``.
 
         All loads come before the first store. Offsets count doubles, or vectors if the node is a vector. The arguments
-        are the pointers that it uses, sorted.
+        are the `pointers`; by default those that it uses.
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
@@ -431,7 +433,7 @@ class Module:
         for pointer, offset, node in stores:
             writer.used.add(pointer)
             writer.store(writer.value(node), writer.place(f"%{pointer}", offset, node))
-        self.pointers[name] = tuple(sorted(writer.used))
+        self.pointers[name] = tuple(pointers or sorted(writer.used))
         writer.begin(f"void @{self.prefix}{name}({', '.join(f'ptr %{pointer}' for pointer in self.pointers[name])})")
         self._functions.append(writer.end())
 
