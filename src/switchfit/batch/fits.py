@@ -512,6 +512,17 @@ def judge_study(
     return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
 
 
+def judge_failed_starts(fits: Fits) -> Verdict:
+    """Return the verdict on fits from many starts none of which could be fitted to the end.
+
+    Parameters
+    ----------
+    fits : Fits
+    """
+    everywhere = Doubt("not converged", "bad", np.ones(len(fits), dtype=bool))
+    return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
+
+
 def measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:
     """Return how far fits converged from the others, in spreads; 0 for those that did not converge: (R,).
 

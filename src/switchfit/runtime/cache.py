@@ -34,18 +34,10 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def find_folder() -> Path | None:
-    """Return the folder of compiled programs; None if the cache is off."""
-    chosen = os.environ.get("SWITCHFIT_CACHE", "")
-    if chosen.lower() == "off":
-        return None
-    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("switchfit", appauthor=False))
-
-
 @contextmanager
 def use_compilation_cache() -> Iterator[None]:
-    """Return a context in which JAX reads and writes compiled programs in `find_folder`; it restores JAX's settings at
-    its end.
+    """Return a context in which JAX reads and writes compiled programs in `get_usable_folder`; it restores JAX's
+    settings at its end.
     """
     path = get_usable_folder()
     before = {name: getattr(jax.config, name) for name in SETTINGS}
@@ -67,9 +59,10 @@ def use_compilation_cache() -> Iterator[None]:
 
 def get_usable_folder() -> Path | None:
     """Return the cache folder, created if missing; None if it is not writable, or if others can write to it."""
-    path = find_folder()
-    if path is None:
+    chosen = os.environ.get("SWITCHFIT_CACHE", "")
+    if chosen.lower() == "off":
         return None
+    path = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("switchfit", appauthor=False))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=0o700, exist_ok=True)
