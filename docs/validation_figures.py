@@ -13,4 +13,3 @@ def draw(folder: Path) -> None:
     names = run_blocks("validation.md")
     names["forecast_figure"].savefig(folder / "forecast.svg")
     names["check_figure"].savefig(folder / "validation.svg")
-    names["table_figure"].savefig(folder / "comparison.svg")
