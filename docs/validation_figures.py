@@ -8,7 +8,7 @@ from page_blocks import run_blocks
 
 
 def draw(folder: Path) -> None:
-    """Write forecast.svg, validation.svg and comparison.svg."""
+    """Write forecast.svg and validation.svg."""
     folder.mkdir(exist_ok=True)
     names = run_blocks("validation.md")
     names["forecast_figure"].savefig(folder / "forecast.svg")
