@@ -8,9 +8,8 @@ from page_blocks import run_blocks
 
 
 def draw(folder: Path) -> None:
-    """Write forecast.svg, validation.svg and comparison.svg."""
+    """Write forecast.svg and validation.svg."""
     folder.mkdir(exist_ok=True)
     names = run_blocks("validation.md")
     names["forecast_figure"].savefig(folder / "forecast.svg")
     names["check_figure"].savefig(folder / "validation.svg")
-    names["table_figure"].savefig(folder / "comparison.svg")
