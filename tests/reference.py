@@ -1,9 +1,10 @@
 """A reference of its own for J, the constraints and all their derivatives: NumPy and SciPy, nothing of switchfit.
 
 What is documented is written down again here in the plainest way: the run goes from event to event (nodes, samples,
-transitions), each stretch is integrated by SciPy's method of order 8, costs are added up from their formulas. Everything
-is analytic in theta and runs with complex numbers, so that gradients are complex steps without cancellation. All columns
-of theta are integrated together, by the same steps. Hessians are central differences of these gradients, extrapolated by Richardson's scheme.
+transitions), each stretch is integrated by SciPy's method of order 8, costs are added up from their formulas.
+Everything is analytic in theta and runs with complex numbers, so that gradients are complex steps without
+cancellation. All columns of theta are integrated together, by the same steps. Hessians are central differences of
+these gradients, extrapolated by Richardson's scheme.
 
 The order of the events is that at the real theta for which derivatives are wanted, and stays the same while theta is
 varied: stretches may become negative or complex. Where a transition time equals a node, `side` = +1 puts the transition

@@ -1,4 +1,4 @@
-"""The paper's adjoint equations against the derivatives of the discretised cost, block by block.
+"""The paper's adjoint equations against the derivatives of the discretised cost, block by block, and these themselves.
 
 Both converge to the derivatives of the cost, so the gap between them closes at the order of the integrator (5).
 On the diagonal of the tau block it is one less: the local error of the row that ends at tau_i goes with the sixth power
@@ -14,7 +14,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from systems import KINDS, KNOTS, NODES, P0, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
+from systems import (
+    KINDS,
+    KNOTS,
+    NODES,
+    P0,
+    Derivatives,
+    Parameter,
+    case,
+    closed_form,
+    closed_form_case,
+    compiled,
+    padded_mesh,
+)
 
 from switchfit.discretization.mesh import build_arguments
 from switchfit.discretization.model import Model
@@ -22,9 +34,21 @@ from switchfit.discretization.propagation import propagate
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
-VARIATIONS = [("plain", kind) for kind in reversed(KINDS)]
-VARIATIONS += [("resets", kind) for kind in reversed(KINDS)]
+VARIATIONS = [(name, kind) for name in ("plain", "resets") for kind in reversed(KINDS)]
 VARIATIONS += [(name, kind) for name in ("stiff", "mixed") for kind in SMOOTH_KINDS]
+
+INSIDE = {
+    "plain": [0.613, 1.287],
+    "resets": [0.413, 0.791, 1.336],
+    "stiff": [0.6187, 1.2812],
+    "mixed": [0.6187, 1.2812],
+}
+"""Transition times that are not nodes."""
+
+
+def slow_but(*names: str) -> list:
+    """Names of systems, of which those that are given are tested in the fast suite."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in names)) for name in INSIDE]
 
 
 def blocks(N: int, gradient: np.ndarray, hessian: np.ndarray) -> dict[str, float]:
@@ -87,14 +111,19 @@ def test_p_block_is_symmetric_without_symmetrising(name: str, kind: str) -> None
     assert asymmetry[1] < asymmetry[0] / 2**8
 
 
-@pytest.mark.slow  # of the discretised cost: in test_discrete.py
-def test_equal_neighbouring_modes_give_zero_rows() -> None:
+@pytest.mark.parametrize(
+    ("method", "tau", "atol"),
+    [
+        pytest.param("paper", NODES[[6, 13]], (1e-13, 1e-12), marks=pytest.mark.slow),
+        ("discrete", INSIDE["plain"], (1e-7, 1e-4)),  # where tau_1 stands moves a step of the integrator
+    ],
+)
+def test_equal_neighbouring_modes_give_zero_rows(method: str, tau: list[float], atol: tuple[float, float]) -> None:
     this = case("plain")
-    found = this.paper(this.arguments(equal=1.0), this.tau, P0)
+    found = getattr(this, method)(this.arguments(equal=1.0, halvings=3), tau, P0)
     assert np.abs(found.hessian[1:, 1:]).max() > 1.0
-    np.testing.assert_allclose(found.gradient[0], 0.0, atol=1e-13)
-    np.testing.assert_allclose(found.hessian[0], 0.0, atol=1e-12)
-    np.testing.assert_allclose(found.hessian[:, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.gradient[0], 0.0, atol=atol[0])
+    np.testing.assert_allclose([found.hessian[0], found.hessian[:, 0]], 0.0, atol=atol[1])
 
 
 @pytest.mark.parametrize("method", ["paper", pytest.param("discrete", marks=pytest.mark.slow)])
@@ -135,14 +164,74 @@ CLOSED = {
 }
 
 
-@pytest.mark.parametrize("name", CLOSED)
-def test_closed_forms(name: str) -> None:
+@pytest.mark.parametrize(("name", "method"), [*((name, "paper") for name in CLOSED), ("with a reset map", "discrete")])
+def test_closed_forms(name: str, method: str) -> None:
     transitions, fixed, cost, theta, (first, second) = CLOSED[name]
     tau, p = np.split(np.array(theta), [transitions])
     this = closed_form_case(transitions=transitions, q=Parameter(0.7, fixed=fixed))
     mesh = padded_mesh(np.linspace(0.0, 2.0, 41), 40)
-    found = this.paper(build_arguments(this.problem, 0, mesh), tau, p)
+    found = getattr(this, method)(build_arguments(this.problem, 0, mesh), tau, p)
     J, gradient, hessian = differentiate(cost, theta)
     assert found.cost == pytest.approx(J, rel=1e-8)
     np.testing.assert_allclose(found.gradient, gradient, rtol=first)
     np.testing.assert_allclose(found.hessian, hessian, rtol=second)
+
+
+# Derivatives of the discretised cost
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", slow_but("mixed")[1:])
+def test_adjoint_and_forward_agree_to_rounding(name: str, kind: str) -> None:
+    this = case(name)
+    at = this.arguments(kind), INSIDE[name], P0
+    expected, found = this.forward(*at), this.discrete(*at)
+    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
+    relative = 1e-9 if any(this.structure.implicit) else 2e-12
+    for a, b in zip(vars(found).values(), vars(expected).values(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_side_is_the_limit_from_that_side(side: int) -> None:
+    this = case("resets")
+    tau = NODES[[5, 9, 14]]
+
+    def at(tau: np.ndarray, side: int) -> Derivatives:
+        return this.discrete(this.arguments(halvings=2), tau, P0, side)
+
+    on, beside = at(tau, side), at(tau + side * 1e-9, side)
+    np.testing.assert_allclose(on.gradient, beside.gradient, atol=1e-6)
+    np.testing.assert_allclose(on.hessian, beside.hessian, atol=1e-4)
+    assert np.abs(on.gradient - at(tau, -side).gradient).max() > 0.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", slow_but("resets", "mixed"))
+def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
+    this = case(name)
+    arguments = this.arguments(kind)
+    tau = np.array(INSIDE[name])
+    direction = np.array([*[1.0, -0.7, 0.8][: this.N], 0.9, -1.1])
+    direction *= (0.0002 if any(this.structure.implicit) else 0.01) / np.abs(direction).max()
+    at = this.discrete(arguments, tau, P0)
+
+    def remainders(step: float) -> list[float]:
+        d = step * direction
+        change = this.cost(arguments, tau + d[: this.N], P0 + d[this.N :]) - at.cost
+        return [change, change - at.gradient @ d, change - at.gradient @ d - 0.5 * d @ at.hessian @ d]
+
+    coarse, fine = np.abs(remainders(0.5)), np.abs(remainders(0.25))
+    np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)
+
+
+@pytest.mark.parametrize("split", [0.0, 0.35, 1.287])
+def test_splitting_a_mode_changes_nothing(split: float) -> None:
+    """Modes A, A, C with the first transition anywhere, at t0 too, where nothing is left of the first A."""
+    this = case("plain")
+    arguments = this.arguments(equal=1.0, halvings=3)
+    expected = this.discrete(arguments, [0.6, 1.287], P0)
+    found = this.discrete(arguments, [split, 1.287], P0)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    np.testing.assert_allclose(found.gradient[1:], expected.gradient[1:], atol=1e-6)
+    np.testing.assert_allclose(found.hessian[1:, 1:], expected.hessian[1:, 1:], atol=1e-5)

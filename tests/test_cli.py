@@ -2,13 +2,14 @@
 
 import csv
 import errno
-import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -78,14 +79,24 @@ def read_json(result):
     return json.loads(result.stdout, parse_constant=refuse)
 
 
+def catch_settings(monkeypatch, name):
+    """Return what the command line gives to a function, which ends with an error."""
+    got = {}
+
+    def record(problem, callback=None, **settings):
+        got.update(settings)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(sf, name, record)
+    return got
+
+
 def test_fit_converged(folder, tmp_path):
     out = tmp_path / "a" / "b"
     result = run("fit", folder / "problem.toml", "--out", out)
     assert result.exit_code == 0, result.stderr
     assert sorted(path.name for path in out.iterdir()) == ["estimate.json", "fit.png", "report.html", "report.txt"]
     assert (out / "report.txt").read_text().strip() == result.stdout.strip()
-    assert "heating" in result.stdout
-    assert "tau_1" in result.stdout
     assert result.stderr == f"written to {out}\n"
     estimate = sf.Estimate.load(out / "estimate.json")
     np.testing.assert_allclose(estimate.theta, [3.2, 0.5], rtol=1e-5)
@@ -102,27 +113,17 @@ def test_fit_converged(folder, tmp_path):
 
 
 def test_fit_not_converged_writes_what_was_found(folder, tmp_path):
-    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--max-iterations", 1, "--no-figures")
-    assert result.exit_code == 1
+    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--max-iterations", 1, "--no-figures", "--json")
+    assert (result.exit_code, read_json(result)["converged"]) == (1, False)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "report.txt"]
     assert "not converged. Stopped after 1 iteration " in result.stderr
-    shown = run("fit", folder / "problem.toml", "--json", "--max-iterations", 1)
-    assert (shown.exit_code, read_json(shown)["converged"]) == (1, False)
 
 
 def test_options_win_over_the_file(folder, tmp_path, monkeypatch):
     (folder / "options.toml").write_text(PROBLEM + '\n[options]\nhessian = "none"\ntolerance = 1e-3\n')
-    got = {}
-
-    def estimate(problem, **options):
-        got.update(options)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(sf, "estimate", estimate)
+    got = catch_settings(monkeypatch, "estimate")
     result = run("fit", folder / "options.toml", "--hessian", "gauss-newton", "--max-iterations", 7)
-    assert result.exit_code == 2
-    assert result.stderr == "switchfit: enough\n"
-    del got["callback"]
+    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
     assert got == {"hessian": "gauss-newton", "tolerance": 1e-3, "max_iterations": 7}
 
 
@@ -149,13 +150,10 @@ def test_second_interrupt_stops_at_once(folder, monkeypatch):
 
 
 def test_check_fails_where_derivatives_are_wrong(folder, monkeypatch):
-    class Wrong:
-        passed = False
-        observed_orders = (1.0, 1.0, 1.0)
-        gradient_gap = hessian_gap = float("nan")
-        failures = (sf.Issue("derivatives of another cost"),)
-
-    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: Wrong())
+    gaps = dict.fromkeys(("gradient_gap", "hessian_gap"), float("nan"))
+    failures = (sf.Issue("derivatives of another cost"),)
+    wrong = SimpleNamespace(passed=False, observed_orders=(1.0, 1.0, 1.0), failures=failures, **gaps)
+    monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: wrong)
     assert run("check", folder / "problem.toml").exit_code == 1
 
 
@@ -163,13 +161,11 @@ def test_simulate(folder, tmp_path):
     result = run("simulate", folder / "problem.toml", "--out", tmp_path / "new" / "x.csv")
     assert result.exit_code == 0, result.stderr
     assert result.stdout == ""
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "new" / "x.csv").read_text())))
-    assert list(rows[0]) == ["experiment", "t", "mode", "T"]
-    times = np.array([float(row["t"]) for row in rows])
-    states = np.array([float(row["T"]) for row in rows])
-    on = np.array([row["mode"] == "on" for row in rows])
-    assert {row["mode"] for row in rows} == {"on", "off"}
-    assert {row["experiment"] for row in rows} == {"run1"}
+    header, *rows = csv.reader((tmp_path / "new" / "x.csv").read_text().splitlines())
+    assert header == ["experiment", "t", "mode", "T"]
+    runs, times, modes, states = (np.array(column) for column in zip(*rows, strict=True))
+    times, states, on = times.astype(float), states.astype(float), modes == "on"
+    assert ({*modes}, {*runs}) == ({"on", "off"}, {"run1"})
     assert times[on].max() == times[~on].min() == 2.0
     np.testing.assert_allclose(states[on], 8 * (1 - np.exp(-0.05 * times[on])), atol=1e-8)
     (found,) = read_json(run("simulate", folder / "problem.toml", "--json"))["runs"]
@@ -180,9 +176,7 @@ def test_simulate(folder, tmp_path):
 
 
 def test_version_and_help():
-    result = run("--version")
-    assert result.exit_code == 0
-    assert result.stdout == f"switchfit {sf.__version__}\n"
+    assert run("--version").stdout == f"switchfit {sf.__version__}\n"
     for name in ([], ["init"], ["fit"], ["check"], ["simulate"], ["validate"], ["compare"], ["examples"], ["paper"]):
         assert "Usage" in run(*name, "--help").stdout
     for wrong in (["--hessian", "newton"], ["--max-iterations", -1]):
@@ -248,25 +242,21 @@ def test_ctrl_c_that_is_ignored_stays_so(folder, monkeypatch):
 
 
 def test_check_without_running_the_model(folder, tmp_path):
-    (tmp_path / "log.csv").write_text((folder / "log.csv").read_text())
+    shutil.copy(folder / "log.csv", tmp_path)
     (tmp_path / "room.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
     path = tmp_path / "problem.toml"
     path.write_text(PROBLEM)
     result = run("check", path, "--no-run")
     assert result.exit_code == 0, result.stderr
-    assert "on -> off on [0, 6] s, at 2 s" in result.stdout
-    assert "12 samples of T, 0.25 to 5.75" in result.stdout
-    assert "No Python file was run" in result.stdout
-    assert not (tmp_path / "ran").exists()
+    for said in ("on -> off on [0, 6] s, at 2 s", "12 samples of T, 0.25 to 5.75", "No Python file was run"):
+        assert said in result.stdout
     for old, new, message in (
         ("transition_times = [2.0]", "transition_times = [7.0]", "experiments[1]: transition_times must increase"),
         ("room.py:room", "roof", "model 'roof' is not known"),
         ("heating = 0.4", "heating = { value = 0.4, lower = 1.0 }", "parameters.heating: Parameter value 0.4 lies"),
     ):
         path.write_text(PROBLEM.replace(old, new))
-        result = run("check", path, "--no-run")
-        assert result.exit_code == 2
-        assert message in result.stderr
+        assert message in run("check", path, "--no-run").stderr
     path.write_text('problem = "room.py:make"\n')
     assert run("check", path, "--no-run").exit_code == 0
     assert not (tmp_path / "ran").exists()
@@ -279,14 +269,12 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypat
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    result = run("fit", folder / "problem.toml", "--out", tmp_path)
-    assert result.exit_code == 2
-    assert f"{tmp_path / 'report.txt'} cannot be read or written: No space left on device" in result.stderr
+    for out, reason in ((tmp_path, "No space left on device"), (tmp_path / "report.txt", "File exists")):
+        result = run("fit", folder / "problem.toml", "--out", out)
+        assert result.exit_code == 2
+        assert f"{tmp_path / 'report.txt'} cannot be read or written: {reason}" in result.stderr
     assert (tmp_path / "report.txt").read_text() == "before"
     assert list(tmp_path.iterdir()) == [tmp_path / "report.txt"]
-    result = run("fit", folder / "problem.toml", "--out", tmp_path / "report.txt")
-    assert result.exit_code == 2
-    assert f"{tmp_path / 'report.txt'} cannot be read or written: File exists" in result.stderr
 
 
 @pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.slow)])
@@ -344,20 +332,18 @@ def test_verbose_says_what_is_done(folder):
 
 def test_check_is_one_screen_of_many_runs(tmp_path, folder):
     """And needs no JAX program: the paper's equations take longer than a fit to compile."""
-    (tmp_path / "room.py").write_text(ROOM)
-    (tmp_path / "log.csv").write_text((folder / "log.csv").read_text())
+    for name in ("room.py", "log.csv"):
+        shutil.copy(folder / name, tmp_path)
     head, run_table = PROBLEM.split("[[experiments]]")
     parts = [f'[[experiments]]\nname = "r{k}"\n{run_table.strip()}' for k in range(12)]
     (tmp_path / "problem.toml").write_text("\n\n".join([head, *parts]))
-    result = run("check", tmp_path / "problem.toml")
-    assert result.exit_code == 0, result.output
-    assert len(result.stdout.splitlines()) < 50
-    assert "and 9 more experiments: --full lists them" in result.stdout
-    assert "in all 12 experiments" in result.stdout
-    assert "Paper's equations" not in result.stdout
-    result = run("check", tmp_path / "problem.toml", "--full")
-    assert "Experiment 12 (r11)" in result.stdout
-    assert "Paper's equations" in result.stdout
+    short, full = (run("check", tmp_path / "problem.toml", *options).stdout for options in ((), ("--full",)))
+    assert len(short.splitlines()) < 50
+    for said in ("and 9 more experiments: --full lists them", "in all 12 experiments"):
+        assert said in short
+    for said in ("Experiment 12 (r11)", "Paper's equations"):
+        assert said in full
+        assert said not in short
 
 
 # --- completion -------------------------------------------------------------------------------------------------------
@@ -384,7 +370,7 @@ def test_a_fit_waits_for_the_modules_that_draw(folder, monkeypatch):
     done = []
 
     def import_figures():
-        time.sleep(1.0)
+        time.sleep(0.3)
         done.append(True)
 
     monkeypatch.setattr(fitting, "_import_figures", import_figures)

@@ -1,10 +1,11 @@
 """`switchfit design`, and [design] in problem files."""
 
+import csv
 import json
 
 import numpy as np
 import pytest
-from test_cli import run
+from test_cli import catch_settings, run
 
 import switchfit as sf
 from switchfit.io.problem_file import load_problem
@@ -91,21 +92,15 @@ def test_a_design_is_printed_and_written(folder):
     assert str(plan) == result.stdout.rstrip("\n")
     np.testing.assert_array_equal(sf.read_log(out / "input.csv")["power"], plan.inputs["power"])
     np.testing.assert_array_equal(sf.read_log(out / "input.csv").times, np.linspace(0.0, 4.0, 9))
-    rows = [line.split(",") for line in (out / "samples.csv").read_text().splitlines()]
-    assert {row[rows[0].index("sensor")] for row in rows[1:]} == {"T"}
-    np.testing.assert_array_equal([float(row[rows[0].index("t")]) for row in rows[1:]], plan.sample_times["T"])
+    rows = list(csv.DictReader((out / "samples.csv").read_text().splitlines()))
+    assert {row["sensor"] for row in rows} == {"T"}
+    np.testing.assert_array_equal([float(row["t"]) for row in rows], plan.sample_times["T"])
     saved = json.loads((out / "design.json").read_text())["design"]
     assert saved["sample_times"]["T"] == plan.sample_times["T"].tolist()
 
 
 def test_options_override_the_file(folder, monkeypatch):
-    given = {}
-
-    def design(problem, **settings):
-        given.update(settings)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(sf, "design", design)
+    given = catch_settings(monkeypatch, "design")
     result = run("design", folder / "plain.toml", "--criterion", "E", "--samples", 5)
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
     assert given == {"criterion": "E", "samples": 5}
