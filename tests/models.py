@@ -69,6 +69,23 @@ def curve(
     return sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, tf), parameters)
 
 
+# A state that follows the cosine
+
+
+def followed(times: np.ndarray, k: float) -> np.ndarray:
+    """x(t) of x' = k (cos t - x) from 0."""
+    return (k**2 * np.cos(times) + k * np.sin(times) - k**2 * np.exp(-k * times)) / (1.0 + k**2)
+
+
+def slow_guess(k: float, seed: int) -> sf.Problem:
+    """Ten noisy samples of it with sigma = 0.01; the guess is k = 1, for whose mesh a fast truth is too fast."""
+    times = np.linspace(0.4, 4.0, 10)
+    values = followed(times, k) + 0.01 * np.random.default_rng(seed).normal(size=10)
+    system = sf.HybridSystem({"follow": lambda t, x, p: p["k"] * (jnp.cos(t) - x)}, [0.0])
+    run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("follow",), (), 0.0, 4.0)
+    return sf.Problem(system, run, {"k": 1.0}, rtol=1e-5, atol=1e-7)
+
+
 # Ramps
 
 

@@ -7,9 +7,9 @@ program serves all of these variations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -147,18 +147,12 @@ def weighted(structure: Structure, arguments: Arguments, kind: str, equal: float
         )
 
 
-@dataclass(frozen=True)
-class Derivatives:
+class Derivatives(NamedTuple):
     """Cost, gradient (D,) and Hessian (D, D)."""
 
     cost: float
     gradient: np.ndarray
     hessian: np.ndarray
-
-    @classmethod
-    def of(cls, values: Any) -> Derivatives:
-        cost, *rest = values
-        return cls(float(cost), *(np.asarray(value) for value in rest))
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -206,15 +200,15 @@ class Case:
 
     def paper(self, *given: Any) -> Derivatives:
         """By the paper's adjoint equations."""
-        return Derivatives.of(self._paper(*given))
+        return Derivatives(*map(np.asarray, self._paper(*given)))
 
     def discrete(self, *given: Any) -> Derivatives:
         """Of the discretised cost, gradient backward and Hessian forward over it."""
-        return Derivatives.of(self._discrete(*given))
+        return Derivatives(*map(np.asarray, self._discrete(*given)))
 
     def forward(self, *given: Any) -> Derivatives:
         """Of the discretised cost, forward over forward."""
-        return Derivatives.of(self._forward(*given))
+        return Derivatives(*map(np.asarray, self._forward(*given)))
 
 
 @cache
@@ -226,27 +220,13 @@ def case(name: str) -> Case:
 # A system whose cost has a closed form
 
 
-def constant_velocity(t, x, p):
-    return p["q"] * jnp.ones(1)
-
-
-def decay(t, x, p):
-    return -x
-
-
-def quadratic_reset(t, x, p):
-    return p["q"] * x**2 + t
-
-
-def half_square(t, x, p):
-    return 0.5 * x[0] ** 2
-
-
 def closed_form_case(*, transitions: int, q: Parameter) -> Case:
     """x' = q from 0; then, at tau, x becomes ``q x^2 + tau`` and x' = -x, to T = 2; ell = x^2 / 2."""
-    system = HybridSystem({"A": constant_velocity, "B": decay}, [0.0], {("A", "B"): quadratic_reset})
+    modes = {"A": lambda t, x, p: p["q"] * jnp.ones(1), "B": lambda t, x, p: -x}
+    system = HybridSystem(modes, [0.0], {("A", "B"): lambda t, x, p: p["q"] * x**2 + t})
     sequence, tau = (("A", "B"), [0.9]) if transitions else (("A",), [])
-    return Case(Problem(system, Experiment(RunningCost(half_square), sequence, tau, 0.0, 2.0), {"q": q}))
+    cost = RunningCost(lambda t, x, p: 0.5 * x[0] ** 2)
+    return Case(Problem(system, Experiment(cost, sequence, tau, 0.0, 2.0), {"q": q}))
 
 
 def closed_form(tau, q):

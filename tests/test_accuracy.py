@@ -18,13 +18,11 @@ def pendulum(torque):
 
 def fastest_swing(begin=0.0, **settings):
     """From rest at 0 to rest at 2 rad in the shortest time: J is a clock, which every mesh integrates exactly."""
-    system = sf.HybridSystem(
-        {"push": pendulum(1.5), "brake": pendulum(-1.5), "done": lambda t, x, p: jnp.zeros(3)}, [0.0, 0.0, 0.0]
-    )
+    modes = {"push": pendulum(1.5), "brake": pendulum(-1.5), "done": lambda t, x, p: jnp.zeros(3)}
     costs = [sf.TerminalCost(lambda x, p: x[2]), sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] - 2.0, x[1]]))]
     times = (begin + 3.0, begin + 4.0)
     run = sf.Experiment(costs, ("push", "brake", "done"), times, begin, begin + 20.0)
-    return sf.Problem(system, run, **settings)
+    return sf.Problem(sf.HybridSystem(modes, np.zeros(3)), run, **settings)
 
 
 fit_locally = partial(sf.estimate, strategy="local")
@@ -58,7 +56,6 @@ def test_the_error_that_is_reported_is_that_of_the_end():
     assert fit.integration_error_of == f"terminal constraint {worst + 1}"
     assert fit.integration_error == pytest.approx(errors[worst], rel=0.1)
     assert f"{fit.integration_error:.1e}   (of terminal constraint {worst + 1}, relative" in str(fit)
-    assert f"{fit.integration_error:.1e} (terminal constraint {worst + 1})" in str(fit.certificate)
     assert f"the integration error of terminal constraint {worst + 1} is" in str(fit.certificate.failures[0])
 
 

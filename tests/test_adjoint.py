@@ -188,7 +188,7 @@ def test_adjoint_and_forward_agree_to_rounding(name: str, kind: str) -> None:
     expected, found = this.forward(*at), this.discrete(*at)
     assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
     relative = 1e-9 if any(this.structure.implicit) else 2e-12
-    for a, b in zip(vars(found).values(), vars(expected).values(), strict=True):
+    for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
 
 

@@ -13,8 +13,6 @@ PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7
 LAYOUT = ArrowLayout.of(11, PLACES)
 """Four runs with 3, 2, 3 and 1 unknowns of their own; two are shared."""
 
-SHARED = [9, 10]
-
 
 def arrow_of(full):
     """The arrow that holds a full matrix of its shape."""
@@ -36,16 +34,9 @@ def random_matrix(rng, lowest=None):
     return full if lowest is None else full + (lowest - np.linalg.eigvalsh(full)[0]) * np.eye(11)
 
 
-def test_own_and_shared_unknowns():
-    np.testing.assert_array_equal(LAYOUT.own, [[0, 1, 2], [3, 4, 11], [5, 6, 7], [8, 11, 11]])
-    np.testing.assert_array_equal(LAYOUT.shared, SHARED)
-    np.testing.assert_array_equal(LAYOUT.slots(2, PLACES[2]), [0, 1, 2, 4, 3])
-    # What no run depends on is with the shared ones.
-    np.testing.assert_array_equal(ArrowLayout.of(3, [np.array([0, -1]), np.array([1])]).shared, [2])
-
-
 def test_parts_of_runs_add_up():
-    """Each run's own matrix at its slots, as the sum over runs in full."""
+    """Each run's own matrix at its slots, as the sum over runs in full; what no run depends on is shared."""
+    np.testing.assert_array_equal(ArrowLayout.of(3, [np.array([0, -1]), np.array([1])]).shared, [2])
     rng = np.random.default_rng(0)
     full, parts = np.zeros((11, 11)), []
     for e, places in enumerate(PLACES):
@@ -115,9 +106,8 @@ NONE, NO_FLOOR = np.zeros((0, 11)), np.zeros(11)
 @pytest.mark.parametrize("seed", range(20))
 def test_what_is_made_positive_definite(seed):
     rng = np.random.default_rng(seed)
-    kept = arrow_of(random_matrix(rng, lowest=0.1))
+    kept, full = arrow_of(random_matrix(rng, lowest=0.1)), random_matrix(rng, lowest=-(10.0 ** rng.uniform(-2, 2)))
     assert kept.convexify(NONE, NO_FLOOR)[0] is kept
-    full = random_matrix(rng, lowest=-(10.0 ** rng.uniform(-2, 2)))
     convex = arrow_of(full).convexify(NONE, NO_FLOOR)[0].dense()
     assert np.linalg.eigvalsh(convex)[0] > 0.0
     scale = diagonal_scaling(Dense(full))

@@ -21,10 +21,6 @@ def level(t, x, p):
     return jnp.array([p["m"]])
 
 
-def line(t, x, p):
-    return jnp.array([p["m"] + p["s"] * t])
-
-
 def mean_of(values, sigma=None):
     return sf.estimate(curve(level, TIMES[: len(values)], values, {"m": 0.0}, sigma=sigma, tf=4.0))
 
@@ -44,7 +40,7 @@ def test_the_bootstrap_of_a_mean_is_that_of_scipy():
     assert study.standard_deviation[0] == pytest.approx(values.std(ddof=1) / np.sqrt(40), rel=0.04)
     assert abs(study.bias[0]) < 4 * study.standard_deviation[0] / np.sqrt(4000)
     other = scipy.stats.bootstrap(
-        (values,), np.mean, n_resamples=20_000, method="BCa", rng=np.random.default_rng(1), vectorized=True
+        (values,), np.mean, n_resamples=20_000, rng=np.random.default_rng(1)
     ).confidence_interval
     expected = values.mean() + inflation * (np.array([other.low, other.high]) - values.mean())
     np.testing.assert_allclose(study.intervals()[0], expected, atol=0.02)
@@ -65,6 +61,7 @@ def test_wild_follows_noise_that_grows():
     rng = np.random.default_rng(3)
     size = np.linspace(0.1, 2.0, 40) ** 2
     values = 1.0 + 0.5 * TIMES + size * rng.standard_normal(40)
+    line = lambda t, x, p: jnp.array([p["m"] + p["s"] * t])  # noqa: E731
     fit = sf.estimate(curve(line, TIMES, values, {"m": 0.0, "s": 0.0}, tf=4.0))
     design = np.stack([np.ones(40), TIMES], axis=1)
     residual = values - design @ fit.theta
@@ -90,7 +87,6 @@ def test_blocks_follow_noise_that_is_correlated():
     expected = np.sqrt((1 + r) / (1 - r))
     assert blocks.standard_deviation[0] / single.standard_deviation[0] == pytest.approx(expected, rel=0.2)
     assert single.standard_deviation[0] == pytest.approx(fit.standard_errors[0], rel=0.1)
-    assert "resampled: blocks of" in str(blocks)
     assert sf.bootstrap(fit, 5, resample="blocks", block=7).block == 7
 
 
@@ -118,7 +114,6 @@ def test_a_run_weighs_as_often_as_it_was_drawn():
     assert study.resampled.tolist() == [False] * 3 + [True]
     assert np.isnan(study.intervals()).all(axis=1).tolist() == [True] * 3 + [False]
     np.testing.assert_allclose(study.standard_deviation, [np.nan] * 3 + [study.theta[:, 3].std(ddof=1)], rtol=1e-12)
-    assert "of one run alone" in str(study)
     assert [ax.get_xlabel() for ax in study.plot().axes if ax.get_visible()] == ["v"]
 
 
@@ -128,9 +123,7 @@ def test_missing_values_stay_missing_and_channels_stay_together():
     values = np.array([1.0, 3.0]) + noise
     values[[3, 9], 1] = np.nan
 
-    def two(t, x, p):
-        return jnp.array([p["m"], p["n"]])
-
+    two = lambda t, x, p: jnp.array([p["m"], p["n"]])  # noqa: E731
     fit = sf.estimate(curve(two, TIMES, values, {"m": 0.0, "n": 0.0}, tf=4.0))
     study = sf.bootstrap(fit, 300)
     assert study.samples.tolist() == [78] * 300
@@ -138,16 +131,15 @@ def test_missing_values_stay_missing_and_channels_stay_together():
 
 
 def test_seeds_and_folders(tmp_path):
-    fit = mean_of(skewed(), sigma=1.0)
-    one, same, other = (sf.bootstrap(fit, CHUNK + 8, seed=seed) for seed in (0, 0, 1))
+    fit, runs = mean_of(skewed(), sigma=1.0), sf.estimate(ramps([0.9, 1.0, 1.2]))
+    one, same, other = (
+        sf.bootstrap(fit, CHUNK + 8, seed=seed, folder=f) for seed, f in ((0, None), (0, tmp_path), (1, None))
+    )
     np.testing.assert_array_equal(one.theta, same.theta)
     assert not np.array_equal(one.theta, other.theta)
-    np.testing.assert_array_equal(sf.bootstrap(fit, CHUNK + 8, folder=tmp_path).theta, one.theta)
-    with pytest.raises(ValueError, match="holds the results of another run"):
-        sf.bootstrap(fit, CHUNK + 8, folder=tmp_path, resample="wild")
-    runs = sf.estimate(ramps([0.9, 1.0, 1.2]))
-    with pytest.raises(ValueError, match="holds the results of another run"):
-        sf.bootstrap(runs, CHUNK + 8, folder=tmp_path, resample="runs")
+    for another, resample in ((fit, "wild"), (runs, "runs")):
+        with pytest.raises(ValueError, match="holds the results of another run"):
+            sf.bootstrap(another, CHUNK + 8, folder=tmp_path, resample=resample)
 
 
 def made(**settings):

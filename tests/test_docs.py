@@ -29,12 +29,10 @@ PAGES = sorted(
 )
 
 #: Pages that take a second or more.
-HEAVY = {
-    *(f"{name}.md" for name in ("figures", "report", "sampling", "command-line", "how-many-switches")),
-    *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "many-runs", "guards", "design", "online")),
-    *(f"{name}.md" for name in ("convergence", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
-    "sharp.md",
-}
+HEAVY = (
+    "figures report sampling command-line how-many-switches uncertainty validation terrain many-runs guards design "
+    "online convergence what-now vehicles real-logs dates fishing husky sharp"
+)
 
 #: Blocks that are files and commands of one session; tests/test_first_ten_minutes.py runs them in order.
 SESSIONS = {"first-ten-minutes.md"}
@@ -51,7 +49,9 @@ def blocks_of(page):
 
 def pages_with(*kinds):
     return [
-        pytest.param(page, id=page.relative_to(ROOT).as_posix(), marks=[pytest.mark.slow] * (page.name in HEAVY))
+        pytest.param(
+            page, id=page.relative_to(ROOT).as_posix(), marks=[pytest.mark.slow] * (page.stem in HEAVY.split())
+        )
         for page in PAGES
         if page.name not in SESSIONS and any(kind in kinds for kind, _ in blocks_of(page))
     ]
@@ -59,10 +59,10 @@ def pages_with(*kinds):
 
 def commands_of(page):
     """Command lines of a page, without prompts, comments, and what commands print."""
-    blocks = blocks_of(page)
-    lines = [line for kind, block in blocks if kind == "sh" for line in block.splitlines()]
-    shown = [line for kind, block in blocks if kind == "console" for line in block.splitlines()]
-    lines += [line.removeprefix("$ ") for line in shown if line.startswith("$ ")]
+    lines = [(kind, line) for kind, block in blocks_of(page) for line in block.splitlines()]
+    lines = [
+        line.removeprefix("$ ") for kind, line in lines if kind == "sh" or (kind == "console" and line[:2] == "$ ")
+    ]
     return [command for line in lines if (command := shlex.split(line, comments=True))]
 
 
@@ -181,14 +181,6 @@ def test_the_limits_on_the_page_are_those_of_the_code(row, limits):
 def test_every_public_name_is_in_the_reference():
     listed = set(re.findall(r"^   (\w+)$", (ROOT / "docs" / "api.rst").read_text(), re.MULTILINE))
     assert set(sf.__all__) <= listed, "add them to docs/api.rst, each to its topic"
-
-
-def test_every_page_is_in_the_contents():
-    """A page that no list of contents names is not found; pages of results are included in others."""
-    contents = re.findall(r"^```\{toctree\}\n(.*?)^```$", (ROOT / "docs" / "index.md").read_text(), re.M | re.S)
-    named = {line for block in contents for line in block.splitlines() if line and not line.startswith(":")}
-    pages = {path.stem for path in (ROOT / "docs").glob("*.md") if not path.stem.endswith("-results")}
-    assert pages - {"index"} <= named
 
 
 def test_the_documentation_is_short():

@@ -43,8 +43,8 @@ def voltage(times, tau=TRUTH[0], k=TRUTH[1:]):
     return np.where(times < tau, 1.0 - np.exp(-k[0] * times), at_tau * np.exp(-k[1] * (times - tau)))
 
 
-def noise(seed, size=40):
-    return SIGMA * np.random.default_rng(seed).normal(size=size)
+def noise(seed):
+    return SIGMA * np.random.default_rng(seed).normal(size=40)
 
 
 def run(values, tau=GUESS[0]):
@@ -71,7 +71,6 @@ def test_truth_from_noisy_samples():
     fitted = found.comparisons[0][0].fitted[:, 0]
     np.testing.assert_allclose(fitted, voltage(TIMES, found.theta[0], found.theta[1:]), rtol=0, atol=1e-8)
     assert found.history[-1].theta.tolist() == found.theta.tolist()
-    assert [record.iteration for record in found.history] == list(range(found.iterations + 1))
 
 
 def test_a_bound_that_is_reached_is_named():
@@ -163,19 +162,16 @@ def test_a_time_is_not_determined_if_the_others_gain_nothing_as_it_moves(slope, 
 # Scales
 
 
-UNITS = {
-    "charge": lambda t, x, p: p["k"][0] * p["unit"] * (1.0 - x),
-    "discharge": lambda t, x, p: -p["k"][1] * p["unit"] * x,
-}
-
-
 def test_badly_scaled_unknowns_take_the_same_iterates():
     """Rates in units of 1e6 per second beside times in seconds, and rates of 1e6 in 1e-6 per second."""
     values = voltage(TIMES) + noise(6)
     histories = []
     for unit in (1.0, 1e6, 1e-6):
-        parameters = {"k": GUESS[1:] / unit, "unit": sf.Parameter(unit, fixed=True)}
-        found = sf.estimate(sf.Problem(sf.HybridSystem(UNITS, [0.0]), run(values), parameters))
+        modes = {
+            "charge": lambda t, x, p, unit=unit: charge(t, x, {"k": p["k"] * unit}),
+            "discharge": lambda t, x, p, unit=unit: discharge(t, x, {"k": p["k"] * unit}),
+        }
+        found = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run(values), {"k": GUESS[1:] / unit}))
         assert found.success
         size = np.array([1.0, 1.0 / unit, 1.0 / unit])
         assert np.all(np.abs(found.theta / size - TRUTH) < 4 * found.standard_errors / size)
@@ -258,10 +254,10 @@ def test_times_out_of_order_by_rounding_are_put_in_order():
 
 
 def with_a_mode_too_many(sequence, times):
-    modes = {"charge": charge, "discharge": discharge, "drain": lambda t, x, p: 0.0 * x - p["leak"]}
+    system = replace(CAPACITOR, modes={**CAPACITOR.modes, "drain": lambda t, x, p: 0.0 * x - p["leak"]})
     data = sf.Measurements(TIMES, voltage(TIMES) + noise(1), sigma=SIGMA)
     parameters = {"k": GUESS[1:], "leak": sf.Parameter(1.0, lower=0.1, upper=5.0)}
-    return sf.Problem(sf.HybridSystem(modes, [0.0]), sf.Experiment(data, sequence, times, 0.0, 2.0), parameters)
+    return sf.Problem(system, sf.Experiment(data, sequence, times, 0.0, 2.0), parameters)
 
 
 def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
@@ -282,7 +278,6 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     text = " ".join(found.report(full=True).split())
     for unsaid in ("not identified", "Fix one of", "add data", "hardly determine", "NOT UNIQUE"):
         assert unsaid not in text
-    assert "because a mode has collapsed" in " ".join(str(found.identifiability).split())
 
 
 def test_a_parameter_that_acts_only_in_a_mode_that_collapsed_at_the_start_is_named():
@@ -365,23 +360,10 @@ def test_covariance_of_a_linear_model_in_closed_form(known):
 # The mesh
 
 
-def follow(t, x, p):
-    return p["k"] * (jnp.cos(t) - x)
-
-
-def followed(times, k):
-    """x(t) of x' = k (cos t - x) from 0."""
-    return (k**2 * np.cos(times) + k * np.sin(times) - k**2 * np.exp(-k * times)) / (1.0 + k**2)
-
-
 @cache
 def refined_fit():
     """The guess is slow, the truth fast: the mesh of the guess is too coarse for it."""
-    times = np.linspace(0.4, 4.0, 10)
-    values = followed(times, 8.0) + noise(10, 10)
-    system = sf.HybridSystem({"follow": follow}, [0.0])
-    experiment = sf.Experiment(sf.Measurements(times, values, sigma=SIGMA), ("follow",), (), 0.0, 4.0)
-    return sf.estimate(sf.Problem(system, experiment, {"k": 1.0}, rtol=1e-5, atol=1e-7))
+    return sf.estimate(models.slow_guess(8.0, 10))
 
 
 @pytest.mark.usefixtures("quick_certificates")
@@ -399,7 +381,7 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     assert abs(rough - fine) > 1e-3 * fine
     assert found.cost == pytest.approx(fine, rel=2e-5)
     times, values = found.comparisons[0][0].times, found.comparisons[0][0].measured[:, 0]
-    exact = scipy.optimize.least_squares(lambda k: (followed(times, k[0]) - values) / SIGMA, [7.0], xtol=1e-14)
+    exact = scipy.optimize.least_squares(lambda k: (models.followed(times, *k) - values) / SIGMA, [7.0], xtol=1e-14)
     assert found.theta[0] == pytest.approx(exact.x[0], rel=1e-5)
     assert [record.iteration for record in found.history] == list(range(len(found.history)))  # over all meshes
     assert found.iterations == found.history[-1].iteration > found.earlier_iterations > 0
