@@ -155,12 +155,9 @@ BALL_G, BALL_HEIGHT = 9.8, 50.0
 
 def ball_system(**settings: Any) -> sf.HybridSystem:
     """A ball that is dropped from 50 m; an impact takes it to ``(x, -e v)``."""
-    return sf.HybridSystem(
-        {"air": lambda t, x, p: jnp.stack([x[1], -BALL_G + 0 * x[0]])},
-        [BALL_HEIGHT, 0.0],
-        reset_maps={("air", "air"): lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])},
-        **settings,
-    )
+    fall = {"air": lambda t, x, p: jnp.stack([x[1], -BALL_G + 0 * x[0]])}
+    bounce = {("air", "air"): lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])}
+    return sf.HybridSystem(fall, [BALL_HEIGHT, 0.0], bounce, **settings)
 
 
 def ball(times: Any, *, e: float = 0.8, system: sf.HybridSystem | None = None) -> sf.Problem:
@@ -222,9 +219,8 @@ def drive(data: Any, guess: Any = (5.0, 9.0, 0.8)) -> sf.Problem:
 
 def positions(times: np.ndarray, sigma: float) -> sf.Measurements:
     """Measurements of X and Y, all zero: values to be replaced."""
-    return sf.Measurements(
-        times, np.zeros((len(times), 2)), lambda t, x, p: x[jnp.array([0, 2])], sigma=sigma, names=("X", "Y")
-    )
+    observe = lambda t, x, p: x[jnp.array([0, 2])]  # noqa: E731
+    return sf.Measurements(times, np.zeros((len(times), 2)), observe, sigma=sigma, names=("X", "Y"))
 
 
 def tracked_drive() -> sf.Problem:

@@ -62,7 +62,7 @@ def test_the_error_that_is_reported_is_that_of_the_end():
 def test_the_error_does_not_depend_on_where_time_begins():
     theta = swing().theta
     early, late = (
-        sf.estimate(fastest_swing(begin, rtol=1e-4), start=theta + begin, max_iterations=0) for begin in (0.0, 1024.0)
+        sf.estimate(fastest_swing(t0, rtol=1e-4), start=theta + t0, max_iterations=0) for t0 in (0.0, 1024.0)
     )
     assert early.integration_error_of.startswith("terminal constraint")
     assert late.integration_error_of == early.integration_error_of

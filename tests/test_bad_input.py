@@ -58,9 +58,8 @@ def with_data(*data, **changes):
 
 
 def noisy(sigma, more=None, **settings):
-    return with_data(
-        seen(times=TIMES, values=np.ones(5), sigma=sigma, **settings), parameters={"k": 1.0} | (more or {})
-    )
+    data = seen(times=TIMES, values=np.ones(5), sigma=sigma, **settings)
+    return with_data(data, parameters={"k": 1.0} | (more or {}))
 
 
 def starting_at(initial_state):

@@ -68,11 +68,8 @@ def everything(running=True, solver="auto", **more):
     along_the_way = [follow, sf.RunningCost(lambda t, x, p: 0.1 * p["k"] * x[0] ** 2)] if running else []
     at_the_end = sf.TerminalCost(lambda x, p: p["k"] * x[1] ** 2)
     given = {"data": [slow, fast, noisy, at_transitions, at_the_end, *along_the_way]} | more
-    system = sf.HybridSystem(
-        {"swing": swing, "drift": drift, "brake": brake},
-        [sf.Parameter(0.5), 0.2],
-        reset_maps={("swing", "drift"): bounce, ("drift", "brake"): bounce},
-    )
+    bounces = {("swing", "drift"): bounce, ("drift", "brake"): bounce}
+    system = sf.HybridSystem({"swing": swing, "drift": drift, "brake": brake}, [sf.Parameter(0.5), 0.2], bounces)
     inputs = sf.Input([0.0, 1.0, 2.2, 4.0], [0.1, 0.5, -0.3, 0.0], kind="hold")
     run = sf.Experiment(mode_sequence=SEQUENCE, t0=0.0, tf=4.0, inputs=inputs, **{"transition_times": TIMES} | given)
     parameters = {"k": sf.Parameter(1.3, lower=0.2), "v": 0.6, "s": sf.Parameter(0.4, lower=0.01)}
@@ -85,15 +82,18 @@ def beam(problem, library, parameters, *, penalty, width, grid=None):
     return track.run(Rules.of(library, track.modes), parameters, penalty, width, beams.REPLAYS, None)
 
 
+def without_priors(D):
+    """The start of one hypothesis with D unknowns."""
+    one, rows = np.zeros(1), np.zeros((1, D))
+    return Hypotheses(one, one, rows, np.zeros((1, D, D)), rows, one, one)
+
+
 def begin_at(problem, grid, library):
     """Prepare a beam without priors that does not move its point of linearisation; return it, its state at t0 and p."""
     track = beams.prepare(problem, 0, library, grid)
     D = track.births + len(track.places)
-    nothing = Hypotheses(
-        np.zeros(1), np.zeros(1), np.zeros((1, D)), np.zeros((1, D, D)), np.zeros((1, D)), np.zeros(0), np.zeros(0)
-    )
     p = problem.initial_theta[len(problem.initial_theta) - len(problem.parameters) - 1 :][track.own[track.places]]
-    return track, track.engine.begin(p, nothing, (1e300, 1.0, 0.0), None), p  # one step a cell
+    return track, track.engine.begin(p, without_priors(D), (1e300, 1.0, 0.0), None), p  # one step a cell
 
 
 def follow_schedule(problem, library, sequence, times, grid):
@@ -167,13 +167,11 @@ def replay_births(problem, grid):
     """Transitions at `BIRTHS`, which are no nodes, propagated anew from t0; the point of linearisation stays."""
     track, _, p = begin_at(problem, grid, free(MODES, 2))
     S, D = track.births, track.births + len(track.places)
-    one, rows = np.zeros(1), np.zeros((1, D))
-    start = Hypotheses(one, one, rows, np.zeros((1, D, D)), rows, one, one)
     children = np.full((1, S, len(Column)), -1, dtype=np.int64)
     for i, (before, after) in enumerate(zip((0, 1), (1, 2), strict=True)):
         children[0, i] = 0, before, after, i, *track.functions[:, before, after]
     sequence, times = np.array([[2, 0]]), np.array([BIRTHS])
-    return track, track.engine.replay(start, p[None], sequence, children, times, len(track.times) - 1)
+    return track, track.engine.replay(without_priors(D), p[None], sequence, children, times, len(track.times) - 1)
 
 
 def test_births_at_any_time():
@@ -224,12 +222,10 @@ def test_two_names_of_one_parameter_are_one_unknown():
     times, rng = np.linspace(0.1, 10.0, 60), np.random.default_rng(0)
     end = 1.0 - np.exp(-0.8 * 5.0)
     x = np.where(times < 5.0, 1.0 - np.exp(-0.8 * times), (1.0 + end) * np.exp(-0.8 * (times - 5.0)) - 1.0)
-    system = sf.HybridSystem(
-        {"up": lambda t, x, p: -p["k1"] * (x - 1.0), "down": lambda t, x, p: -p["k2"] * (x + 1.0)}, [0.0]
-    )
+    modes = {"up": lambda t, x, p: -p["k1"] * (x - 1.0), "down": lambda t, x, p: -p["k2"] * (x + 1.0)}
     seen = sf.Measurements(times, (x + 0.02 * rng.normal(size=60))[:, None], sigma=0.02)
     run = sf.Experiment(seen, ("up", "down"), (4.0,), 0.0, 10.0, parameter_map={"k1": "k", "k2": "k"})
-    problem = sf.Problem(system, run, {"k": 1.3})
+    problem = sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"k": 1.3})
     fitted = sf.estimate(problem, strategy="local")
     proposal = beams.follow_order(problem, 0, np.array([1.3]))[0]
     np.testing.assert_allclose(proposal.parameters, fitted.parameters["k"], rtol=1e-4)
@@ -412,11 +408,9 @@ def test_a_guarded_time_depends_on_the_parameters_as_the_implicit_derivative_say
     guards = {("rise", "fall"): lambda t, x, p: x[0] - 0.5 * p["v"]}
     problem = replace(problem, system=replace(problem.system, guards=guards))
     track = beams.prepare(problem, 0, free(("rise", "fall"), 1), 0.1)
-    one, rows = np.zeros(1), np.zeros((1, 3))
-    nothing = Hypotheses(one, one, rows, np.zeros((1, 3, 3)), rows, one, one)
     tau, p = track.times[int(np.searchsorted(track.times, 0.3))], np.array([1.0, 0.3])
     node = int(np.searchsorted(track.times, tau))
-    states = track.engine.begin(p, nothing, (1e300, 1.0, 1e8), None)
+    states = track.engine.begin(p, without_priors(3), (1e300, 1.0, 1e8), None)
     states = track.engine.advance(states, np.array([[0, 0, 0, -1, -1, -1, -1]]), 0, node)
     without = states.matrices[0], states.gradients[0]
     states = track.engine.advance(states, np.array([[0, 0, 1, 0, -1, -1, 0]]), node, node + 1)

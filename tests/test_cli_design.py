@@ -2,6 +2,7 @@
 
 import csv
 import json
+import tomllib
 
 import numpy as np
 import pytest
@@ -85,10 +86,7 @@ def test_a_design_is_printed_and_written(folder):
     assert sorted(path.name for path in out.iterdir()) == names
     assert (out / "design.txt").read_text() == result.stdout
     problem = load_problem(folder / "problem.toml").problem
-    plan = sf.design(
-        problem, free={"power": [0.0, 1.5]}, names={"k": 0.1, "b": 0.5}, criterion="A", samples={"T": 3},
-        sensors={"T": 1.0, "fine": 3.0}, budget=2.0, starts=0,
-    )  # fmt: skip
+    plan = sf.design(problem, **tomllib.loads(DESIGN)["design"])
     assert str(plan) == result.stdout.rstrip("\n")
     np.testing.assert_array_equal(sf.read_log(out / "input.csv")["power"], plan.inputs["power"])
     np.testing.assert_array_equal(sf.read_log(out / "input.csv").times, np.linspace(0.0, 4.0, 9))

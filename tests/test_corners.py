@@ -30,9 +30,8 @@ KNOTS, HEIGHTS = np.array([-1.0, -0.5, 0.0, 0.3]), np.array([-2.0, -0.5, 0.0, 0.
 def samples(tf=4.0, count=40, values=None, sigma=1.0, **settings):
     """The first state at equal times, which is compared with a cosine unless values are given."""
     times = np.linspace(0.0, tf, count + 1)[1:]
-    return sf.Measurements(
-        times, np.cos(times) if values is None else values, lambda t, x, p: x[:1], sigma=sigma, **settings
-    )
+    values = np.cos(times) if values is None else values
+    return sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=sigma, **settings)
 
 
 def problem_of(mode, start, parameters, tf=4.0, data=None, count=40, inputs=None, jumps=(), **settings):
@@ -130,10 +129,8 @@ def test_what_does_not_change_with_the_state_has_no_corner():
 
 def test_a_branch_leaves_out_what_has_no_slope_on_the_other_side():
     """sqrt(x) has no slope at 0, and a selection would multiply it by 0."""
-    for slope in (
-        lambda x, p: jnp.where(x[0] < 0, 2.0 * x[0], jnp.sqrt(x[0])),
-        lambda x, p: jnp.where(x[0] >= 0, jnp.sqrt(x[0]), 2.0 * x[0]),
-    ):
+    root = lambda x, p: jnp.where(x[0] < 0, 2.0 * x[0], jnp.sqrt(x[0]))  # noqa: E731
+    for slope in (root, lambda x, p: jnp.where(x[0] >= 0, jnp.sqrt(x[0]), 2.0 * x[0])):
         corners = corners_of(stacked(slope))
         with use_float64():
             at = jnp.array([0.0, 1.0])
@@ -784,9 +781,8 @@ ROOTS = {
 def test_a_tank_that_is_or_ran_empty_is_filled_again(name, start):
     """sqrt(x) is not defined below zero, and its slope at zero is infinite: rows begin and end there all the same."""
     root, modes = ROOTS[name], ("drain", "fill") if start else ("fill", "drain")
-    system = sf.HybridSystem(
-        {"drain": lambda t, x, p: -p["c"] * root(x), "fill": lambda t, x, p: p["q"] - p["c"] * root(x)}, [start]
-    )
+    drain, fill = (lambda t, x, p: -p["c"] * root(x)), (lambda t, x, p: p["q"] - p["c"] * root(x))
+    system = sf.HybridSystem({"drain": drain, "fill": fill}, [start])
 
     def build(values, tau, c, q):
         data = sf.Measurements(np.linspace(0.1, 10.0, 60), values, sigma=0.01)

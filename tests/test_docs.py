@@ -24,9 +24,7 @@ from switchfit.io.problem_file import load_problem
 matplotlib.use("agg")
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted(
-    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*/README.md")]
-)
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*/README.md")])
 
 #: Pages that take a second or more.
 HEAVY = (
@@ -48,21 +46,18 @@ def blocks_of(page):
 
 
 def pages_with(*kinds):
+    pages = [page for page in PAGES if page.name not in SESSIONS and {kind for kind, _ in blocks_of(page)} & {*kinds}]
+    slow = [[pytest.mark.slow] * (page.stem in HEAVY.split()) for page in pages]
     return [
-        pytest.param(
-            page, id=page.relative_to(ROOT).as_posix(), marks=[pytest.mark.slow] * (page.stem in HEAVY.split())
-        )
-        for page in PAGES
-        if page.name not in SESSIONS and any(kind in kinds for kind, _ in blocks_of(page))
+        pytest.param(page, id=str(page.relative_to(ROOT)), marks=mark) for page, mark in zip(pages, slow, strict=True)
     ]
 
 
 def commands_of(page):
     """Command lines of a page, without prompts, comments, and what commands print."""
-    lines = [(kind, line) for kind, block in blocks_of(page) for line in block.splitlines()]
-    lines = [
-        line.removeprefix("$ ") for kind, line in lines if kind == "sh" or (kind == "console" and line[:2] == "$ ")
-    ]
+    blocks = [(kind, block) for kind, block in blocks_of(page) if kind in ("sh", "console")]
+    lines = [(kind, line) for kind, block in blocks for line in block.splitlines()]
+    lines = [line.removeprefix("$ ") for kind, line in lines if kind == "sh" or line.startswith("$ ")]
     return [command for line in lines if (command := shlex.split(line, comments=True))]
 
 

@@ -167,10 +167,8 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
     values = voltage(TIMES) + noise(6)
     histories = []
     for unit in (1.0, 1e6, 1e-6):
-        modes = {
-            "charge": lambda t, x, p, unit=unit: charge(t, x, {"k": p["k"] * unit}),
-            "discharge": lambda t, x, p, unit=unit: discharge(t, x, {"k": p["k"] * unit}),
-        }
+        in_unit = lambda mode, unit: lambda t, x, p: mode(t, x, {"k": p["k"] * unit})  # noqa: E731
+        modes = {name: in_unit(mode, unit) for name, mode in CAPACITOR.modes.items()}
         found = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run(values), {"k": GUESS[1:] / unit}))
         assert found.success
         size = np.array([1.0, 1.0 / unit, 1.0 / unit])
@@ -414,9 +412,8 @@ def test_a_tank_that_runs_dry(sigma, seed):
     data = sf.Measurements(times, values[:, None], sigma=sigma)
     valve = sf.Experiment(data, ("closed", "open", "closed", "open"), (3.5, 6.5, 10.5), 0.0, 20.0)
     found = sf.estimate(sf.Problem(tank, valve, {"k": sf.Parameter(0.4, lower=0.01)}), strategy="local")
-    exact = scipy.optimize.least_squares(
-        lambda theta: (level_of_tank(times, theta) - values) / sigma, found.theta, xtol=1e-14, ftol=1e-14
-    )
+    residuals = lambda theta: (level_of_tank(times, theta) - values) / sigma  # noqa: E731
+    exact = scipy.optimize.least_squares(residuals, found.theta, xtol=1e-14, ftol=1e-14)
     assert found.iterations < 200
     assert found.status is not sf.Status.MAX_ITERATIONS
     assert found.cost == pytest.approx(exact.cost, abs=1e-4)
