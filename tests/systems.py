@@ -161,13 +161,17 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def call(arguments: Arguments, tau: Any, p: Any, side: int = 1) -> Any:
         with use_float64(), use_compilation_cache():
-            return jax.block_until_ready(program(arguments, jnp.asarray(tau), jnp.asarray(p), jnp.asarray(side)))
+            return jax.tree.map(np.asarray, program(arguments, *map(jnp.asarray, (tau, p, side))))
 
     return call
 
 
 class Case:
-    """A problem, and all ways to differentiate its cost, each compiled once."""
+    """A problem, and all ways to evaluate and differentiate its cost, each compiled once.
+
+    `cost` is the simulated cost. The others return `Derivatives`: `paper` by the paper's adjoint equations; `discrete`
+    and `forward` of the discretised cost, with a gradient backward and a Hessian forward over it, or both forward.
+    """
 
     def __init__(self, problem: Problem, implicit: tuple[bool, ...] | None = None) -> None:
         self.problem = problem
@@ -175,10 +179,9 @@ class Case:
         self.structure = structure if implicit is None else replace(structure, implicit=implicit)
         self.tau = problem.experiments[0].initial_times
         self.N = len(self.tau)
-        self._paper = compiled(lambda given, *at: compute_paper_derivatives(Model(self.structure, given), *at))
-        self._discrete = compiled(self._differentiate("discrete-adjoint"))
-        self._forward = compiled(self._differentiate("forward"))
-        self._cost = compiled(self._simulate)
+        self.cost = compiled(self._simulate)
+        self.paper = compiled(lambda given, *at: Derivatives(*compute_paper_derivatives(self._model(given), *at)))
+        self.discrete, self.forward = map(self._differentiate, ("discrete-adjoint", "forward"))
 
     def arguments(self, kind: str = "all", *, halvings: int = 0, equal: float = 0.0) -> Arguments:
         """Arguments of one of `SYSTEMS`, on the mesh of `NODES` with each cell halved some times."""
@@ -187,28 +190,15 @@ class Case:
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
         return weighted(self.structure, build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
 
+    def _model(self, arguments: Arguments) -> Model:
+        return Model(self.structure, arguments)
+
     def _differentiate(self, method: Any) -> Callable[..., Any]:
-        return lambda *at: derivatives(*at, structure=self.structure, method=method)
+        return compiled(lambda *at: Derivatives(*derivatives(*at, structure=self.structure, method=method)))
 
     def _simulate(self, arguments: Arguments, tau: Any, p: Any, side: int) -> Any:
-        model = Model(self.structure, arguments)
+        model = self._model(arguments)
         return compute_path_cost(model, propagate(model, tau, p, side), p)
-
-    def cost(self, *given: Any) -> float:
-        """The simulated cost."""
-        return float(self._cost(*given))
-
-    def paper(self, *given: Any) -> Derivatives:
-        """By the paper's adjoint equations."""
-        return Derivatives(*map(np.asarray, self._paper(*given)))
-
-    def discrete(self, *given: Any) -> Derivatives:
-        """Of the discretised cost, gradient backward and Hessian forward over it."""
-        return Derivatives(*map(np.asarray, self._discrete(*given)))
-
-    def forward(self, *given: Any) -> Derivatives:
-        """Of the discretised cost, forward over forward."""
-        return Derivatives(*map(np.asarray, self._forward(*given)))
 
 
 @cache

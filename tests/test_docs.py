@@ -223,13 +223,3 @@ def test_no_page_loads_anything_from_a_network(site):
         loaded = [tag for tag in tags if "rel=" not in tag or re.search(r'rel="[^"]*(stylesheet|icon|preload)', tag)]
         sources = [re.search(r'\b(?:src|href)="([^"]*)"', tag) for tag in loaded]
         assert not [source[1] for source in sources if source and "//" in source[1]], page.name
-
-
-@pytest.mark.slow
-def test_formulas_are_mathml(site):
-    """Also those that converters get wrong: 1/2 without braces, letters with dots and hats."""
-    page = (site / "how-it-works.html").read_text(encoding="utf-8")
-    assert re.search(r"<mfrac>(<mrow>)?<mn>1</mn>(</mrow><mrow>)?<mn>2</mn>(</mrow>)?</mfrac>", page)
-    assert page.count("<math") > 8
-    assert "\\frac" not in page.replace("annotation", "")
-    assert "MathJax" not in page
