@@ -9,14 +9,11 @@ from __future__ import annotations
 
 from functools import cache
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
 from systems import (
     KINDS,
-    KNOTS,
     NODES,
     P0,
     Derivatives,
@@ -24,13 +21,10 @@ from systems import (
     case,
     closed_form,
     closed_form_case,
-    compiled,
     padded_mesh,
 )
 
 from switchfit.discretization.mesh import build_arguments
-from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import propagate
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
@@ -118,27 +112,6 @@ def test_equal_neighbouring_modes_give_zero_rows(method: str, tau: list[float], 
     np.testing.assert_allclose([found.hessian[0], found.hessian[:, 0]], 0.0, atol=atol[1])
 
 
-@pytest.mark.parametrize("method", ["paper", pytest.param("discrete", marks=pytest.mark.slow)])
-def test_one_sided_derivatives_at_a_sample_differ_by_dell_x(method: str) -> None:
-    this = case("resets")
-    tau = NODES[[4, 14, 16]]  # the second one, which has no reset map, at the sixth sample
-    arguments = this.arguments("samples", halvings=2)
-    left, right = (getattr(this, method)(arguments, tau, P0, side).gradient for side in (-1, 1))
-
-    def Dell_X(arguments, tau, p, side):
-        model = Model(this.structure, arguments)
-        x = propagate(model, tau, p, side).at_transition(1)[1]
-        sample = jax.tree.map(lambda a: a[5], arguments.samples[0])
-        Dell = jax.grad(lambda x: model.sample_cost(0, sample, x, p))(x)
-        u = jnp.interp(tau[1], KNOTS, jnp.cos(KNOTS))
-        before, behind = (model.structure.modes[i](tau[1], x, model.parameters(p), u) for i in (1, 0))
-        return Dell @ (before - behind)
-
-    expected = float(compiled(Dell_X)(arguments, tau, P0))
-    assert abs(expected) > 0.1
-    np.testing.assert_allclose((left - right)[1], expected, rtol=1e-6)
-
-
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("nodes", [[4, 9, 14], [4, 4, 13]], ids=["at a sample", "coinciding"])
 def test_derivatives_converge_from_both_sides(nodes: list[int], side: int) -> None:
@@ -215,15 +188,3 @@ def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
 
     coarse, fine = np.abs(remainders(0.5)), np.abs(remainders(0.25))
     np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)
-
-
-@pytest.mark.parametrize("split", [0.0, 0.35, 1.287])
-def test_splitting_a_mode_changes_nothing(split: float) -> None:
-    """Modes A, A, C with the first transition anywhere, at t0 too, where nothing is left of the first A."""
-    this = case("plain")
-    arguments = this.arguments(equal=1.0, halvings=3)
-    expected = this.discrete(arguments, [0.6, 1.287], P0)
-    found = this.discrete(arguments, [split, 1.287], P0)
-    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
-    np.testing.assert_allclose(found.gradient[1:], expected.gradient[1:], atol=1e-6)
-    np.testing.assert_allclose(found.hessian[1:, 1:], expected.hessian[1:, 1:], atol=1e-5)

@@ -34,22 +34,6 @@ def random_matrix(rng, lowest=None):
     return full if lowest is None else full + (lowest - np.linalg.eigvalsh(full)[0]) * np.eye(11)
 
 
-def test_parts_of_runs_add_up():
-    """Each run's own matrix at its slots, as the sum over runs in full; what no run depends on is shared."""
-    np.testing.assert_array_equal(ArrowLayout.of(3, [np.array([0, -1]), np.array([1])]).shared, [2])
-    rng = np.random.default_rng(0)
-    full, parts = np.zeros((11, 11)), []
-    for e, places in enumerate(PLACES):
-        own = rng.normal(size=(len(places), len(places)))
-        own = own + own.T
-        full[np.ix_(places, places)] += own
-        slots = LAYOUT.slots(e, places)
-        part = np.zeros((5, 5))
-        part[np.ix_(slots, slots)] = own
-        parts.append(part)
-    np.testing.assert_allclose(Arrow.of_runs(LAYOUT, parts).dense(), full, atol=1e-14)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_operations_are_those_of_the_full_matrix(seed):
     rng = np.random.default_rng(seed)
@@ -217,14 +201,3 @@ def test_coordinates_are_released_from_kinks(seed):
     assert arrow.iterations == full.iterations
     assert arrow.evaluations == full.evaluations
     np.testing.assert_allclose(arrow.theta, full.theta, rtol=1e-7, atol=1e-8)
-
-
-def test_saddle_points_are_left():
-    def saddle(theta, side):
-        H = np.diag(np.r_[12 * theta[0] ** 2 - 2.0, np.full(10, 2.0)])
-        g = np.r_[-2 * theta[0] + 4 * theta[0] ** 3, 2 * theta[1:]]
-        return theta[0] ** 4 - theta[0] ** 2 + theta[1:] @ theta[1:], g, H
-
-    for found in minimize_both(saddle, np.zeros(11)):
-        assert found.status.is_strict_minimum
-        assert abs(found.theta[0]) == pytest.approx(np.sqrt(0.5), rel=1e-6)

@@ -17,7 +17,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse
 from switchfit.strategy import beam as beams
 from switchfit.strategy.beam import build_mesh, choose_grid, choose_stops, count_values
-from switchfit.strategy.library import Library, Rules, Sequences, encode, select_lowest
+from switchfit.strategy.library import Library, Rules, select_lowest
 
 
 def free(modes, max_switches=8, first=None, last=None, successions=None, durations=None):
@@ -339,15 +339,6 @@ def test_few_hypotheses_have_different_sequences():
     assert few == [6, 0, 1, 5], "less than one is reserved for each"
 
 
-def test_sequences_have_the_codes_that_their_births_give_them():
-    kept, sequence = Sequences.start(np.array([1]), 9, 0.0), [1]
-    for k in range(9):
-        children = kept.list_children(np.zeros(1, dtype=np.int64), np.array([k % 3]))
-        kept = kept.follow(children, np.array([1]), k + 1.0)
-        sequence.append(k % 3)
-        assert kept.code.tolist() == [encode(sequence)], "int64 wraps around from the fourth on"
-
-
 def test_some_hypotheses_have_fewer_switches():
     """Where sigma is far too small every switch pays; the best with fewer are found all the same."""
     sequence, _, values = draw_truth(8)
@@ -429,21 +420,15 @@ def test_births_are_on_an_even_grid_of_nodes():
     nodes = build_mesh(run, 0.3).times
     assert np.isin([0.0, *times, 2.15], nodes).all()
     births = nodes[choose_stops(nodes, 0.3)]
-    assert births[[0, -1]].tolist() == [0.0, 4.0]
-    assert len(births) == 14
-    assert np.abs(births[1:-1] - 0.3 * np.arange(1, 13)).max() <= 0.15
+    np.testing.assert_allclose(births, [*(0.3 * np.arange(13)), 4.0], atol=0.15)
     counts = count_values([log], nodes)
-    assert counts[np.searchsorted(nodes, [0.0, 0.1, 0.2, 0.31, 4.0])].tolist() == [0, 1, 1, 2, 6]
-    assert counts[-2] == 5
+    assert counts[np.searchsorted(nodes, [0.0, 0.1, 0.2, 0.31, 3.99, 4.0]) - [0, 0, 0, 0, 1, 0]].tolist() == [
+        0,
+        1,
+        1,
+        2,
+        5,
+        6,
+    ]
     assert choose_grid(run) == pytest.approx(0.11)
     assert choose_grid(replace(run, tf=12.0)) == pytest.approx(0.2)
-
-
-def test_births_leave_room_for_the_shortest_durations():
-    library = free("uv", 3, first=("u",), durations={"u": 1.0, "v": 0.5})
-    rules = Rules.of(library, ("u", "v"))
-    kept = Sequences.start(np.array([0, 1]), 3, 0.0)
-    assert [found.tolist() for found in rules.list_births(kept, 0.4, 4.0)] == [[], []]
-    assert [found.tolist() for found in rules.list_births(kept, 0.6, 4.0)] == [[1], [0]]
-    assert [found.tolist() for found in rules.list_births(kept, 1.0, 4.0)] == [[0, 1], [1, 0]]
-    assert [found.tolist() for found in rules.list_births(kept, 3.4, 4.0)] == [[0], [1]]

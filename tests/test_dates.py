@@ -103,8 +103,7 @@ def test_dates_with_a_zone_are_moments(kind):
 
 
 def test_numbers_are_numbers_as_ever():
-    run = run_of([0.0, 1.0, 2.0], [1.5], time_unit="fortnight")
-    assert (run.origin, run.time_zone) == (None, None)
+    assert run_of([0.0, 1.0, 2.0], [1.5], time_unit="fortnight").origin is None
     assert run_of([1.7e12, 1.8e12, 1.9e12]).origin is None, "never told by their size"
 
 
@@ -198,8 +197,7 @@ def test_the_origin_is_the_first_sample_or_t0_or_what_is_stated():
     assert (stated.t0, stated.tf, stated.initial_times) == (27.0, 30.0, [28.5])
     numbers = run_of([0.0, 1.0, 2.0], [1.0], origin="2020-03-28", time_unit="d", tf="2020-03-31")
     assert (numbers.t0, numbers.tf, numbers.origin.date) == (0.0, 3.0, "2020-03-28T00:00:00")
-    beside = run_of(DAYS, [30.0])
-    assert beside.initial_times == [30.0], "numbers beside dates count from the origin"
+    assert run_of(DAYS, [30.0]).initial_times == [30.0], "numbers beside dates count from the origin"
 
 
 def test_guesses_bounds_and_priors_are_dates():
@@ -214,9 +212,8 @@ def test_guesses_bounds_and_priors_are_dates():
 def test_a_copy_keeps_its_origin():
     run = run_of(DAYS, time_zone="Europe/Berlin")
     copy = replace(run, data=log(["2020-03-29 12:00", "2020-03-30"]))
-    assert copy.origin == run.origin
+    assert (copy.origin, copy.time_zone) == (run.origin, "Europe/Berlin")
     np.testing.assert_array_equal(copy.data[0].times, [35.0, 47.0])
-    assert replace(copy, name="again").time_zone == "Europe/Berlin"
 
 
 def test_signals_and_inputs():
@@ -311,8 +308,7 @@ def test_the_numbers_are_those_of_a_fit_to_numbers_and_the_transition_is_a_date(
 def test_the_report_shows_dates(fits):
     dated, plain = fits
     text = str(dated)
-    assert "on -> off, 2020-03-20 to 2020-04-08 13:00" in text
-    assert re.search(r"times +d since 2020-03-20, Europe/Berlin", text)
+    assert re.search(r"on -> off, 2020-03-20 to 2020-04-08 13:00(.|\n)*times +d since 2020-03-20, Europe/Berlin", text)
     (shown,) = re.findall(r"tau_1 +(2020-03-\d\d \d\d:\d\d) +± \S+ +d +2020-03-28 +t = \S+, on -> off", text)
     off = dt.datetime.fromisoformat(shown).replace(tzinfo=BERLIN) - dated.transition_dates[0][0]
     assert abs(off) <= dt.timedelta(seconds=30)
@@ -352,12 +348,10 @@ def test_tables_frames_and_json_have_dates_beside_numbers(fits):
 def test_a_saved_fit_has_the_dates(fits, tmp_path):
     dated, _ = fits
     dated.save(tmp_path / "fit.json")
-    content = json.loads((tmp_path / "fit.json").read_text())
-    assert content["transition_dates"] == {"tau_1": dated.transition_dates[0][0].isoformat()}
+    assert f'"tau_1": "{dated.transition_dates[0][0].isoformat()}"' in (tmp_path / "fit.json").read_text()
     loaded = sf.Estimate.load(tmp_path / "fit.json", problem=dated.problem)
     assert loaded.transition_dates == dated.transition_dates
     assert str(loaded) == str(dated)
-    assert loaded.trajectory.origin == dated.trajectory.origin
     for problem in (room(dated=True, origin="2020-03-19"), room(dated=False)):
         with pytest.raises(ValueError, match=r"since 2020-03-20T00:00:00\+01:00, the problem has them in"):
             sf.Estimate.load(tmp_path / "fit.json", problem=problem)
@@ -420,15 +414,12 @@ def test_ticks_of_any_span(span):
 
 def test_profiles_residuals_and_many_fits_show_dates(fits):
     dated, _ = fits
-    profile = dated.profile("tau_1")
-    assert re.search(r"estimate +2020-03-29 \d\d:\d\d ± ", str(profile))
+    profile, study = dated.profile("tau_1"), sf.bootstrap(dated, 40)
     assert re.search(r"95 % interval +\[2020-03-29 \d\d:\d\d, 2020-03-29 \d\d:\d\d\]", str(profile))
-    assert profile.plot().axes[0].get_xlabel() == "tau_1 (Europe/Berlin)"
-    assert dated.plot_residuals().axes[0].get_xlabel() == "time (Europe/Berlin)"
-    study = sf.bootstrap(dated, 40)
-    assert study.date_origins == (dated.trajectory.origin, None)
     assert re.search(r"tau_1 \(d\) +2020-03-29 \d\d:\d\d", str(study))
-    assert study.plot().axes[0].get_xlabel() == "tau_1 (Europe/Berlin)"
+    for figure, what in ((profile.plot(), "tau_1"), (dated.plot_residuals(), "time"), (study.plot(), "tau_1")):
+        assert figure.axes[0].get_xlabel() == f"{what} (Europe/Berlin)"
+    assert study.date_origins == (dated.trajectory.origin, None)
 
 
 def test_many_logs_with_origins_of_their_own_are_not_shown_as_dates():

@@ -15,7 +15,6 @@ from test_cli import catch_settings, run
 import switchfit as sf
 from switchfit.experiment_design import (
     Candidates,
-    Criterion,
     Nominal,
     _build_criterion,
     _describe,
@@ -302,16 +301,6 @@ def test_gradient_against_differences(problem, power):
         step[place] = 1e-4
         difference = (rate(table + step) - rate(table - step)) / 2e-4
         assert float(slope[place]) == pytest.approx(difference, rel=1e-5, abs=1e-7)
-
-
-def test_slope_of_the_criterion_in_the_information():
-    rng = np.random.default_rng(0)
-    F, step = (root @ root.T for root in rng.normal(size=(2, 3, 3)))
-    rule = Criterion(np.array([0, 2]), np.array([1.0, 3.0]), np.eye(3), np.array([1.0, 0.5, 2.0]))
-    for power in (0.0, 1.0, 20.0):
-        slope = rule.rate(F, power)[1]
-        difference = rule.rate(F + 1e-6 * step, power)[0] - rule.rate(F - 1e-6 * step, power)[0]
-        assert np.sum(slope * step) == pytest.approx(difference / 2e-6, rel=1e-6)
 
 
 def test_a_gain_is_known_best_with_the_input_at_its_limit():

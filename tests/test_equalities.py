@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from optimizer import box, free, minimize, rows
+from optimizer import box, free, minimize
 
 from switchfit.optimize import Status, step
 from switchfit.optimize.qp import Equalities, Room, find_normal_step, solve_composite
@@ -119,29 +119,6 @@ def test_multipliers_hessian_and_free_directions_in_closed_form():
     np.testing.assert_allclose(found.hessian, np.eye(2), atol=1e-8)
     np.testing.assert_allclose(np.abs(found.free_basis[:, 0]), np.sqrt([0.5, 0.5]), atol=1e-9)
     assert found.free_basis[0, 0] * found.free_basis[1, 0] < 0
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_random_problems_end_at_a_minimum(seed):
-    """A convex cost on bent surfaces, with an order and bounds: the conditions of Karush, Kuhn and Tucker hold."""
-    rng = np.random.default_rng(seed)
-    root, g = rng.normal(size=(5, 5)), rng.normal(size=5)
-    B = root @ root.T + np.eye(5)
-    lines, bend, point = rng.normal(size=(2, 5)), 0.1 * rng.normal(size=(2, 5)), np.sort(0.5 + rng.random(5))
-    level = np.asarray(lines @ point + bend @ point**2)
-    linear = rows([[-1.0, 1.0, 0.0, 0.0, 0.0]], [0.0], np.full(5, -3.0), np.full(5, 3.0))
-    surfaces = lambda x: [lines[i] @ x + bend[i] @ x**2 - level[i] for i in range(2)]  # noqa: E731
-    found = solve(lambda x: g @ x + 0.5 * x @ (B @ x), surfaces, point, linear)
-    assert found.status.successful
-    x, lam = found.theta, np.array([multiplier for _, _, multiplier in found.equalities])
-    A = lines + 2 * bend * x
-    np.testing.assert_allclose(lines @ x + bend @ x**2, level, atol=1e-8)
-    np.testing.assert_allclose(g + B @ x + lam @ A, linear.normals.T @ found.multipliers, atol=1e-6)
-    assert np.all(found.multipliers >= 0.0)
-    assert np.all(linear.slack(x) >= -1e-12)
-    assert np.all(linear.slack(x)[found.multipliers > 1e-7] < 1e-9)
-    Z = found.free_basis
-    assert not Z.size or np.linalg.eigvalsh(Z.T @ (B + np.diag(2 * lam @ bend)) @ Z)[0] > 0
 
 
 # --- each part of the method ------------------------------------------------------------------------------------------
