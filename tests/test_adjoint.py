@@ -36,11 +36,6 @@ INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
 """Transition times that are not nodes."""
 
 
-def slow_but(*names: str) -> list:
-    """Names of systems, of which those that are given are tested in the fast suite."""
-    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in names)) for name in INSIDE]
-
-
 BLOCKS = ("D_tau J", "D_p J", "tau-tau, i = j", "tau-tau, i > j", "tau-p", "p-p")
 
 
@@ -145,8 +140,9 @@ def test_closed_forms(name: str, method: str) -> None:
 # Derivatives of the discretised cost
 
 
+@pytest.mark.slow  # in the fast suite, `test_protocol.py` compares them
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", slow_but("mixed")[1:])
+@pytest.mark.parametrize("name", ["resets", "stiff", "mixed"])
 def test_adjoint_and_forward_agree_to_rounding(name: str, kind: str) -> None:
     this = case(name)
     at = this.arguments(kind), INSIDE[name], P0
@@ -172,7 +168,9 @@ def test_side_is_the_limit_from_that_side(side: int) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", slow_but("resets", "mixed"))
+@pytest.mark.parametrize(
+    "name", [*("resets", "mixed"), *(pytest.param(v, marks=pytest.mark.slow) for v in ("plain", "stiff"))]
+)
 def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
     this = case(name)
     arguments = this.arguments(kind)

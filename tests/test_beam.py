@@ -422,13 +422,6 @@ def test_births_are_on_an_even_grid_of_nodes():
     births = nodes[choose_stops(nodes, 0.3)]
     np.testing.assert_allclose(births, [*(0.3 * np.arange(13)), 4.0], atol=0.15)
     counts = count_values([log], nodes)
-    assert counts[np.searchsorted(nodes, [0.0, 0.1, 0.2, 0.31, 3.99, 4.0]) - [0, 0, 0, 0, 1, 0]].tolist() == [
-        0,
-        1,
-        1,
-        2,
-        5,
-        6,
-    ]
+    assert counts[np.searchsorted(nodes, [0.0, 0.1, 0.2, 0.31, 4.0])].tolist() == [0, 1, 1, 2, 6]
     assert choose_grid(run) == pytest.approx(0.11)
     assert choose_grid(replace(run, tf=12.0)) == pytest.approx(0.2)
