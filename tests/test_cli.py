@@ -1,9 +1,7 @@
 """The command line: what it writes, what it prints where, and its exit codes."""
 
 import csv
-import errno
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -258,19 +256,11 @@ def test_check_without_running_the_model(folder, tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_full_disk_leaves_the_old_file_and_says_so(folder, tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_made_is_said(folder, tmp_path):
     (tmp_path / "report.txt").write_text("before")
-
-    def full(handle):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    for out, reason in ((tmp_path, "No space left on device"), (tmp_path / "report.txt", "File exists")):
-        result = run("fit", folder / "problem.toml", "--out", out)
-        assert result.exit_code == 2
-        assert f"{tmp_path / 'report.txt'} cannot be read or written: {reason}" in result.stderr
-    assert (tmp_path / "report.txt").read_text() == "before"
-    assert list(tmp_path.iterdir()) == [tmp_path / "report.txt"]
+    result = run("fit", folder / "problem.toml", "--out", tmp_path / "report.txt")
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'report.txt'} cannot be read or written: File exists" in result.stderr
 
 
 @pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.slow)])
