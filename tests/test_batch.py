@@ -335,6 +335,17 @@ def test_fixed_times_and_bounds_keep_their_place_among_the_starts():
 # Many logs
 
 
+def fit_as_single_ones(problems, rtol):
+    """Return the fits of many problems, which must be those of each by itself."""
+    fits = sf.estimate_many(problems)
+    assert fits.message.tolist() == [""] * len(problems)
+    for theta, errors, problem in zip(fits.theta, fits.standard_errors, problems, strict=True):
+        single = sf.estimate(problem)
+        np.testing.assert_allclose(theta, single.theta, rtol=rtol)
+        np.testing.assert_allclose(errors, single.standard_errors, rtol=max(10 * rtol, 1e-6))
+    return fits
+
+
 def test_many_logs_are_the_same_as_single_estimates():
     """Logs of two lengths, one with a missing sample, and two whose horizon is the span of their own data."""
     problems = [room(sf.Measurements(TIMES, measured_room(seed), sigma=0.01)) for seed in range(3)]
@@ -346,29 +357,17 @@ def test_many_logs_are_the_same_as_single_estimates():
     for first in (0.25, 100.0):
         run = sf.Experiment(replace(item, times=item.times - 0.25 + first), ("on", "off"), (first + 1.5,))
         problems.append(replace(problems[0], experiments=run))
-    fits = sf.estimate_many(problems)
-    assert fits.success.all()
+    fits = fit_as_single_ones(problems, 1e-8)
     assert fits.samples.tolist() == [24, 24, 24, 13, 23, 24, 24]
-    for k, problem in enumerate(problems):
-        single = sf.estimate(problem)
-        np.testing.assert_allclose(fits.theta[k], single.theta, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(fits.standard_errors[k], single.standard_errors, rtol=1e-6)
     np.testing.assert_allclose(fits.theta[6] - fits.theta[5], [99.75, 0.0], atol=1e-6)
-    assert "7 fits" in str(fits)
 
 
 def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
     """The guess is slow and the truth fast: the mesh of the guess is too coarse for one of the logs."""
-
     problems = [slow_guess(k, 1) for k in (1.0, 12.0, 1.1)]
-    fits = sf.estimate_many(problems)
+    fits = fit_as_single_ones(problems, 1e-5)
     on_its_mesh = minimize_cost(evaluator_of(problems[1]), problems[1].initial_theta, "exact", 1e-7, 200)
     assert abs(on_its_mesh.theta[0] - fits.theta[1, 0]) > 1e-5
-    for k, problem in enumerate(problems):
-        single = sf.estimate(problem)
-        np.testing.assert_allclose(fits.theta[k], single.theta, rtol=1e-5)
-        np.testing.assert_allclose(fits.standard_errors[k], single.standard_errors, rtol=1e-4)
-    assert fits.message.tolist() == ["", "", ""]
 
 
 # Chunks
@@ -389,31 +388,21 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
-    sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "a")
-    with pytest.raises(ValueError, match="holds the results of another run"):
-        sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "a", seed=1)
-    sf.multistart(room(), 2, folder=tmp_path / "c")
-    with pytest.raises(ValueError, match="holds the results of another run"):
-        sf.multistart(sf.Problem(OTHER, room().experiments, room().parameters), 2, folder=tmp_path / "c")
-
-
-class Interrupted:
-    """Work whose third chunk is interrupted from the keyboard."""
-
-    size = 2
-
-    def __call__(self, runs):
-        if runs.start == 4:
-            time.sleep(0.5)  # the others are done by then
-            raise KeyboardInterrupt
-        return {"value": np.arange(runs.start, runs.stop)}
-
-    def fingerprint(self):
-        return "interrupted"
+    sf.multistart(room(), 2, folder=tmp_path)
+    for problem, seed in ((room(), 1), (replace(room(), system=OTHER), 0)):
+        with pytest.raises(ValueError, match="holds the results of another run"):
+            sf.multistart(problem, 2, folder=tmp_path, seed=seed)
 
 
 def test_ctrl_c_returns_what_is_done(tmp_path):
-    runs, arrays = run_chunks(Interrupted(), 6, folder=tmp_path / "x")
+    def work(runs):
+        if runs.start == 4:
+            time.sleep(0.2)  # the others are done by then
+            raise KeyboardInterrupt
+        return {"value": np.arange(runs.start, runs.stop)}
+
+    work.size, work.fingerprint = 2, lambda: "interrupted"
+    runs, arrays = run_chunks(work, 6, folder=tmp_path / "x")
     assert set(runs) <= {0, 1, 2, 3}
     np.testing.assert_array_equal(arrays["value"], runs)
 
@@ -561,8 +550,7 @@ def test_a_run_whose_noise_raises_an_error_is_listed():
     study = sf.monte_carlo(room(), 40, theta=TRUTH, noise=noise, seed=0)
     failed = study.status == "ERROR"
     assert 4 <= failed.sum() <= 36
-    np.testing.assert_array_equal(study.success, ~failed)
-    np.testing.assert_array_equal(np.isnan(study.cost), failed)
+    np.testing.assert_array_equal([~study.success, np.isnan(study.cost)], [failed, failed])
     said = " ".join(message for _, message in study.failures)
     assert "ArithmeticError: no noise today" in said
     assert "noise must give finite values of shape (24, 1); got shape (24, 1), not all finite" in said
@@ -610,7 +598,7 @@ def test_a_fit_that_crawls_towards_a_kink_is_handed_over():
     run = sf.Experiment(data, ("rest", "up", "rest", "down"), (1.3, 2.6, 4.3), 0.0, 6.0)
     problem = sf.Problem(system, run, {"v": sf.Parameter(1.0, lower=0.1, upper=4.0)})
     study = sf.monte_carlo(problem, 150, theta=[1.1, 2.8, 4.6, 1.2], start=problem.initial_theta, seed=1)
-    assert study.failures == []
+    assert study.success.all()
     assert np.sum(study.status == "CONVERGED_AT_KINK") > 40
     assert study.evaluations.max() < 200
 
@@ -630,8 +618,7 @@ def test_an_end_that_is_out_of_order_by_rounding_is_finished():
     meshes = evaluator_of(problem).meshes
     found = Batch(problem, meshes, {}, LIMITS).fit(starts)
     assert "ERROR" not in found.status.tolist()
-    assert np.all(found.theta[:, 0] >= 0.0)
-    assert np.all(found.theta[:, 0] <= 6.0)
+    assert np.all((found.theta[:, 0] >= 0.0) & (found.theta[:, 0] <= 6.0))
 
 
 def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch, finished):

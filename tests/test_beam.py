@@ -47,7 +47,7 @@ def bounce(t, x, p):
     return jnp.stack([x[0] + 0.1 * jnp.sin(t), -0.7 * x[1] * p["k"]])
 
 
-SEQUENCE, TIMES, MODES = ("swing", "drift", "brake"), (1.2, 2.4), ("swing", "drift", "brake")
+SEQUENCE, TIMES = ("swing", "drift", "brake"), (1.2, 2.4)
 FIRST = np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.4, 2.8, 3.2, 3.6, 4.0])
 SECOND = np.array([0.3, 1.1, 1.9, 2.7, 3.5])
 
@@ -76,10 +76,10 @@ def everything(running=True, solver="auto", **more):
     return sf.Problem(system, run, parameters, solver=solver)
 
 
-def beam(problem, library, parameters, *, penalty, width, grid=None):
+def beam(problem, library, *, penalty, width):
     """Return the proposals of a beam over the only run."""
-    track = beams.prepare(problem, 0, library, grid)
-    return track.run(Rules.of(library, track.modes), parameters, penalty, width, beams.REPLAYS, None)
+    track = beams.prepare(problem, 0, library, None)
+    return track.run(Rules.of(library, track.modes), problem.initial_theta, penalty, width, beams.REPLAYS, None)
 
 
 def without_priors(D):
@@ -88,28 +88,25 @@ def without_priors(D):
     return Hypotheses(one, one, rows, np.zeros((1, D, D)), rows, one, one)
 
 
-def begin_at(problem, grid, library):
+def begin_at(problem, grid):
     """Prepare a beam without priors that does not move its point of linearisation; return it, its state at t0 and p."""
-    track = beams.prepare(problem, 0, library, grid)
+    track = beams.prepare(problem, 0, free(SEQUENCE, 2), grid)
     D = track.births + len(track.places)
     p = problem.initial_theta[len(problem.initial_theta) - len(problem.parameters) - 1 :][track.own[track.places]]
     return track, track.engine.begin(p, without_priors(D), (1e300, 1.0, 0.0), None), p  # one step a cell
 
 
-def follow_schedule(problem, library, sequence, times, grid):
-    """Propagate one hypothesis without priors and without moving its point of linearisation; return J, g, H."""
-    track, states, _ = begin_at(problem, grid, library)
-    S, D = track.births, track.births + len(track.places)
-    nodes = [0, *np.searchsorted(track.times, times).tolist(), len(track.times) - 1]
-    index = [track.modes.index(name) for name in sequence]
+def follow_schedule(problem, grid):
+    """Propagate `SEQUENCE` and `TIMES`, without priors and with a fixed point of linearisation; return J, g, H."""
+    track, states, _ = begin_at(problem, grid)
+    nodes = [0, *np.searchsorted(track.times, TIMES).tolist(), len(track.times) - 1]
     for i, (first, last) in enumerate(pairwise(nodes)):
-        before = index[max(i - 1, 0)]
+        before = max(i - 1, 0)
         child = np.full((1, len(Column)), -1, dtype=np.int64)
-        child[0, :4] = 0, before, index[i], i - 1
-        child[0, beams.FUNCTIONS] = track.functions[:, before, index[i]]
+        child[0, :4] = 0, before, i, i - 1
+        child[0, beams.FUNCTIONS] = track.functions[:, before, i]
         states = track.engine.advance(states, child, first, last)
-    N = len(times)
-    own = np.concatenate([np.arange(N), np.arange(S, D)])
+    own = np.append(np.arange(len(TIMES)), track.births + np.arange(len(track.places)))
     return track, states.costs[0], states.gradients[0][own], states.matrices[0][np.ix_(own, own)]
 
 
@@ -133,7 +130,7 @@ def test_costs_and_derivatives_are_those_of_the_evaluator(running, solver):
     """
     problem, in_g, in_H = everything(running=running, solver=solver), [], []
     for grid in (0.05, 0.02, 0.01) if running else (0.2, 0.1, 0.05):
-        track, J, g, H = follow_schedule(problem, free(MODES, 2), SEQUENCE, TIMES, grid)
+        track, J, g, H = follow_schedule(problem, grid)
         J_e, g_e, H_e = evaluate_on(problem, track)
         np.testing.assert_allclose(J, J_e, rtol=1e-12)
         assert max(gap(g[2:], g_e[2:]), gap(H[2:, 2:], H_e[2:, 2:])) < 1e-11
@@ -151,7 +148,7 @@ def test_costs_and_derivatives_are_those_of_the_evaluator(running, solver):
 def test_a_birth_at_a_sample_comes_after_it():
     """The derivatives are those for a later time; those for an earlier one differ, since the sample moves with it."""
     problem = everything(data=everything().experiments[0].data[0])
-    track, _, g, H = follow_schedule(problem, free(MODES, 2), SEQUENCE, TIMES, 0.1)
+    track, _, g, H = follow_schedule(problem, 0.1)
     assert np.isin(TIMES, FIRST).all()
     _, g_later, H_later = evaluate_on(problem, track, side=1)
     _, g_earlier, H_earlier = evaluate_on(problem, track, side=-1)
@@ -165,11 +162,11 @@ BIRTHS = (1.27, 2.43)
 
 def replay_births(problem, grid):
     """Transitions at `BIRTHS`, which are no nodes, propagated anew from t0; the point of linearisation stays."""
-    track, _, p = begin_at(problem, grid, free(MODES, 2))
+    track, _, p = begin_at(problem, grid)
     S, D = track.births, track.births + len(track.places)
     children = np.full((1, S, len(Column)), -1, dtype=np.int64)
-    for i, (before, after) in enumerate(zip((0, 1), (1, 2), strict=True)):
-        children[0, i] = 0, before, after, i, *track.functions[:, before, after]
+    for i in range(2):
+        children[0, i] = 0, i, i + 1, i, *track.functions[:, i, i + 1]
     sequence, times = np.array([[2, 0]]), np.array([BIRTHS])
     return track, track.engine.replay(without_priors(D), p[None], sequence, children, times, len(track.times) - 1)
 
@@ -189,29 +186,18 @@ def test_births_at_any_time():
 # A system that is linear in its unknowns: its linearised cost is its cost
 
 
-def rise(t, x, p):
-    return p["v"] - x
-
-
-def fall(t, x, p):
-    return -p["v"] - 0.5 * x
-
-
-def linear_problem(values=None, sigma=0.1, parameters=None, **more):
-    times = np.linspace(0.1, 4.0, 40)
-    values = np.random.default_rng(1).normal(size=(40, 1)) if values is None else values
-    system = sf.HybridSystem({"rise": rise, "fall": fall}, [sf.Parameter(0.3)])
-    given = {"mode_sequence": ("rise",), "t0": 0.0, "tf": 4.0} | more
-    run = sf.Experiment(sf.Measurements(times, values, sigma=sigma), **given)
-    return sf.Problem(system, run, parameters or {"v": sf.Parameter(1.0)}, max_transitions=2)
+def linear_problem(v=1.0, sequence=("rise",), times=(), **settings):
+    modes = {"rise": lambda t, x, p: p["v"] - x, "fall": lambda t, x, p: -p["v"] - 0.5 * x}
+    system = sf.HybridSystem(modes, [sf.Parameter(0.3)], **settings)
+    data = sf.Measurements(np.linspace(0.1, 4.0, 40), np.random.default_rng(1).normal(size=(40, 1)), sigma=0.1)
+    return sf.Problem(system, sf.Experiment(data, sequence, times, 0.0, 4.0), {"v": v}, max_transitions=2)
 
 
 def test_without_switches_the_proposal_is_the_estimate():
-    problem = linear_problem(parameters={"v": sf.Parameter(1.0, prior=sf.Normal(mean=0.5, sd=0.05))})
+    problem = linear_problem(sf.Parameter(1.0, prior=sf.Normal(mean=0.5, sd=0.05)))
     estimate = sf.estimate(problem, strategy="local")
-    (found,) = beam(problem, free(("rise",), 0), problem.initial_theta, penalty=3.0, width=5)
-    assert found.sequences == (("rise",),)
-    assert len(found.transition_times[0]) == 0
+    (found,) = beam(problem, free(("rise",), 0), penalty=3.0, width=5)
+    assert (found.sequences, len(found.transition_times[0])) == ((("rise",),), 0)
     np.testing.assert_allclose(found.parameters, estimate.theta, atol=1e-6)
     # the priors count, and besides them only the weak term of the initial state
     np.testing.assert_allclose(found.cost, estimate.cost, rtol=1e-4)
@@ -249,8 +235,8 @@ def test_the_point_of_linearisation_does_not_matter_for_a_linear_model():
 
 
 def test_parameters_stay_inside_their_bounds():
-    problem = linear_problem(parameters={"v": sf.Parameter(1.0, lower=0.8, upper=1.1)})
-    found = beam(problem, free(("rise", "fall"), 2), problem.initial_theta, penalty=1.0, width=10)
+    problem = linear_problem(sf.Parameter(1.0, lower=0.8, upper=1.1))
+    found = beam(problem, free(("rise", "fall"), 2), penalty=1.0, width=10)
     assert {proposal.parameters[0] for proposal in found} & {0.8, 1.1}
     assert all(0.8 <= proposal.parameters[0] <= 1.1 for proposal in found)
 
@@ -274,8 +260,7 @@ def truth_problem(values, sigma=0.05):
 
 
 def find(values, library=None, width=40, **given):
-    problem = truth_problem(values, **given)
-    return beam(problem, library or free("ABC"), problem.initial_theta, penalty=3.0, width=width)
+    return beam(truth_problem(values, **given), library or free("ABC"), penalty=3.0, width=width)
 
 
 def test_random_truths():
@@ -359,12 +344,8 @@ BOUNCES = (FIRST_BOUNCE, FIRST_BOUNCE * 2.6)
 def bouncing_ball(guarded=False):
     """A ball whose bounces, with a restitution of 0.8, are changes of mode with a reset map: problem and library."""
 
-    def fly(t, x, p):
-        return jnp.stack([x[1], -9.81 + 0.0 * x[0]])
-
-    def bounced(t, x, p):
-        return jnp.stack([x[0], -p["e"] * x[1]])
-
+    fly = lambda t, x, p: jnp.stack([x[1], -9.81 + 0.0 * x[0]])  # noqa: E731
+    bounced = lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])  # noqa: E731
     pairs = [("drop", "first"), ("first", "second")]
     guards = dict.fromkeys(pairs, lambda t, x, p: x[0] - p["ground"] + 0.3) if guarded else {}
     names, ground = ("drop", "first", "second"), {"ground": sf.Parameter(0.3, fixed=True)}
@@ -372,8 +353,7 @@ def bouncing_ball(guarded=False):
     times = np.arange(0.02, 2.0, 0.02)
     seen = sf.Measurements(times, np.zeros((len(times), 1)), observe=lambda t, x, p: x[:1], sigma=0.01)
     run = sf.Experiment(seen, names, BOUNCES, 0.0, 2.0)
-    true = sf.Problem(system, run, {"e": 0.8} | ground)
-    height = Evaluator(true).simulate(true.initial_theta)[0].seen[0][: len(times)]
+    height = sf.simulate(sf.Problem(system, run, {"e": 0.8} | ground), times="samples").states[:, :1]
     values = height + 0.01 * np.random.default_rng(0).normal(size=height.shape)
     run = replace(run, data=replace(seen, values=values), mode_sequence=("drop",), transition_times=())
     follow = {"drop": ("first",), "first": ("second",), "second": ()}
@@ -382,11 +362,10 @@ def bouncing_ball(guarded=False):
 
 def test_guards_determine_times():
     """The first bounce does not depend on what is estimated: its time is that of the guard, not that of the noise."""
-    problem, library = bouncing_ball(guarded=True)
-    guarded = beam(problem, library, problem.initial_theta, penalty=3.0, width=20)[0]
+    guarded = beam(*bouncing_ball(guarded=True), penalty=3.0, width=20)[0]
     assert guarded.sequences[0] == ("drop", "first", "second")
     assert abs(guarded.transition_times[0][0] - FIRST_BOUNCE) < 5e-5
-    without = beam(*bouncing_ball(), problem.initial_theta, penalty=3.0, width=20)[0]
+    without = beam(*bouncing_ball(), penalty=3.0, width=20)[0]
     assert without.sequences[0] == ("drop", "first", "second")
     np.testing.assert_allclose(without.transition_times[0], BOUNCES, atol=0.01)
     assert abs(without.transition_times[0][0] - FIRST_BOUNCE) > 2e-4
@@ -395,9 +374,8 @@ def test_guards_determine_times():
 
 def test_a_guarded_time_depends_on_the_parameters_as_the_implicit_derivative_says():
     """dtau = -(D_x c Z + D_p c) / (D_x c f + D_t c): x = 0.3 exp(-t) + v (1 - exp(-t)) meets c = x - v / 2."""
-    problem = linear_problem(transition_times=(0.5,), mode_sequence=("rise", "fall"))
     guards = {("rise", "fall"): lambda t, x, p: x[0] - 0.5 * p["v"]}
-    problem = replace(problem, system=replace(problem.system, guards=guards))
+    problem = linear_problem(sequence=("rise", "fall"), times=(0.5,), guards=guards)
     track = beams.prepare(problem, 0, free(("rise", "fall"), 1), 0.1)
     tau, p = track.times[int(np.searchsorted(track.times, 0.3))], np.array([1.0, 0.3])
     node = int(np.searchsorted(track.times, tau))

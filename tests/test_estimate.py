@@ -5,7 +5,6 @@ from functools import cache
 from itertools import product
 from unittest.mock import Mock
 
-import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
@@ -129,20 +128,6 @@ def test_a_fit_that_passes_samples_does_not_stop_at_them():
 
 
 # Unknowns that the data does not determine
-
-
-def test_unknowns_that_trade_off_are_named():
-    values = np.exp(-1.4 * TIMES) + noise(4)
-    system = sf.HybridSystem({"decay": lambda t, x, p: -(p["a"] + p["b"]) * x}, [1.0])
-    data = sf.Measurements(TIMES, values, sigma=SIGMA)
-    found = sf.estimate(sf.Problem(system, sf.Experiment(data, ("decay",), (), 0.0, 2.0), {"a": 0.5, "b": 0.5}))
-    assert found.status is sf.Status.SINGULAR
-    for said in ("flat to second order along", "0.71 a", "0.71 b", "Fix one of them or add data"):
-        assert said in found.message
-    assert found.parameters["a"] + found.parameters["b"] == pytest.approx(1.4, abs=0.02)
-    (reason,) = found.verdict.reasons
-    assert (found.verdict.level, reason.kind, set(reason.subjects)) == ("doubtful", "not determined", {"a", "b"})
-    assert np.isnan(found.covariance).all()
 
 
 @pytest.mark.parametrize(("slope", "status"), [(1e-6, sf.Status.SINGULAR), (10.0, sf.Status.SADDLE)])
@@ -371,41 +356,6 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     assert [record.iteration for record in found.history] == list(range(len(found.history)))  # over all meshes
     assert found.iterations == found.history[-1].iteration > found.earlier_iterations > 0
     assert np.all(np.diff([record.evaluations for record in found.history]) > 0)
-
-
-# A tank that runs dry inside the last mode: the root of its level has no derivative there, whatever the mesh
-
-
-def run_dry(t, x, p):
-    level = jnp.where(x[0] > 0.0, x[0], 1.0)
-    return jnp.array([jnp.where(x[0] > 0.0, -p["k"] * jnp.sqrt(level), 0.0)])
-
-
-def level_of_tank(times, theta):
-    """x(t) in closed form: the root of the level falls at the rate k/2 while the valve is open, down to zero."""
-    opened, closed, again, k = theta
-    open_for = np.clip(times, opened, closed) - opened + np.maximum(times - again, 0.0)
-    return np.maximum(np.sqrt(2.0) - 0.5 * k * open_for, 0.0) ** 2
-
-
-@pytest.mark.parametrize(
-    ("sigma", "seed"), [*(pytest.param(*given, marks=pytest.mark.slow) for given in ((0.01, 1), (0.05, 2))), (0.05, 0)]
-)
-def test_a_tank_that_runs_dry(sigma, seed):
-    """J has kinks and jumps of the size of its integration error: a search does not creep along one of them."""
-    tank = sf.HybridSystem({"closed": lambda t, x, p: 0.0 * x, "open": run_dry}, [2.0])
-    times = np.linspace(0.0, 20.0, 61)[1:]
-    values = level_of_tank(times, (3.0, 7.0, 11.0, 0.45)) + sigma * np.random.default_rng(seed).normal(size=60)
-    data = sf.Measurements(times, values[:, None], sigma=sigma)
-    valve = sf.Experiment(data, ("closed", "open", "closed", "open"), (3.5, 6.5, 10.5), 0.0, 20.0)
-    found = sf.estimate(sf.Problem(tank, valve, {"k": sf.Parameter(0.4, lower=0.01)}), strategy="local")
-    residuals = lambda theta: (level_of_tank(times, theta) - values) / sigma  # noqa: E731
-    exact = scipy.optimize.least_squares(residuals, found.theta, xtol=1e-14, ftol=1e-14)
-    assert found.iterations < 200
-    assert found.status is not sf.Status.MAX_ITERATIONS
-    assert found.cost == pytest.approx(exact.cost, abs=1e-4)
-    errors = np.sqrt(np.linalg.inv(exact.jac.T @ exact.jac).diagonal())
-    assert (np.abs(found.theta - exact.x) < 0.02 * errors).all()
 
 
 def test_a_minimum_to_the_accuracy_of_its_cost_has_converged():
