@@ -425,9 +425,6 @@ import switchfit as sf
 def heat(t, x, p, u):
     return p["b"] * u["power"] + u["sun"] - p["k"] * x
 
-def fine(t, x, p):
-    return x
-
 system = sf.HybridSystem({"heat": heat}, [0.0], state_names=("T",))
 """
 
@@ -449,20 +446,13 @@ file = "plan.csv"
 time = "t"
 columns = ["T"]
 sigma = 0.1
-
-[[experiments.data]]
-file = "plan.csv"
-time = "t"
-columns = ["fine"]
-observe = "model.py:fine"
-sigma = 0.05
 """
 
 DESIGN = """
 [design]
 criterion = "A"
 samples = { T = 3 }
-sensors = { T = 1.0, fine = 3.0 }
+sensors = { T = 1.0 }
 budget = 2.0
 starts = 0
 
@@ -480,8 +470,8 @@ def folder(tmp_path):
     (tmp_path / "model.py").write_text(MODEL)
     (tmp_path / "problem.toml").write_text(PROBLEM + DESIGN)
     (tmp_path / "plain.toml").write_text(PROBLEM)
-    rows = [f"{t},0,0,1.0,0.2" for t in np.linspace(0.0, 4.0, 9)]
-    (tmp_path / "plan.csv").write_text("\n".join(["t,T,fine,power,sun", *rows]) + "\n")
+    rows = [f"{t},0,1.0,0.2" for t in np.linspace(0.0, 4.0, 9)]
+    (tmp_path / "plan.csv").write_text("\n".join(["t,T,power,sun", *rows]) + "\n")
     return tmp_path
 
 
@@ -523,16 +513,8 @@ def test_json_and_what_cannot_be_estimated(folder):
     assert (shown["theta_names"], shown["covariance"]) == (["k", "b"], [[None, None], [None, None]])
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('criterion = "A"', 'criterion = "T"', "design.criterion"),
-        ("power = [0.0, 1.5]", "moon = [0.0, 1.5]", "free must name inputs of the run: power, sun; got 'moon'"),
-        ("k = 0.1", "c = 0.1", "names has 'c', which is no unknown of the problem: k, b"),
-    ],
-)
-def test_mistakes_in_the_file(folder, old, new, message):
-    (folder / "problem.toml").write_text((PROBLEM + DESIGN).replace(old, new))
+def test_a_mistake_in_the_file_is_said_with_its_key(folder):
+    (folder / "problem.toml").write_text((PROBLEM + DESIGN).replace('criterion = "A"', 'criterion = "T"'))
     result = run("design", folder / "problem.toml")
     assert result.exit_code == 2
-    assert message in result.stderr.replace("\n", " ")
+    assert "design.criterion" in result.stderr
