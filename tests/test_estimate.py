@@ -1,10 +1,11 @@
 """estimate(): truth recovered, constraints and kinks named, uncertainties in closed form, all ways to end."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from unittest.mock import Mock
 
+import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ import switchfit as sf
 from switchfit.estimation import estimator
 from switchfit.estimation.local_fit import _drop_noise_of_times
 from switchfit.fit.accuracy import Follower
-from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
+from switchfit.paper.vehicle import build_simulated_problem
 from switchfit.runtime.errors import Issue
 
 # A capacitor that is charged through one resistor and discharged through another one
@@ -369,3 +371,116 @@ def test_a_minimum_to_the_accuracy_of_its_cost_has_converged():
     assert almost.cost - best.cost < almost.integration_error * best.cost
     assert almost.verdict.level == best.verdict.level == "good"
     assert "below the error of the cost" in almost.message
+
+
+# What is said about the integration error: of every output that a problem contains, and against finer meshes
+
+
+def pendulum(torque):
+    """Angle, angular velocity and a clock."""
+    return lambda t, x, p: jnp.stack([x[1], torque - jnp.sin(x[0]) - 0.1 * x[1] ** 2, 1.0 + 0 * x[0]])
+
+
+def fastest_swing(begin=0.0, **settings):
+    """From rest at 0 to rest at 2 rad in the shortest time: J is a clock, which every mesh integrates exactly."""
+    modes = {"push": pendulum(1.5), "brake": pendulum(-1.5), "done": lambda t, x, p: jnp.zeros(3)}
+    costs = [sf.TerminalCost(lambda x, p: x[2]), sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] - 2.0, x[1]]))]
+    times = (begin + 3.0, begin + 4.0)
+    run = sf.Experiment(costs, ("push", "brake", "done"), times, begin, begin + 20.0)
+    return sf.Problem(sf.HybridSystem(modes, np.zeros(3)), run, **settings)
+
+
+fit_locally = partial(sf.estimate, strategy="local")
+"""A cost without data is otherwise fitted from many starts, which all end here."""
+
+
+@cache
+def swing():
+    return fit_locally(fastest_swing())
+
+
+def misses(theta, begin=0.0):
+    """By how much the end is really missed: (angle, angular velocity)."""
+    return Evaluator(fastest_swing(begin, rtol=1e-13, atol=1e-15), theta).constrained(theta).constraints
+
+
+def test_the_mesh_is_refined_for_terminal_constraints():
+    fit = swing()
+    assert fit.success
+    np.testing.assert_allclose(misses(fit.theta), 0.0, rtol=0, atol=1e-8)
+    assert 1e-13 < fit.integration_error < 1e-8
+
+
+@pytest.mark.usefixtures("quick_certificates")
+def test_the_error_that_is_reported_is_that_of_the_end():
+    """With a coarse mesh, what is reported is by how much the end is missed, over the range of angle or velocity."""
+    fit = fit_locally(fastest_swing(rtol=1e-4, atol=1e-6))
+    ranges = np.ptp(fit.trajectory.states, axis=0)[:2]
+    errors = np.abs(misses(fit.theta) - [c for _, c, _ in fit.constraints]) / ranges
+    worst = int(np.argmax(errors))
+    assert fit.integration_error_of == f"terminal constraint {worst + 1}"
+    assert fit.integration_error == pytest.approx(errors[worst], rel=0.1)
+    assert f"{fit.integration_error:.1e}   (of terminal constraint {worst + 1}, relative" in str(fit)
+    assert f"the integration error of terminal constraint {worst + 1} is" in str(fit.certificate.failures[0])
+
+
+def test_the_error_does_not_depend_on_where_time_begins():
+    theta = swing().theta
+    early, late = (
+        sf.estimate(fastest_swing(t0, rtol=1e-4), start=theta + t0, max_iterations=0) for t0 in (0.0, 1024.0)
+    )
+    assert early.integration_error_of.startswith("terminal constraint")
+    assert late.integration_error_of == early.integration_error_of
+    assert late.integration_error == pytest.approx(early.integration_error, rel=1e-6)
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+def test_a_fit_from_a_start_judges_its_meshes_as_the_problem_s_own(rtol):
+    """Only the problem's own meshes are tried with halved cells first; what is reported is by halved rows."""
+    problem = fastest_swing(rtol=rtol)
+    own, given = fit_locally(problem), fit_locally(problem, start=problem.initial_theta)
+    assert given.integration_error == pytest.approx(own.integration_error, rel=1e-6)
+    np.testing.assert_allclose(given.theta, own.theta, rtol=1e-12)
+    assert given.iterations == own.iterations
+
+
+def test_the_mesh_is_refined_for_guards():
+    """J looks at the first state alone, which is a line; the guard hangs on a state that is not."""
+    fast = lambda t, x, p: jnp.stack([1.0 + 0 * x[0], p["w"] * x[2], -p["w"] * x[1]])  # noqa: E731
+    slow = lambda t, x, p: jnp.stack([0.1 + 0 * x[0], 0 * x[1], 0 * x[2]])  # noqa: E731
+    system = sf.HybridSystem({"a": fast, "b": slow}, [0.0, 0.0, 1.0], guards={("a", "b"): lambda t, x, p: x[1]})
+    w = 11.0
+    crossing = 6 * np.pi / w
+    data = sf.Measurements([0.5, 4.0], [[0.5], [crossing + 0.1 * (4.0 - crossing)]], lambda t, x, p: x[:1], sigma=0.1)
+    run = sf.Experiment(data, ("a", "b"), (1.7,), 0.0, 4.0)
+    loose = sf.Problem(system, run, {"w": sf.Parameter(w, fixed=True)}, rtol=1e-5, atol=1e-7)
+    fit = fit_locally(loose)
+    assert fit.success
+    assert fit.integration_error_of == "guard of tau_1 (a -> b)"
+    assert 0.0 < fit.integration_error < 1e-5
+    assert 0.0 < abs(fit.theta[0] - crossing) < 1e-5
+
+
+# What the defaults promise: J to some 1e-8, its derivatives to some 1e-7, and the solution to 1e-8
+
+
+AWAY = np.array([0.03, 0.02, 0.001])
+
+
+@pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), tuple(models.VEHICLE_TRUTH + AWAY)])
+def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
+    """The paper's problem on its reference of 0.1 s; the last theta is near the solution, where J almost vanishes."""
+    problem, theta = build_simulated_problem(), np.array(theta)
+    found = Evaluator(problem, theta)(theta)
+    exact = Evaluator(problem, theta).divide(4)(theta)
+    error = np.linalg.norm(found.gradient - exact.gradient) / np.linalg.norm(exact.gradient)
+    assert 1e-9 < error < 2e-7
+    assert np.linalg.norm(found.hessian - exact.hessian) / np.linalg.norm(exact.hessian) < 1e-7
+
+
+def test_default_tolerances_give_the_solution_to_1e_8():
+    fit = sf.estimate(build_simulated_problem())
+    exact = sf.estimate(sf.Problem(fit.problem.system, fit.problem.experiments, fit.problem.parameters, rtol=1e-12))
+    assert fit.success
+    assert exact.success
+    np.testing.assert_allclose(fit.theta, exact.theta, rtol=1e-8, atol=0)
