@@ -87,17 +87,6 @@ def test_quadratic_programmes(seed):
 NONE, NO_FLOOR = np.zeros((0, 11)), np.zeros(11)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_what_is_made_positive_definite(seed):
-    rng = np.random.default_rng(seed)
-    kept, full = arrow_of(random_matrix(rng, lowest=0.1)), random_matrix(rng, lowest=-(10.0 ** rng.uniform(-2, 2)))
-    assert kept.convexify(NONE, NO_FLOOR)[0] is kept
-    convex = arrow_of(full).convexify(NONE, NO_FLOOR)[0].dense()
-    assert np.linalg.eigvalsh(convex)[0] > 0.0
-    scale = diagonal_scaling(Dense(full))
-    assert np.linalg.cond(convex / np.outer(scale, scale)) < 1e7
-
-
 def test_an_indefinite_block_leaves_the_shared_unknowns_their_curvature():
     """In place of -1e-4 its eigenvalue is made 1e-2, not 1e-4: the shared unknown gets a curvature of 49, not 5000."""
     full = np.eye(11)

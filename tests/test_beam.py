@@ -337,41 +337,6 @@ def test_some_hypotheses_have_fewer_switches():
     assert select_lowest(values, codes, switches, 6).tolist() == [0, 1, 2, 3, 4, 8]
 
 
-FIRST_BOUNCE = np.sqrt(2 * 2.0 / 9.81)
-BOUNCES = (FIRST_BOUNCE, FIRST_BOUNCE * 2.6)
-
-
-def bouncing_ball(guarded=False):
-    """A ball whose bounces, with a restitution of 0.8, are changes of mode with a reset map: problem and library."""
-
-    fly = lambda t, x, p: jnp.stack([x[1], -9.81 + 0.0 * x[0]])  # noqa: E731
-    bounced = lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])  # noqa: E731
-    pairs = [("drop", "first"), ("first", "second")]
-    guards = dict.fromkeys(pairs, lambda t, x, p: x[0] - p["ground"] + 0.3) if guarded else {}
-    names, ground = ("drop", "first", "second"), {"ground": sf.Parameter(0.3, fixed=True)}
-    system = sf.HybridSystem(dict.fromkeys(names, fly), [2.0, 0.0], dict.fromkeys(pairs, bounced), guards=guards)
-    times = np.arange(0.02, 2.0, 0.02)
-    seen = sf.Measurements(times, np.zeros((len(times), 1)), observe=lambda t, x, p: x[:1], sigma=0.01)
-    run = sf.Experiment(seen, names, BOUNCES, 0.0, 2.0)
-    height = sf.simulate(sf.Problem(system, run, {"e": 0.8} | ground), times="samples").states[:, :1]
-    values = height + 0.01 * np.random.default_rng(0).normal(size=height.shape)
-    run = replace(run, data=replace(seen, values=values), mode_sequence=("drop",), transition_times=())
-    follow = {"drop": ("first",), "first": ("second",), "second": ()}
-    return sf.Problem(system, run, {"e": 0.6} | ground), free(names, 2, first=("drop",), successions=follow)
-
-
-def test_guards_determine_times():
-    """The first bounce does not depend on what is estimated: its time is that of the guard, not that of the noise."""
-    guarded = beam(*bouncing_ball(guarded=True), penalty=3.0, width=20)[0]
-    assert guarded.sequences[0] == ("drop", "first", "second")
-    assert abs(guarded.transition_times[0][0] - FIRST_BOUNCE) < 5e-5
-    without = beam(*bouncing_ball(), penalty=3.0, width=20)[0]
-    assert without.sequences[0] == ("drop", "first", "second")
-    np.testing.assert_allclose(without.transition_times[0], BOUNCES, atol=0.01)
-    assert abs(without.transition_times[0][0] - FIRST_BOUNCE) > 2e-4
-    assert abs(guarded.transition_times[0][1] - FIRST_BOUNCE * (1 + 2 * guarded.parameters[0])) < 2e-4
-
-
 def test_a_guarded_time_depends_on_the_parameters_as_the_implicit_derivative_says():
     """dtau = -(D_x c Z + D_p c) / (D_x c f + D_t c): x = 0.3 exp(-t) + v (1 - exp(-t)) meets c = x - v / 2."""
     guards = {("rise", "fall"): lambda t, x, p: x[0] - 0.5 * p["v"]}

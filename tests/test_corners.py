@@ -66,10 +66,7 @@ MODES = {
     "maximum": (lambda x, p: jnp.maximum(x[0] * p["w"], x[1] ** 2), 1),
     "minimum": (lambda x, p: jnp.minimum(0.3, x[0] * x[1]), 1),
     "the same twice": (lambda x, p: jnp.where(x[0] < 0, x[1], 2.0) + jnp.maximum(x[0], 0.0), 1),
-    "the same the other way round": (
-        lambda x, p: jnp.where(jnp.greater(0.0, x[0]), x[1], 2.0) + jnp.minimum(0.0, x[0]),
-        1,
-    ),
+    "the same the other way round": (lambda x, p: jnp.where(x[0] > 0, x[1], 2.0) + jnp.minimum(0.0, x[0]), 1),
     "two states both ways": (lambda x, p: jnp.where(x[0] > x[1], x[0], 1.0) * jnp.where(x[1] >= x[0], 2.0, 1.0), 1),
     "nested": (lambda x, p: jnp.where(x[0] > 0, jnp.where(x[1] <= p["w"], x[1] ** 2, 2.0), 3.0), 2),
     "both of two": (lambda x, p: jnp.where((x[0] > 0) & (x[1] > 0), x[0] * x[1], 0.0), 2),

@@ -18,7 +18,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
-from models import charge, decay, first_state
+from models import charge, decay, first_state, temperature
 from typer.testing import CliRunner
 
 import switchfit as sf
@@ -276,8 +276,7 @@ START = dt.datetime(2020, 3, 20, tzinfo=BERLIN)
 def room(dated, **more):
     """A room that is heated for 9.3 days, with samples every 12 hours; over the night in which clocks are set."""
     t = np.arange(40) / 2
-    truth = np.where(t < 9.3, 1 - np.exp(-t), (1 - np.exp(-9.3)) * np.exp(-(t - 9.3)))
-    values = truth + 0.02 * np.random.default_rng(1).normal(size=40)
+    values = temperature(t, 9.3, 1.0, 1.0, start=0.0) + 0.02 * np.random.default_rng(1).normal(size=40)
     dates = pd.Timestamp(START).tz_convert("UTC") + pd.to_timedelta(t, "D")
     data = sf.Measurements(dates if dated else t, values, observe=first_state, sigma=0.02, names=("x",))
     guess = sf.Parameter("2020-03-28T00:00", lower="2020-03-22") if dated else sf.Parameter(8.0, lower=2.0)
