@@ -103,6 +103,7 @@ def test_a_run_weighs_as_often_as_it_was_drawn():
     fit = sf.estimate(problem, strategy="local")
     study = sf.bootstrap(fit, 6, resample="runs", seed=2)
     work = StudyOfRuns(problem, list(fit.evaluator.meshes), fit.theta[None], Limits(1e-7, 200), 2)
+    assert len({tuple(each) for each in work.weigh(range(6))}) > 1
     for k in range(6):
         weights = np.round(work.weigh([k])[0]).astype(int)
         assert weights.sum() == 3
