@@ -501,7 +501,7 @@ def test_a_log_hands_over_its_dates(cells, zone, first, tmp_path):
 
 
 FILE = """
-model = "{model}"
+model = "heater.py:HEATER"
 
 [parameters]
 power = 1.5
@@ -530,8 +530,7 @@ def write(tmp_path):
     (tmp_path / "stamps.csv").write_text("\n".join(["time_ms,warmth", *stamps]))
 
     def write(experiment, log="naive.csv", data=""):
-        text = FILE.format(model="heater.py:HEATER", experiment=experiment, log=log, data=data)
-        (tmp_path / "problem.toml").write_text(text)
+        (tmp_path / "problem.toml").write_text(FILE.format(experiment=experiment, log=log, data=data))
         return tmp_path / "problem.toml"
 
     return write
