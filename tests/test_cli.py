@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from models import temperature
 from typer.testing import CliRunner
 
 import switchfit as sf
@@ -57,8 +58,7 @@ def folder(tmp_path_factory):
     (folder / "problem.toml").write_text(PROBLEM)
     (folder / "room.py").write_text(ROOM)
     times = np.arange(0.25, 6.0, 0.5)
-    heated = 10 * (1 - np.exp(-0.05 * np.minimum(times, 3.2)))
-    values = heated * np.exp(-0.05 * np.maximum(times - 3.2, 0))
+    values = temperature(times, 3.2, 0.5, 0.05, start=0.0)
     rows = "".join(f"{t},{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
     (folder / "log.csv").write_text("t,T\n" + rows)
     return folder

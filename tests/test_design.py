@@ -406,14 +406,19 @@ def test_problems_that_cannot_be_designed():
     one = lag([1.0])
     cost = replace(one, experiments=replace(one.experiments[0], data=sf.RunningCost(lambda t, x, p: x[0] ** 2)))
     corner = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + p["b"] * u}, [1.0])
-    for problem, error, message in (
-        (3, TypeError, r"problem must be an sf\.Problem"),
-        (line(sigma=None), ValueError, "design needs sigma, the standard deviation of the noise, for the data of run1"),
-        (cost, ValueError, "design needs Measurements, for the data of run1"),
-        (replace(one, system=corner), ValueError, "free cannot be used where"),
+    for problem, free, error, message in (
+        (3, None, TypeError, r"problem must be an sf\.Problem"),
+        (
+            line(sigma=None),
+            None,
+            ValueError,
+            "design needs sigma, the standard deviation of the noise, for the data of r",
+        ),
+        (cost, None, ValueError, "design needs Measurements, for the data of run1"),
+        (replace(one, system=corner), {"u": (0.0, 1.0)}, ValueError, "free cannot be used where"),
     ):
         with pytest.raises(error, match=message):
-            sf.design(problem, free=None if isinstance(problem, int) or problem is cost else {"u": (0.0, 1.0)})
+            sf.design(problem, free=free)
 
 
 # --- `switchfit design`, and [design] in problem files ----------------------------------------------------------------
