@@ -25,15 +25,10 @@ LEVELS = np.array([2.0, -1.0, 4.0, 0.5, 7.0])
 CUBIC = Polynomial([1.0, -2.0, 0.7, 0.4])
 
 
-def integrated(inputs, gain=1.5):
-    run = sf.Experiment(FINAL_STATE, ("on",), (), 0.0, 2.0, inputs=inputs)
-    return sf.evaluate(sf.Problem(INTEGRATOR, run, {"gain": gain}))
-
-
-def integral_of(pieces, gain=1.5):
-    """gain (int u + 2 int int u) over [0, 2] = gain int u (1 + 2 (2 - t)); pieces: (from, to, polynomial)."""
+def integral_of(pieces):
+    """p (int u + 2 int int u) over [0, 2] = p int u (1 + 2 (2 - t)) with p = 1.5; pieces: (from, to, polynomial)."""
     weighted = [(a, b, (u * Polynomial([5.0, -2.0])).integ()) for a, b, u in pieces]
-    return gain * sum(U(b) - U(a) for a, b, U in weighted)
+    return 1.5 * sum(U(b) - U(a) for a, b, U in weighted)
 
 
 def line(a, b, at_a, at_b):
@@ -41,27 +36,24 @@ def line(a, b, at_a, at_b):
 
 
 CLIPPED = np.clip(KNOTS, 0.0, 2.0)
-PIECES = {
-    "hold": [(CLIPPED[k], CLIPPED[k + 1], Polynomial([LEVELS[k]])) for k in range(4)],
-    "linear": [(CLIPPED[k], CLIPPED[k + 1], line(KNOTS[k], KNOTS[k + 1], LEVELS[k], LEVELS[k + 1])) for k in range(4)],
-    "cubic": [(0.0, 2.0, CUBIC)],
+CELLS = [(CLIPPED[k], CLIPPED[k + 1]) for k in range(4)]
+LINES = [line(KNOTS[k], KNOTS[k + 1], LEVELS[k], LEVELS[k + 1]) for k in range(4)]
+STEP = [(0.0, 0.5, Polynomial([1.0])), (0.5, 2.0, Polynomial([3.0]))]
+INPUTS = {
+    "hold": (sf.Input(KNOTS, LEVELS), [(a, b, Polynomial([u])) for (a, b), u in zip(CELLS, LEVELS[:4], strict=True)]),
+    "linear": (sf.Input(KNOTS, LEVELS, kind="linear"), [(a, b, u) for (a, b), u in zip(CELLS, LINES, strict=True)]),
+    "cubic": (sf.Input(KNOTS, CUBIC(KNOTS), kind="cubic"), [(0.0, 2.0, CUBIC)]),
+    "its last value is kept": (sf.Input([0.0, 0.5], [1.0, 3.0]), STEP),
 }
 
 
-@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
-def test_inputs_are_integrated_exactly_since_no_step_crosses_a_knot(kind):
+@pytest.mark.parametrize(("inputs", "pieces"), INPUTS.values(), ids=INPUTS)
+def test_inputs_are_integrated_exactly_since_no_step_crosses_a_knot(inputs, pieces):
     """Any step across the jump at 0.3711 would leave an error of the step length or of its square."""
-    values = CUBIC(KNOTS) if kind == "cubic" else LEVELS
-    found = integrated(sf.Input(KNOTS, values, kind=kind))
-    expected = integral_of(PIECES[kind])
+    run = sf.Experiment(FINAL_STATE, ("on",), (), 0.0, 2.0, inputs=inputs)
+    found, expected = sf.evaluate(sf.Problem(INTEGRATOR, run, {"gain": 1.5})), integral_of(pieces)
     assert found.cost == pytest.approx(expected, rel=1e-13)
     assert found.gradient[0] == pytest.approx(expected / 1.5, rel=1e-13)
-
-
-def test_a_held_input_starts_by_t0_and_keeps_its_last_value():
-    found = integrated(sf.Input([0.0, 0.5], [1.0, 3.0]))
-    expected = integral_of([(0.0, 0.5, Polynomial([1.0])), (0.5, 2.0, Polynomial([3.0]))])
-    assert found.cost == pytest.approx(expected, rel=1e-13)
 
 
 # Reference signals
