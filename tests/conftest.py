@@ -75,18 +75,15 @@ def pytest_configure(config):
     llvm.compile_modules = program.compile_modules = compile_quickly
 
 
-TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_prediction")
+TOGETHER = ("test_adjoint", "test_native", "test_prediction")
 """Files that share the programs of `systems.case`, which are most of what they take: one process runs them all."""
 
-LONGEST = (
-    *TOGETHER,
-    *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "paper", "html")),
-    *(f"test_{name}" for name in ("zero_times_nan", "beam", "insertion", "modes", "sampling", "inputs", "stiffness")),
-    *(f"test_{name}" for name in ("first_ten_minutes", "jumps", "cli", "strategy", "files", "docstrings", "starts")),
-    *(f"test_{name}" for name in ("closed_form", "random_systems", "batch_intervals", "guards")),
-    *(f"test_{name}" for name in ("known_answers", "units", "bootstrap", "examples", "estimate", "vehicles")),
-    *(f"test_{name}" for name in ("plots", "verdict", "dates", "cli_modes")),
+BEGIN_FIRST = (
+    "batch docs real_logs protocol runs final_time paper html zero_times_nan beam insertion modes sampling inputs "
+    "stiffness first_ten_minutes jumps cli strategy files docstrings starts closed_form random_systems batch_intervals "
+    "guards known_answers units bootstrap examples estimate vehicles plots verdict dates cli_modes"
 )
+LONGEST = [*TOGETHER, *(f"test_{name}" for name in BEGIN_FIRST.split())]
 """Files that begin first, so that no process works alone for long at the end."""
 
 

@@ -34,13 +34,13 @@ OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
 
 NAMES = {
     "batch": "batch sampling batch_intervals bootstrap many_logs verdict_many starts",
-    "cli": "cli cli_modes saved_problem cli_design online_cli init interrupt many_logs",
+    "cli": "cli cli_modes saved_problem design online_cli init interrupt many_logs",
     "discretization": "mesh implicit random_systems stiffness protocol",
     "engine": "corners mesh stiffness following protocol native",
     "engine/native": "native protocol random_systems beam implicit operations",
     "estimation": "saved_problem estimate save mesh following bad_input",
     "experiment_design": "design",
-    "fit": "estimate following finiteness accuracy starts strategy guards verdict",
+    "fit": "estimate following finiteness starts strategy guards verdict",
     "io": "io saved_problem init tables_out files many_logs",
     "io/logs": "logs log_formats units real_logs gps_drive dates",
     "io/problem_file": "io files dates saved_problem bad_input cli_modes jumps",

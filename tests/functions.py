@@ -339,22 +339,11 @@ FALLS_BACK = {
 LEFT_AT_SOME_POINTS = ("decisions: large integers", "tables: too many integers")
 """Functions with integers that leave their type: JAX evaluates the points where they do."""
 
-ZERO_TIMES_INFINITY = (
-    "arithmetic: divide by itself",
-    "arithmetic: overflow",
-    "arithmetic: power of a negative",
-    "elementary: arccos",
-    "elementary: arccosh",
-    "elementary: arcsin",
-    "elementary: arctan2",
-    "elementary: arctanh",
-    "elementary: cbrt",
-    "elementary: log",
-    "elementary: log10",
-    "elementary: log2",
-    "elementary: sqrt",
-    "elementary: unguarded sqrt",
+INVERSES = "arccos arccosh arcsin arctan2 arctanh cbrt log log10 log2 sqrt"
+ZERO_TIMES_INFINITY = [
+    *(f"arithmetic: {name}" for name in ("divide by itself", "overflow", "power of a negative")),
+    *(f"elementary: {name}" for name in (*INVERSES.split(), "unguarded sqrt")),
     "matrices: solve of a singular matrix",
     "special: bessel_jn",
-)
+]
 """Functions of which JAX says NaN for an entry of a derivative that is 0: a tangent of 0 times an infinite slope."""

@@ -1,9 +1,10 @@
-"""A reference of its own for J, the constraints and all their derivatives: NumPy alone, nothing of switchfit.
+"""A reference of its own for J, the constraints and all their derivatives: NumPy and SciPy, nothing of switchfit.
 
 What is documented is written down again here in the plainest way: the run goes from event to event (nodes, samples,
-transitions), each stretch is integrated by Gragg's extrapolated midpoint rule of order 12, costs are added up from
-their formulas. Everything is analytic in theta and runs with complex numbers, so that gradients are complex steps
-without cancellation. Hessians are central differences of these gradients, extrapolated by Richardson's scheme.
+transitions), each stretch is integrated by SciPy's method of order 8, costs are added up from their formulas.
+Everything is analytic in theta and runs with complex numbers, so that gradients are complex steps without
+cancellation. All columns of theta are integrated together, by the same steps. Hessians are central differences of
+these gradients, extrapolated by Richardson's scheme.
 
 The order of the events is that at the real theta for which derivatives are wanted, and stays the same while theta is
 varied: stretches may become negative or complex. Where a transition time equals a node, `side` = +1 puts the transition
@@ -20,14 +21,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-ORDER = 12
-"""Order of the extrapolated midpoint rule; its midpoint rules take 2, 4, ..., ORDER steps."""
-
-LONGEST_STEP, SETTLED, HALVINGS = 0.1, 1e-10, 5
-"""Longest step of the integrator. It is halved until that changes J and the constraints by less than SETTLED, relative;
-of the last two the shorter one is taken, whose error is some 4000 times smaller."""
+TOLERANCE = 1e-13
+"""Of the integrator, relative and absolute."""
 
 TINY = 1e-30
 """Imaginary step: its square is nothing beside 1."""
@@ -137,23 +135,13 @@ class Reference:
     parameters: dict[str, Any]
     priors: Sequence[tuple[int, str, float, float]] = field(default=())
 
-    def longest_step(self, theta: np.ndarray, side: int) -> float:
-        """A step that is short enough at theta (d,)."""
-        step, before = LONGEST_STEP, np.array([np.inf])
-        for _ in range(HALVINGS):
-            here = np.concatenate([np.ravel(part) for part in self.outputs(theta[:, None], theta, side, step)])
-            if np.all(np.abs(here - before) <= SETTLED * np.maximum(np.abs(here), 1.0)):
-                return step
-            step, before = 0.5 * step, here
-        raise ValueError(f"steps of {step} are too long for this system.")
-
-    def outputs(self, theta: np.ndarray, base: np.ndarray, side: int, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    def outputs(self, theta: np.ndarray, base: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
         """J (B,) and the constraints (m, B) at the columns of theta (d, B), events in their order at `base` (d,)."""
         named, at_base = self._named(theta), self._named(base[:, None])
         total, constraints = np.zeros(theta.shape[1], dtype=theta.dtype), []
         for run in self.runs:
             own, own_base = ({name: values[where] for name, where in run.names.items()} for values in (named, at_base))
-            cost, held = _Walk(run, theta, base, own, own_base, side, longest).outputs()
+            cost, held = _Walk(run, theta, base, own, own_base, side).outputs()
             total = total + cost
             constraints += held
         for place, kind, center, spread in self.priors:
@@ -184,7 +172,7 @@ class Reference:
         points = theta[:, None] + np.array(shifts).T
         columns = np.repeat(points, d, axis=1).astype(complex)
         columns += 1j * TINY * np.tile(np.eye(d), points.shape[1])
-        cost, held = self.outputs(columns, theta, side, self.longest_step(theta, side))
+        cost, held = self.outputs(columns, theta, side)
         both = np.concatenate([cost[None], held]).reshape(1 + len(held), points.shape[1], d)
         first = both.imag / TINY
         around = first[:, 1:].reshape(len(first), len(DIFFERENCES), d, 2, d)
@@ -215,10 +203,8 @@ class Derivatives:
 class _Walk:
     """One run from event to event, for all columns of theta at once."""
 
-    def __init__(
-        self, run: Run, theta: np.ndarray, base: np.ndarray, p: Any, p_base: Any, side: int, longest: float
-    ) -> None:
-        self.run, self.p, self.longest = run, p, longest
+    def __init__(self, run: Run, theta: np.ndarray, base: np.ndarray, p: Any, p_base: Any, side: int) -> None:
+        self.run, self.p = run, p
         zero = np.zeros(theta.shape[1], dtype=theta.dtype)
         self.tau = [theta[at] if isinstance(at, int) else at + zero for at in run.times]
         tau_base = [base[at] if isinstance(at, int) else at for at in run.times]
@@ -306,16 +292,19 @@ class _Walk:
 
     def _go(self, to: np.ndarray) -> None:
         """Integrate from the present time to `to`, both (B,), in the present mode and cell."""
-        steps = max(int(np.ceil(np.max(np.abs(to - self.t)) / self.longest)), 1)
-        h = (to - self.t) / steps
-        if np.any(h):
+        start, span = self.t, to - self.t
+        if np.any(span):
             y = np.concatenate([self.x, self.cost[None]])
-            for k in range(steps):
-                y = _extrapolated_midpoint(self._slope, self.t + k * h, y, h)
-            self.x, self.cost = y[:-1], y[-1]
+
+            def slope(s: float, flat: np.ndarray) -> np.ndarray:
+                return (span * self._slope(start + s * span, flat.reshape(y.shape))).ravel()
+
+            found = solve_ivp(slope, (0.0, 1.0), y.ravel(), "DOP853", rtol=TOLERANCE, atol=TOLERANCE).y[:, -1]
+            self.x, self.cost = found.reshape(y.shape)[:-1], found.reshape(y.shape)[-1]
         self.t = to
 
     def _slope(self, t: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Of the states and of the cost, at times (B,) and y (n + 1, B)."""
         run, p, x = self.run, self.p, y[:-1]
         middle = 0.5 * (self.cell[0] + self.cell[1])
         given = (t, x, p) if run.input is None else (t, x, p, run.input.at(t, middle))
@@ -327,27 +316,6 @@ class _Walk:
             r = np.stack([entry + self.zero for entry in item.observe(t, x, p)]) - item.signal.at(t, middle)
             density = density + 0.5 * np.einsum("ib,ij,jb->b", r, item.weights, r)
         return np.stack([*rates, density])
-
-
-def _extrapolated_midpoint(f: Callable[..., Any], t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """One step of the Gragg-Bulirsch-Stoer method with all its columns (Hairer, Norsett and Wanner I, section II.9).
-
-    The rule's error is a series in the square of its step; the step counts are even, as Gragg's theorem wants them.
-    """
-    counts = np.arange(2, ORDER + 1, 2)
-    slope = f(t, y)
-    table: list[np.ndarray] = []
-    for j, count in enumerate(counts):
-        small = h / count
-        before, here = y, y + small * slope
-        for k in range(1, count):
-            before, here = here, before + 2 * small * f(t + k * small, here)
-        row = [here]
-        for m in range(1, j + 1):
-            ratio = (count / counts[j - m]) ** 2
-            row.append(row[-1] + (row[-1] - table[m - 1]) / (ratio - 1))
-        table = row
-    return table[-1]
 
 
 def _robust(loss: str, C: float, u: np.ndarray) -> np.ndarray:

@@ -7,9 +7,9 @@ program serves all of these variations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -147,18 +147,12 @@ def weighted(structure: Structure, arguments: Arguments, kind: str, equal: float
         )
 
 
-@dataclass(frozen=True)
-class Derivatives:
+class Derivatives(NamedTuple):
     """Cost, gradient (D,) and Hessian (D, D)."""
 
     cost: float
     gradient: np.ndarray
     hessian: np.ndarray
-
-    @classmethod
-    def of(cls, values: Any) -> Derivatives:
-        cost, *rest = values
-        return cls(float(cost), *(np.asarray(value) for value in rest))
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -167,13 +161,17 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def call(arguments: Arguments, tau: Any, p: Any, side: int = 1) -> Any:
         with use_float64(), use_compilation_cache():
-            return jax.block_until_ready(program(arguments, jnp.asarray(tau), jnp.asarray(p), jnp.asarray(side)))
+            return jax.tree.map(np.asarray, program(arguments, *map(jnp.asarray, (tau, p, side))))
 
     return call
 
 
 class Case:
-    """A problem, and all ways to differentiate its cost, each compiled once."""
+    """A problem, and all ways to evaluate and differentiate its cost, each compiled once.
+
+    `cost` is the simulated cost. The others return `Derivatives`: `paper` by the paper's adjoint equations; `discrete`
+    and `forward` of the discretised cost, with a gradient backward and a Hessian forward over it, or both forward.
+    """
 
     def __init__(self, problem: Problem, implicit: tuple[bool, ...] | None = None) -> None:
         self.problem = problem
@@ -181,10 +179,9 @@ class Case:
         self.structure = structure if implicit is None else replace(structure, implicit=implicit)
         self.tau = problem.experiments[0].initial_times
         self.N = len(self.tau)
-        self._paper = compiled(lambda given, *at: compute_paper_derivatives(Model(self.structure, given), *at))
-        self._discrete = compiled(self._differentiate("discrete-adjoint"))
-        self._forward = compiled(self._differentiate("forward"))
-        self._cost = compiled(self._simulate)
+        self.cost = compiled(self._simulate)
+        self.paper = compiled(lambda given, *at: Derivatives(*compute_paper_derivatives(self._model(given), *at)))
+        self.discrete, self.forward = map(self._differentiate, ("discrete-adjoint", "forward"))
 
     def arguments(self, kind: str = "all", *, halvings: int = 0, equal: float = 0.0) -> Arguments:
         """Arguments of one of `SYSTEMS`, on the mesh of `NODES` with each cell halved some times."""
@@ -193,28 +190,15 @@ class Case:
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
         return weighted(self.structure, build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
 
+    def _model(self, arguments: Arguments) -> Model:
+        return Model(self.structure, arguments)
+
     def _differentiate(self, method: Any) -> Callable[..., Any]:
-        return lambda *at: derivatives(*at, structure=self.structure, method=method)
+        return compiled(lambda *at: Derivatives(*derivatives(*at, structure=self.structure, method=method)))
 
     def _simulate(self, arguments: Arguments, tau: Any, p: Any, side: int) -> Any:
-        model = Model(self.structure, arguments)
+        model = self._model(arguments)
         return compute_path_cost(model, propagate(model, tau, p, side), p)
-
-    def cost(self, *given: Any) -> float:
-        """The simulated cost."""
-        return float(self._cost(*given))
-
-    def paper(self, *given: Any) -> Derivatives:
-        """By the paper's adjoint equations."""
-        return Derivatives.of(self._paper(*given))
-
-    def discrete(self, *given: Any) -> Derivatives:
-        """Of the discretised cost, gradient backward and Hessian forward over it."""
-        return Derivatives.of(self._discrete(*given))
-
-    def forward(self, *given: Any) -> Derivatives:
-        """Of the discretised cost, forward over forward."""
-        return Derivatives.of(self._forward(*given))
 
 
 @cache
@@ -226,27 +210,13 @@ def case(name: str) -> Case:
 # A system whose cost has a closed form
 
 
-def constant_velocity(t, x, p):
-    return p["q"] * jnp.ones(1)
-
-
-def decay(t, x, p):
-    return -x
-
-
-def quadratic_reset(t, x, p):
-    return p["q"] * x**2 + t
-
-
-def half_square(t, x, p):
-    return 0.5 * x[0] ** 2
-
-
 def closed_form_case(*, transitions: int, q: Parameter) -> Case:
     """x' = q from 0; then, at tau, x becomes ``q x^2 + tau`` and x' = -x, to T = 2; ell = x^2 / 2."""
-    system = HybridSystem({"A": constant_velocity, "B": decay}, [0.0], {("A", "B"): quadratic_reset})
+    modes = {"A": lambda t, x, p: p["q"] * jnp.ones(1), "B": lambda t, x, p: -x}
+    system = HybridSystem(modes, [0.0], {("A", "B"): lambda t, x, p: p["q"] * x**2 + t})
     sequence, tau = (("A", "B"), [0.9]) if transitions else (("A",), [])
-    return Case(Problem(system, Experiment(RunningCost(half_square), sequence, tau, 0.0, 2.0), {"q": q}))
+    cost = RunningCost(lambda t, x, p: 0.5 * x[0] ** 2)
+    return Case(Problem(system, Experiment(cost, sequence, tau, 0.0, 2.0), {"q": q}))
 
 
 def closed_form(tau, q):

@@ -1,4 +1,4 @@
-"""The paper's adjoint equations against the derivatives of the discretised cost, block by block.
+"""The paper's adjoint equations against the derivatives of the discretised cost, block by block, and these themselves.
 
 Both converge to the derivatives of the cost, so the gap between them closes at the order of the integrator (5).
 On the diagonal of the tau block it is one less: the local error of the row that ends at tau_i goes with the sixth power
@@ -9,41 +9,46 @@ from __future__ import annotations
 
 from functools import cache
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from systems import KINDS, KNOTS, NODES, P0, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
+from systems import (
+    KINDS,
+    NODES,
+    P0,
+    Derivatives,
+    Parameter,
+    case,
+    closed_form,
+    closed_form_case,
+    padded_mesh,
+)
 
 from switchfit.discretization.mesh import build_arguments
-from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import propagate
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
-VARIATIONS = [("plain", kind) for kind in reversed(KINDS)]
-VARIATIONS += [("resets", kind) for kind in reversed(KINDS)]
+VARIATIONS = [(name, kind) for name in ("plain", "resets") for kind in reversed(KINDS)]
 VARIATIONS += [(name, kind) for name in ("stiff", "mixed") for kind in SMOOTH_KINDS]
+
+INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
+INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
+"""Transition times that are not nodes."""
+
+
+BLOCKS = ("D_tau J", "D_p J", "tau-tau, i = j", "tau-tau, i > j", "tau-p", "p-p")
 
 
 def blocks(N: int, gradient: np.ndarray, hessian: np.ndarray) -> dict[str, float]:
     """Largest entry of each block of a gradient and a Hessian."""
-    parts = {
-        "D_tau J": gradient[:N],
-        "D_p J": gradient[N:],
-        "tau-tau, i = j": np.diag(hessian)[:N],
-        "tau-tau, i > j": hessian[:N, :N][np.tril_indices(N, -1)],
-        "tau-p": hessian[:N, N:],
-        "p-p": hessian[N:, N:],
-    }
-    return {name: float(np.abs(part).max()) for name, part in parts.items()}
+    of_tau = np.diag(hessian)[:N], hessian[:N, :N][np.tril_indices(N, -1)]
+    parts = gradient[:N], gradient[N:], *of_tau, hessian[:N, N:], hessian[N:, N:]
+    return {name: float(np.abs(part).max()) for name, part in zip(BLOCKS, parts, strict=True)}
 
 
 ORDER = {"tau-tau, i = j": 4.0}
 ROUNDING = {"stiff": 1e-10, "mixed": 1e-10}
 """Relative gaps that need not close any further; the Jacobian of the stiff mode amplifies rounding."""
-BLOCKS = ("D_tau J", "D_p J", "tau-tau, i = j", "tau-tau, i > j", "tau-p", "p-p")
 
 
 @cache
@@ -87,35 +92,19 @@ def test_p_block_is_symmetric_without_symmetrising(name: str, kind: str) -> None
     assert asymmetry[1] < asymmetry[0] / 2**8
 
 
-@pytest.mark.slow  # of the discretised cost: in test_discrete.py
-def test_equal_neighbouring_modes_give_zero_rows() -> None:
+@pytest.mark.parametrize(
+    ("method", "tau", "atol"),
+    [
+        pytest.param("paper", NODES[[6, 13]], (1e-13, 1e-12), marks=pytest.mark.slow),
+        ("discrete", INSIDE["plain"], (1e-7, 1e-4)),  # where tau_1 stands moves a step of the integrator
+    ],
+)
+def test_equal_neighbouring_modes_give_zero_rows(method: str, tau: list[float], atol: tuple[float, float]) -> None:
     this = case("plain")
-    found = this.paper(this.arguments(equal=1.0), this.tau, P0)
+    found = getattr(this, method)(this.arguments(equal=1.0, halvings=3), tau, P0)
     assert np.abs(found.hessian[1:, 1:]).max() > 1.0
-    np.testing.assert_allclose(found.gradient[0], 0.0, atol=1e-13)
-    np.testing.assert_allclose(found.hessian[0], 0.0, atol=1e-12)
-    np.testing.assert_allclose(found.hessian[:, 0], 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("method", ["paper", pytest.param("discrete", marks=pytest.mark.slow)])
-def test_one_sided_derivatives_at_a_sample_differ_by_dell_x(method: str) -> None:
-    this = case("resets")
-    tau = NODES[[4, 14, 16]]  # the second one, which has no reset map, at the sixth sample
-    arguments = this.arguments("samples", halvings=2)
-    left, right = (getattr(this, method)(arguments, tau, P0, side).gradient for side in (-1, 1))
-
-    def Dell_X(arguments, tau, p, side):
-        model = Model(this.structure, arguments)
-        x = propagate(model, tau, p, side).at_transition(1)[1]
-        sample = jax.tree.map(lambda a: a[5], arguments.samples[0])
-        Dell = jax.grad(lambda x: model.sample_cost(0, sample, x, p))(x)
-        u = jnp.interp(tau[1], KNOTS, jnp.cos(KNOTS))
-        before, behind = (model.structure.modes[i](tau[1], x, model.parameters(p), u) for i in (1, 0))
-        return Dell @ (before - behind)
-
-    expected = float(compiled(Dell_X)(arguments, tau, P0))
-    assert abs(expected) > 0.1
-    np.testing.assert_allclose((left - right)[1], expected, rtol=1e-6)
+    np.testing.assert_allclose(found.gradient[0], 0.0, atol=atol[0])
+    np.testing.assert_allclose([found.hessian[0], found.hessian[:, 0]], 0.0, atol=atol[1])
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -135,14 +124,65 @@ CLOSED = {
 }
 
 
-@pytest.mark.parametrize("name", CLOSED)
-def test_closed_forms(name: str) -> None:
+@pytest.mark.parametrize(("name", "method"), [*((name, "paper") for name in CLOSED), ("with a reset map", "discrete")])
+def test_closed_forms(name: str, method: str) -> None:
     transitions, fixed, cost, theta, (first, second) = CLOSED[name]
     tau, p = np.split(np.array(theta), [transitions])
     this = closed_form_case(transitions=transitions, q=Parameter(0.7, fixed=fixed))
     mesh = padded_mesh(np.linspace(0.0, 2.0, 41), 40)
-    found = this.paper(build_arguments(this.problem, 0, mesh), tau, p)
+    found = getattr(this, method)(build_arguments(this.problem, 0, mesh), tau, p)
     J, gradient, hessian = differentiate(cost, theta)
     assert found.cost == pytest.approx(J, rel=1e-8)
     np.testing.assert_allclose(found.gradient, gradient, rtol=first)
     np.testing.assert_allclose(found.hessian, hessian, rtol=second)
+
+
+# Derivatives of the discretised cost
+
+
+@pytest.mark.slow  # in the fast suite, `test_protocol.py` compares them
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["resets", "stiff", "mixed"])
+def test_adjoint_and_forward_agree_to_rounding(name: str, kind: str) -> None:
+    this = case(name)
+    at = this.arguments(kind), INSIDE[name], P0
+    expected, found = this.forward(*at), this.discrete(*at)
+    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
+    relative = 1e-9 if any(this.structure.implicit) else 2e-12
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_side_is_the_limit_from_that_side(side: int) -> None:
+    this = case("resets")
+    tau = NODES[[5, 9, 14]]
+
+    def at(tau: np.ndarray, side: int) -> Derivatives:
+        return this.discrete(this.arguments(halvings=2), tau, P0, side)
+
+    on, beside = at(tau, side), at(tau + side * 1e-9, side)
+    np.testing.assert_allclose(on.gradient, beside.gradient, atol=1e-6)
+    np.testing.assert_allclose(on.hessian, beside.hessian, atol=1e-4)
+    assert np.abs(on.gradient - at(tau, -side).gradient).max() > 0.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "name", [*("resets", "mixed"), *(pytest.param(v, marks=pytest.mark.slow) for v in ("plain", "stiff"))]
+)
+def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
+    this = case(name)
+    arguments = this.arguments(kind)
+    tau = np.array(INSIDE[name])
+    direction = np.array([*[1.0, -0.7, 0.8][: this.N], 0.9, -1.1])
+    direction *= (0.0002 if any(this.structure.implicit) else 0.01) / np.abs(direction).max()
+    at = this.discrete(arguments, tau, P0)
+
+    def remainders(step: float) -> list[float]:
+        d = step * direction
+        change = this.cost(arguments, tau + d[: this.N], P0 + d[this.N :]) - at.cost
+        return [change, change - at.gradient @ d, change - at.gradient @ d - 0.5 * d @ at.hessian @ d]
+
+    coarse, fine = np.abs(remainders(0.5)), np.abs(remainders(0.25))
+    np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)

@@ -13,8 +13,6 @@ PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7
 LAYOUT = ArrowLayout.of(11, PLACES)
 """Four runs with 3, 2, 3 and 1 unknowns of their own; two are shared."""
 
-SHARED = [9, 10]
-
 
 def arrow_of(full):
     """The arrow that holds a full matrix of its shape."""
@@ -34,29 +32,6 @@ def random_matrix(rng, lowest=None):
         run[own[own < 11]] = e
     full[(run[:, None] != run) & (run[:, None] >= 0) & (run >= 0)] = 0.0
     return full if lowest is None else full + (lowest - np.linalg.eigvalsh(full)[0]) * np.eye(11)
-
-
-def test_own_and_shared_unknowns():
-    np.testing.assert_array_equal(LAYOUT.own, [[0, 1, 2], [3, 4, 11], [5, 6, 7], [8, 11, 11]])
-    np.testing.assert_array_equal(LAYOUT.shared, SHARED)
-    np.testing.assert_array_equal(LAYOUT.slots(2, PLACES[2]), [0, 1, 2, 4, 3])
-    # What no run depends on is with the shared ones.
-    np.testing.assert_array_equal(ArrowLayout.of(3, [np.array([0, -1]), np.array([1])]).shared, [2])
-
-
-def test_parts_of_runs_add_up():
-    """Each run's own matrix at its slots, as the sum over runs in full."""
-    rng = np.random.default_rng(0)
-    full, parts = np.zeros((11, 11)), []
-    for e, places in enumerate(PLACES):
-        own = rng.normal(size=(len(places), len(places)))
-        own = own + own.T
-        full[np.ix_(places, places)] += own
-        slots = LAYOUT.slots(e, places)
-        part = np.zeros((5, 5))
-        part[np.ix_(slots, slots)] = own
-        parts.append(part)
-    np.testing.assert_allclose(Arrow.of_runs(LAYOUT, parts).dense(), full, atol=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -110,18 +85,6 @@ def test_quadratic_programmes(seed):
 
 
 NONE, NO_FLOOR = np.zeros((0, 11)), np.zeros(11)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_what_is_made_positive_definite(seed):
-    rng = np.random.default_rng(seed)
-    kept = arrow_of(random_matrix(rng, lowest=0.1))
-    assert kept.convexify(NONE, NO_FLOOR)[0] is kept
-    full = random_matrix(rng, lowest=-(10.0 ** rng.uniform(-2, 2)))
-    convex = arrow_of(full).convexify(NONE, NO_FLOOR)[0].dense()
-    assert np.linalg.eigvalsh(convex)[0] > 0.0
-    scale = diagonal_scaling(Dense(full))
-    assert np.linalg.cond(convex / np.outer(scale, scale)) < 1e7
 
 
 def test_an_indefinite_block_leaves_the_shared_unknowns_their_curvature():
@@ -227,14 +190,3 @@ def test_coordinates_are_released_from_kinks(seed):
     assert arrow.iterations == full.iterations
     assert arrow.evaluations == full.evaluations
     np.testing.assert_allclose(arrow.theta, full.theta, rtol=1e-7, atol=1e-8)
-
-
-def test_saddle_points_are_left():
-    def saddle(theta, side):
-        H = np.diag(np.r_[12 * theta[0] ** 2 - 2.0, np.full(10, 2.0)])
-        g = np.r_[-2 * theta[0] + 4 * theta[0] ** 3, 2 * theta[1:]]
-        return theta[0] ** 4 - theta[0] ** 2 + theta[1:] @ theta[1:], g, H
-
-    for found in minimize_both(saddle, np.zeros(11)):
-        assert found.status.is_strict_minimum
-        assert abs(found.theta[0]) == pytest.approx(np.sqrt(0.5), rel=1e-6)

@@ -1,6 +1,7 @@
 """Every `raise` that a user can reach: the message names the thing, says what was given and what to do."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -57,9 +58,8 @@ def with_data(*data, **changes):
 
 
 def noisy(sigma, more=None, **settings):
-    return with_data(
-        seen(times=TIMES, values=np.ones(5), sigma=sigma, **settings), parameters={"k": 1.0} | (more or {})
-    )
+    data = seen(times=TIMES, values=np.ones(5), sigma=sigma, **settings)
+    return with_data(data, parameters={"k": 1.0} | (more or {}))
 
 
 def starting_at(initial_state):
@@ -80,10 +80,6 @@ def on_a_long_horizon(mode):
 
 def two(t, x, p):
     return jnp.zeros(2)
-
-
-def broken(t, x, p):
-    return x * jnp.sqrt(0.3 - t)
 
 
 def loud(t, x, p):
@@ -117,7 +113,6 @@ def refused(build, error, *said):
     [
         (lambda: system(modes={1: grow}), ["mode names must be strings; got 1"]),
         (lambda: system(modes={"grow": 3}), ["mode 'grow' must be a function f(t, x, p); got 3"]),
-        (lambda: system(reset_maps=[grow]), ["reset_maps must be a dict of (mode before, mode after) -> function"]),
         (lambda: system(reset_maps={"grow": grow}), ["reset_maps must be a dict of (mode before, mode after)", "grow"]),
         (lambda: system(reset_maps={("grow", "shrink"): 1}), ["reset map ('grow', 'shrink') must be a function"]),
         (lambda: system(state_names="x"), ["state_names must be a sequence of strings", "got 'x': give a list or a t"]),
@@ -125,7 +120,7 @@ def refused(build, error, *said):
         (lambda: samples(sigma={"x": 1}), ["sigma must be a number or an array of numbers; got {'x': 1}"]),
         (
             lambda: samples(values=[[1.0, 2.0]], sigma=["s", None]),
-            ["sigma (a number, or the name of a parameter) must be a number", "None"],
+            ["sigma (a number, or the name of", "number", "None"],
         ),
         (lambda: sf.RunningCost(3), ["RunningCost must be a function ell(t, x, p); got 3"]),
         (lambda: sf.TerminalCost(3), ["TerminalCost must be a function phi(x, p); got 3"]),
@@ -190,14 +185,10 @@ def test_wrong_types(build, said):
         (lambda: reference(weights=[-1.0]), ["positive semi-definite; got [[-1.0]]"]),
         # Parameters
         (lambda: sf.Parameter("a"), ["Parameter value must be a number or a date; got 'a'"]),
-        (
-            lambda: sf.Parameter([1.0, 2.0], lower=[1, 2, 3]),
-            ["Parameter lower must fit the value, of shape (2,)", "[1.0, 2.0, 3.0]"],
-        ),
+        (lambda: sf.Parameter([1.0, 2.0], lower=[1, 2, 3]), ["lower must fit the value, of shape (2,)", "1.0, 2.0, 3"]),
         (lambda: sf.Parameter([]), ["Parameter value must have one entry or more"]),
         (lambda: sf.Parameter(math.nan), ["Parameter value must be finite; got nan"]),
         (lambda: sf.Parameter(1.5, lower=2.0, upper=1.0), ["value 1.5 lies outside its bounds [2.0, 1.0]"]),
-        (lambda: sf.Parameter(3.0, lower=1.0, upper=2.0), ["value 3.0 lies outside its bounds [1.0, 2.0]"]),
         (lambda: sf.Parameter(1.0, scale="ln"), ["Parameter scale must be 'linear' or 'log'; got 'ln'"]),
         (lambda: sf.Parameter(0.0, scale="log"), ["with scale='log' must be positive; got 0.0"]),
         (lambda: sf.Parameter(1.0, -1.0, scale="log"), ["with scale='log' must be positive", "lower bound -1.0"]),
@@ -213,11 +204,6 @@ def test_wrong_types(build, said):
         (lambda: experiment(transition_times=()), ["one fewer than the 2 modes", "got 0"]),
         (lambda: experiment(transition_times=(1.5,)), ["increase strictly inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
         (lambda: experiment(transition_times=(math.nan,)), ["a transition time must be a number", "must be finite; g"]),
-        (
-            lambda: experiment(transition_times=([0.1, 0.2],)),
-            ["transition time 1 must be a single number", "the shape (2,)"],
-        ),
-        (lambda: three_modes((0.5, 0.2)), ["transition_times must increase strictly", "got [0.5, 0.2]"]),
         (lambda: three_modes((0.5, 0.5)), ["transition_times must increase strictly", "got [0.5, 0.5]"]),
         (lambda: three_modes([[0.5, 0.6], 0.7]), ["transition time 1 must be a single number", "(2,)"]),
         (lambda: experiment(inputs=UP_TO_HALF), ["known over (t0, tf) = (0.0, 1.0); its samples reach from 0.0 to 0."]),
@@ -261,7 +247,6 @@ def test_wrong_types(build, said):
         (lambda: problem(experiment(inputs=sf.Input([0.0], [1.0]))), ["is called as f(t, x, p, u), but takes the arg"]),
         (lambda: with_modes(lambda t, x, p: x[0], initial_state=[1.0, 2.0]), ["mode 'grow'", "shape (2,); got shape"]),
         (lambda: resetting(two), ["reset map ('grow', 'shrink')", "R(t, x, p) must return an array of shape (1,); go"]),
-        (lambda: starting_at(lambda p: jnp.zeros((2, 2))), ["must return an array of shape (n,); got shape (2, 2)"]),
         (lambda: starting_at(lambda p: p["k"]), ["initial_state(p) must return an array of shape (n,); got shape ()"]),
         (lambda: starting_at(lambda p: [p["k"] if p["k"] > 0 else 1.0]), ["initial_state branches on the value of t"]),
         (lambda: starting_at(lambda: [1.0]), ["is called as initial_state(p), but takes the arguments ()"]),
@@ -270,7 +255,10 @@ def test_wrong_types(build, said):
         (lambda: with_data(sf.RunningCost(two)), ["RunningCost: ell(t, x, p)", "shape (); got shape (2,)"]),
         (lambda: with_data(sf.TerminalCost(grow)), ["TerminalCost is called as phi(x, p), but takes the arguments (t"]),
         # Where the guess cannot be integrated
-        (lambda: sf.evaluate(with_modes(broken)), ["mode 'grow' returned [nan] at t = 0.3", "x = [1.", "guess"]),
+        (
+            lambda: sf.evaluate(with_modes(lambda t, x, p: x * jnp.sqrt(0.3 - t))),
+            ["mode 'grow' returned [nan] at t = 0.3", "x = [1.", "guess"],
+        ),
         (lambda: sf.evaluate(on_a_long_horizon(lambda t, x, p: 1000.0 * x)), ["at t = 0.7", "grows without bound"]),
         (lambda: sf.evaluate(with_data(BROKEN)), ["a running cost in mode 'grow' returned nan at t = 0.3", "x = ["]),
         (lambda: sf.evaluate(starting_at(lambda p: [jnp.sqrt(-p["k"])])), ["at p = {'k': 1.0} returned [nan]"]),
@@ -320,11 +308,7 @@ def test_integers_and_booleans_are_taken_for_numbers():
             np.testing.assert_array_equal(array, [1.0])
 
 
-def fit_once(problem):
-    return sf.estimate(problem, strategy="local")
-
-
-@pytest.mark.parametrize("call", [sf.simulate, fit_once, sf.evaluate])
+@pytest.mark.parametrize("call", [sf.simulate, partial(sf.estimate, strategy="local"), sf.evaluate])
 def test_a_state_that_blows_up(call):
     """x' = x**2 from 1 is infinite at t = 1."""
     blowing_up = on_a_long_horizon(lambda t, x, p: x**2)
@@ -358,31 +342,24 @@ def test_results():
 # --- indices ----------------------------------------------------------------------------------------------------------
 
 
-GAINS = sf.Parameter(np.ones((2, 3)), fixed=True)
-
-
 def problem_of_two_states(mode):
     run = sf.Experiment(sf.Measurements(TIMES, np.zeros((5, 2)), sigma=0.1), ["m"], [])
-    return sf.Problem(sf.HybridSystem({"m": mode}, [1.0, 2.0]), run, {"gains": GAINS, "a": 1.0})
+    gains = sf.Parameter(np.ones((2, 3)), fixed=True)
+    return sf.Problem(sf.HybridSystem({"m": mode}, [1.0, 2.0]), run, {"gains": gains, "a": 1.0})
 
 
 @pytest.mark.parametrize(
     ("mode", "message"),
     [
         (lambda t, x, p: x * x[2], "reads index 2 of an array of size 2"),
-        (lambda t, x, p: x[jnp.array([1, 2])], "reads index 2 of an array of size 2"),
         (lambda t, x, p: x * p["gains"][0, 3], r"reads index 3 of axis 1 of an array of shape \(2, 3\)"),
         (lambda t, x, p: x * jax.jit(lambda x: x[5])(x), "reads index 5 of an array of size 2"),
         (lambda t, x, p: jnp.where(t > 1.0, x[4], 0.0) * x, "reads index 4 of an array of size 2"),
         (lambda t, x, p: x.at[5].set(p["a"]), "writes to index 5 of an array of size 2"),
         (lambda t, x, p: x.at[-3].add(p["a"]), "writes to index -3 of an array of size 2"),
-        (lambda t, x, p: x.at[jnp.array([1, 2])].multiply(p["a"]), "writes to index 2 of an array of size 2"),
         (lambda t, x, p: x.at[2].apply(jnp.sin), "writes to index 2 of an array of size 2"),
         (lambda t, x, p: jax.jvp(lambda x: x.at[4].set(0.0), (x,), (x,))[1], "writes to index 4 of an array of size 2"),
-        (
-            lambda t, x, p: p["gains"].at[:, 3].set(0.0)[0, :2],
-            r"writes to index 3 of axis 1 of an array of shape \(2, 3\)",
-        ),
+        (lambda t, x, p: p["gains"].at[:, 3].set(0.0)[0, :2], r"writes to index 3 of axis 1 .*of shape \(2, 3\)"),
         (lambda t, x, p: jax.lax.dynamic_update_slice(x, jnp.ones(2), (1,)), "writes to index 1 of an array of size 2"),
     ],
 )
@@ -391,15 +368,16 @@ def test_an_index_that_is_out_of_range_is_an_error(mode, message):
     with pytest.raises(ValueError, match=rf"mode 'm' {message} \(test_bad_input\.py:\d+\): its indices are 0 to \d"):
         problem_of_two_states(mode)
 
+    with pytest.raises(ValueError, match=r"observe reads index 1 of an array of size 1 .*: its indices are 0 to 0"):
+        with_data(samples(observe=lambda t, x, p: x[1]))
+
 
 @pytest.mark.parametrize(
     "mode",
     [
         lambda t, x, p: x.at[5].add(p["a"], mode="clip"),
         lambda t, x, p: x.at[1:5].set(p["a"]),
-        lambda t, x, p: x.at[2:].set(p["a"]),
         lambda t, x, p: x.at[-2].set(p["a"]),
-        lambda t, x, p: p["gains"].at[:, 2].set(p["a"])[1, :2],
         lambda t, x, p: p["gains"].at[1, 1:].set(p["a"])[1, :2],
         lambda t, x, p: jax.grad(lambda x: x.at[9].get(mode="fill", fill_value=0.0) ** 2 + p["a"] * x[0])(x),
         lambda t, x, p: jax.ops.segment_sum(x, np.array([0, 7]), num_segments=2) * p["a"],
@@ -410,8 +388,3 @@ def test_an_index_that_is_out_of_range_is_an_error(mode, message):
 )
 def test_an_update_that_says_what_an_index_out_of_range_means_is_accepted(mode):
     assert np.isfinite(sf.evaluate(problem_of_two_states(mode)).cost)
-
-
-def test_an_output_with_an_index_that_is_out_of_range_is_an_error():
-    with pytest.raises(ValueError, match=r"observe reads index 1 of an array of size 1 .*: its indices are 0 to 0"):
-        with_data(samples(observe=lambda t, x, p: x[1]))

@@ -18,7 +18,7 @@ from benchmarks.online import drives
 from benchmarks.peers import casadi_collocation, casadi_horizon, casadi_shooting, scipy_differences
 from benchmarks.sharp import problems as sharp_problems
 from benchmarks.sharp.case import is_right
-from benchmarks.sharp.corners import find_sides, integrate
+from benchmarks.sharp.corners import find_sides
 from switchfit.problem.functions import use_float64
 
 ROWS = 22
@@ -100,16 +100,6 @@ def test_twins_of_sharp_problems_are_the_models_that_switchfit_gets(name):
                 np.testing.assert_allclose(field(0.3, np.asarray(x), p), theirs, rtol=1e-12, atol=1e-12)
     assert 0.7 < 2 * case.judge(case.truth) / case.values.size < 1.3
     assert not is_right(case.judge(case.draw_starts(1)[0]), case.judge(case.truth))
-
-
-def test_a_state_slides_along_a_corner_and_leaves_it():
-    """Friction at rest: the force t is less than the friction 1 until t = 1; then x(2) = 1/6."""
-    times = np.array([0.5, 1.0, 2.0])
-    found, end = integrate(
-        lambda t, x, s: [x[1], t - s[0]], lambda x: [x[1]], [0.0, 0.0], 0.0, 2.0, times, rtol=1e-10, atol=1e-12
-    )
-    np.testing.assert_allclose(found, [[0, 0], [0, 0], [1 / 6, 1 / 2]], atol=1e-8)
-    np.testing.assert_allclose(found[-1], end, rtol=1e-12)
 
 
 def test_a_step_of_the_peers_is_that_of_switchfit():

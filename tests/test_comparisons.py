@@ -11,11 +11,11 @@ import switchfit as sf
 from switchfit.problem.inspection import find_comparisons
 
 
-def make_problem(mode, **given):
+def make_problem(mode, observe=None, parameter_map=None, **others):
     times = np.linspace(0.1, 1.0, 5)
-    log = sf.Measurements(times, times, sigma=1.0, observe=given.pop("observe", None))
-    run = sf.Experiment(log, ("m",), (), 0.0, 1.0, parameter_map=given.pop("parameter_map", None))
-    return sf.Problem(sf.HybridSystem({"m": mode}, [0.3]), run, {"a": 1.0, "b": 2.0} | given)
+    log = sf.Measurements(times, times, sigma=1.0, observe=observe)
+    run = sf.Experiment(log, ("m",), (), 0.0, 1.0, parameter_map=parameter_map)
+    return sf.Problem(sf.HybridSystem({"m": mode, **others}, [0.3]), run, {"a": 1.0, "b": 2.0}, max_transitions=1)
 
 
 FOUND = {
@@ -28,33 +28,26 @@ FOUND = {
     "loop": lambda t, x, p: p["b"] * jax.lax.while_loop(lambda y: y < p["a"], lambda y: y + 1.0, t) * x,
     "jitted": lambda t, x, p: jax.jit(lambda a: jnp.where(t < a, x, -x))(p["a"]) * p["b"],
     "heaviside": lambda t, x, p: jnp.heaviside(t - p["a"], 0.5) * p["b"] * x,
+    "floor": lambda t, x, p: jnp.floor(p["a"] * t) * x * p["b"],
+    "round": lambda t, x, p: jnp.round(p["a"] * t) * x * p["b"],
+    "integers": lambda t, x, p: (p["a"] * t).astype(int) * x * p["b"],
+    "sign": lambda t, x, p: jnp.sign(t - p["a"]) * p["b"],
     "search": lambda t, x, p: jnp.searchsorted(jnp.stack([0.0 * t, p["a"]]), t) * p["b"] * x,
 }
+
+
+SAID = {"floor": "rounds what depends on", "round": "rounds what depends on", "integers": "rounds what depends on"}
+SAID["sign"] = "takes the sign of what depends on"
 
 
 @pytest.mark.promotes
 @pytest.mark.parametrize("name", FOUND)
 def test_a_comparison_is_found_with_its_line(name):
-    mode = FOUND[name]
-    first = mode.__code__.co_firstlineno
-    problem = make_problem(mode)
-    lines = [f"mode 'm' compares with a at test_comparisons.py:{line}" for line in (first, first + 1)]
-    assert find_comparisons(problem).get(0) in lines
-    assert find_comparisons(problem).get(1) is None
-
-
-@pytest.mark.promotes
-@pytest.mark.parametrize(
-    ("mode", "words"),
-    [
-        (lambda t, x, p: jnp.floor(p["a"] * t) * x * p["b"], "rounds what depends on a"),
-        (lambda t, x, p: jnp.round(p["a"] * t) * x * p["b"], "rounds what depends on a"),
-        (lambda t, x, p: (p["a"] * t).astype(int) * x * p["b"], "rounds what depends on a"),
-        (lambda t, x, p: jnp.sign(t - p["a"]) * p["b"], "takes the sign of what depends on a"),
-    ],
-)
-def test_rounding_and_signs_are_found(mode, words):
-    assert f"mode 'm' {words} at test_comparisons.py:" in find_comparisons(make_problem(mode)).get(0)
+    first = FOUND[name].__code__.co_firstlineno
+    found = find_comparisons(make_problem(FOUND[name]))
+    said = SAID.get(name, "compares with")
+    assert found.get(0) in [f"mode 'm' {said} a at test_comparisons.py:{line}" for line in (first, first + 1)]
+    assert found.get(1) is None
 
 
 NOT_FOUND = {
@@ -71,26 +64,13 @@ NOT_FOUND = {
 @pytest.mark.promotes
 @pytest.mark.parametrize("name", NOT_FOUND)
 def test_nothing_is_accused_that_does_not_jump_with_the_parameter(name):
-    problem = make_problem(NOT_FOUND[name])
-    assert find_comparisons(problem).get(0) is None
-    assert find_comparisons(problem).get(1) is None
+    """A mode that does not occur is not named either."""
+    found = find_comparisons(make_problem(NOT_FOUND[name], n=FOUND["where"]))
+    assert (found.get(0), found.get(1)) == (None, None)
 
 
 def test_other_functions_and_the_names_of_a_map():
-    def mode(t, x, p):
-        return -p["b"] * x
-
-    def observe(t, x, p):
-        return jnp.where(t < p["own"], x, 2.0 * x)
-
-    problem = make_problem(mode, observe=observe, parameter_map={"own": "a"})
-    line = observe.__code__.co_firstlineno + 1
+    observe = lambda t, x, p: jnp.where(t < p["own"], x, 2.0 * x)  # noqa: E731
+    problem = make_problem(lambda t, x, p: -p["b"] * x, observe=observe, parameter_map={"own": "a"})
+    line = observe.__code__.co_firstlineno
     assert find_comparisons(problem).get(0) == f"observe 1 compares with own at test_comparisons.py:{line}"
-
-
-def test_a_mode_that_does_not_occur_is_not_named():
-    modes = {"m": lambda t, x, p: -p["a"] * x, "n": lambda t, x, p: jnp.where(t < p["a"], x, -x)}
-    times = np.linspace(0.1, 1.0, 5)
-    run = sf.Experiment(sf.Measurements(times, times, sigma=1.0), ("m",), (), 0.0, 1.0)
-    problem = sf.Problem(sf.HybridSystem(modes, [0.3]), run, {"a": 1.0}, max_transitions=1)
-    assert find_comparisons(problem).get(0) is None

@@ -65,11 +65,6 @@ def compiled():
     return problem
 
 
-def cells_of(problem):
-    """Length of the mesh with its padding: experiments share programs where it is the same."""
-    return len(evaluator_of(problem).meshes[0].nodes)
-
-
 def traces_of(call):
     before = TRACES["count"]
     call()
@@ -91,29 +86,23 @@ def test_nothing_is_traced_as_tau_and_p_move(compiled, method):
         ({"samples": 11}, sf.evaluate),  # of the same padded length as the mesh of 9
         ({"tau": 1.2, "seed": 2}, sf.estimate),
     ],
-    ids=["other data", "samples of the same padded length", "second fit"],
 )
 def test_nothing_is_traced_for_another_problem_of_the_same_size(compiled, change, call):
     other = oscillator(**change)
-    assert cells_of(other) == cells_of(compiled)
+    cells = [len(evaluator_of(problem).meshes[0].nodes) for problem in (other, compiled)]
+    assert cells[0] == cells[1], "with its padding: experiments share programs where it is the same"
     assert evaluator_of(other) is evaluator_of(other), "its mesh is made once"
     assert traces_of(lambda: call(other)) == 0
     assert sf.evaluate(other).cost != sf.evaluate(compiled).cost
 
 
-PROGRAMS = (derivatives, simulate_rows, call_model)
-"""What JAX compiles where there is no machine code."""
+def count_programs():
+    """How many programs of machine code, and of each kind that JAX compiles where there is none, were compiled."""
+    of_jax = [program._cache_size() for program in (derivatives, simulate_rows, call_model)]
+    return np.array([_program_of.cache_info().misses, *of_jax])
 
 
-def compiled_by(call):
-    """How many programs of machine code, and of each kind of JAX's, a call compiles."""
-
-    def counts():
-        return [_program_of.cache_info().misses, *(program._cache_size() for program in PROGRAMS)]
-
-    before = counts()
-    call()
-    return [after - count for after, count in zip(counts(), before, strict=True)]
+ROOM = sf.HybridSystem({"on": charge, "off": decay_at_k}, [0.3])
 
 
 @pytest.mark.parametrize("change", [{}, {"samples": 40}, {"transitions": 3}], ids=["nothing", "samples", "transitions"])
@@ -130,13 +119,10 @@ def test_another_number_of_transitions_compiles_one_program_another_number_of_sa
     size = pad_length(evaluator_of(room()).meshes[0].cells)
     if "samples" in change:
         assert pad_length(evaluator_of(room(**change)).meshes[0].cells) > size
-    fits = []
-    counts = compiled_by(lambda: fits.append(sf.estimate(room(**change), strategy="local")))
-    assert fits[0].integration_error < 1e-8, "the mesh has not been refined after the fit"
-    assert counts == [1 if "transitions" in change else 0, 0, 0, 0]
-
-
-ROOM = sf.HybridSystem({"on": charge, "off": decay_at_k}, [0.3])
+    before = count_programs()
+    fit = sf.estimate(room(**change), strategy="local")
+    assert fit.integration_error < 1e-8, "the mesh has not been refined after the fit"
+    assert (count_programs() - before).tolist() == ["transitions" in change, 0, 0, 0]
 
 
 # float64 whatever the user has set
@@ -187,16 +173,13 @@ def test_everything_is_float64_and_the_setting_as_before(x64, monkeypatch):
 def test_the_setting_is_as_before_after_exceptions(compiled, x64):
     """Raised while a problem is built, while its mesh is refined, and by a callback."""
 
-    def casting(t, x, p):
-        return x.astype(jnp.float32)
-
-    with pytest.raises(ValueError, match="must return float64; got float32"):
-        sf.Problem(sf.HybridSystem({"decay": casting}, [1.0]), decay().experiments[0], {"k": 1.0})
-    assert jax.config.jax_enable_x64 is x64
-    blowing_up = sf.HybridSystem({"decay": lambda t, x, p: 9.0 * x**2}, [1.0])
-    with pytest.raises(ValueError, match="mode 'decay' cannot be integrated"):
-        sf.evaluate(sf.Problem(blowing_up, decay().experiments[0], {"k": 1.0}))
-    assert jax.config.jax_enable_x64 is x64
+    for mode, message in (
+        (lambda t, x, p: x.astype(jnp.float32), "must return float64; got float32"),
+        (lambda t, x, p: 9.0 * x**2, "mode 'decay' cannot be integrated"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sf.evaluate(sf.Problem(sf.HybridSystem({"decay": mode}, [1.0]), decay().experiments[0], {"k": 1.0}))
+        assert jax.config.jax_enable_x64 is x64
     with pytest.raises(ZeroDivisionError):
         sf.estimate(compiled, callback=lambda record: 1 / 0)
 
@@ -249,10 +232,7 @@ def test_import_has_no_side_effects():
     done = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 0, done.stderr
     changed, missing, modules, flags = json.loads(done.stdout)
-    assert not changed
-    assert not missing
-    assert not set(HEAVY) & set(modules)
-    assert flags == SMALL_LOOPS
+    assert (changed, missing, set(HEAVY) & set(modules), flags) == ([], [], set(), SMALL_LOOPS)
 
 
 @pytest.mark.parametrize(

@@ -27,11 +27,17 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-13}
 KNOTS, HEIGHTS = np.array([-1.0, -0.5, 0.0, 0.3]), np.array([-2.0, -0.5, 0.0, 0.5])
 
 
-def problem_of(mode, start, parameters, tf=4.0, data=None, inputs=None, count=40, **settings):
-    """One mode, whose first state is compared with a cosine at equal times."""
+def samples(tf=4.0, count=40, values=None, sigma=1.0, **settings):
+    """The first state at equal times, which is compared with a cosine unless values are given."""
     times = np.linspace(0.0, tf, count + 1)[1:]
-    data = data or sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1], sigma=1.0)
-    run = sf.Experiment(data, ("m",), (), 0.0, tf, inputs=inputs)
+    values = np.cos(times) if values is None else values
+    return sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=sigma, **settings)
+
+
+def problem_of(mode, start, parameters, tf=4.0, data=None, count=40, inputs=None, jumps=(), **settings):
+    """One mode, with `samples` unless other data are given."""
+    data = samples(tf, count) if data is None else data
+    run = sf.Experiment(data, ("m",), (), 0.0, tf, inputs=inputs, jumps=jumps)
     return sf.Problem(sf.HybridSystem({"m": mode}, start), run, parameters, **settings)
 
 
@@ -60,10 +66,7 @@ MODES = {
     "maximum": (lambda x, p: jnp.maximum(x[0] * p["w"], x[1] ** 2), 1),
     "minimum": (lambda x, p: jnp.minimum(0.3, x[0] * x[1]), 1),
     "the same twice": (lambda x, p: jnp.where(x[0] < 0, x[1], 2.0) + jnp.maximum(x[0], 0.0), 1),
-    "the same the other way round": (
-        lambda x, p: jnp.where(jnp.greater(0.0, x[0]), x[1], 2.0) + jnp.minimum(0.0, x[0]),
-        1,
-    ),
+    "the same the other way round": (lambda x, p: jnp.where(x[0] > 0, x[1], 2.0) + jnp.minimum(0.0, x[0]), 1),
     "two states both ways": (lambda x, p: jnp.where(x[0] > x[1], x[0], 1.0) * jnp.where(x[1] >= x[0], 2.0, 1.0), 1),
     "nested": (lambda x, p: jnp.where(x[0] > 0, jnp.where(x[1] <= p["w"], x[1] ** 2, 2.0), 3.0), 2),
     "both of two": (lambda x, p: jnp.where((x[0] > 0) & (x[1] > 0), x[0] * x[1], 0.0), 2),
@@ -123,10 +126,8 @@ def test_what_does_not_change_with_the_state_has_no_corner():
 
 def test_a_branch_leaves_out_what_has_no_slope_on_the_other_side():
     """sqrt(x) has no slope at 0, and a selection would multiply it by 0."""
-    for slope in (
-        lambda x, p: jnp.where(x[0] < 0, 2.0 * x[0], jnp.sqrt(x[0])),
-        lambda x, p: jnp.where(x[0] >= 0, jnp.sqrt(x[0]), 2.0 * x[0]),
-    ):
+    root = lambda x, p: jnp.where(x[0] < 0, 2.0 * x[0], jnp.sqrt(x[0]))  # noqa: E731
+    for slope in (root, lambda x, p: jnp.where(x[0] >= 0, jnp.sqrt(x[0]), 2.0 * x[0])):
         corners = corners_of(stacked(slope))
         with use_float64():
             at = jnp.array([0.0, 1.0])
@@ -206,9 +207,7 @@ def block(tau, parameters, values=None, sigma=1.0):
         "push": lambda t, x, p: jnp.stack([x[1], p["a"] - p["mu"] * 9.81 * jnp.sign(x[1])]),
         "slide": lambda t, x, p: jnp.stack([x[1], -p["mu"] * 9.81 * jnp.sign(x[1])]),
     }
-    times = np.linspace(0.0, 2.0, 41)[1:]
-    data = sf.Measurements(times, np.cos(times) if values is None else values, lambda t, x, p: x[:1], sigma=sigma)
-    run = sf.Experiment(data, ("push", "slide"), (tau,), 0.0, 2.0)
+    run = sf.Experiment(samples(2.0, values=values, sigma=sigma), ("push", "slide"), (tau,), 0.0, 2.0)
     return sf.Problem(sf.HybridSystem(modes, [0.0, 0.0]), run, parameters, **TIGHT)
 
 
@@ -299,19 +298,8 @@ def check_derivatives(problem):
     return evaluator
 
 
-def table(t, x, p):
-    return jnp.stack([-p["a"] * jnp.interp(x[0], np.array([0.0, 0.5, 1.0, 2.5]), np.array([0.1, 0.2, 1.0, 1.6]))])
-
-
 def contact(t, x, p):
     return jnp.stack([x[1], -9.81 + jnp.where(x[0] < 0, -p["k"] * x[0] - p["c"] * x[1], 0.0)])
-
-
-def backlash(t, x, p):
-    """A motor turns a load by a gear with play w; the angles and speeds of both."""
-    twist = x[0] - x[1]
-    torque = p["k"] * (jnp.maximum(twist - p["w"], 0.0) + jnp.minimum(twist + p["w"], 0.0))
-    return jnp.stack([x[2], x[3], 3.0 * jnp.cos(2.0 * t) - torque - 0.2 * x[2], torque - p["d"] * x[3]])
 
 
 def clipped(t, x, p):
@@ -357,32 +345,21 @@ def two_springs(t, x, p):
     return jnp.concatenate([x[2:], -p["k"] * x[:2] - p["c"] * jnp.sign(x[2:])])
 
 
-def with_spring(data, tf=4.0, jumps=(), **more):
-    run = sf.Experiment(data, ("m",), (), 0.0, tf, jumps=jumps)
-    return sf.Problem(sf.HybridSystem({"m": spring}, [1.0, 0.0]), run, {"k": 4.0, "c": 0.3, **more}, **TIGHT)
-
-
-def samples(first=0, **more):
-    times = np.linspace(0.0, 4.0, 31)[1 + first :]
-    return sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1], sigma=1.0, **more)
-
-
 def late_and_jumping():
     jump = sf.Jump(2.5, lambda t, x, p: jnp.stack([x[0], x[1] + p["c"]]))
-    return with_spring(samples(2, delay="late"), jumps=[jump], late=sf.Parameter(0.05, lower=0.0, upper=0.2))
+    parameters = {"k": 4.0, "c": 0.3, "late": sf.Parameter(0.05, lower=0.0, upper=0.2)}
+    return problem_of(spring, [1.0, 0.0], parameters, data=samples(count=20, delay="late"), jumps=[jump], **TIGHT)
 
 
 def free_end():
     costs = [sf.TerminalCost(lambda x, p: (x[0] - 0.1) ** 2 + x[1] ** 2), sf.RunningCost(lambda t, x, p: x[0] ** 2)]
-    return with_spring(costs, sf.Parameter(2.3, lower=1.0, upper=4.0))
+    return problem_of(spring, [1.0, 0.0], {"k": 4.0, "c": 0.3}, sf.Parameter(2.3, 1.0, 4.0), costs, **TIGHT)
 
 
 PUSHES = sf.Input(np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.array([5.0, 1.0, -5.0, 0.0, 6.0]), kind="hold")
 
 CASES = {
     "contact": (lambda: problem_of(contact, [1.0, 0.0], {"k": 1e3, "c": 3.0}, 2.9, **TIGHT), 6),
-    "backlash": (lambda: problem_of(backlash, np.zeros(4), {"k": 30.0, "w": 0.1, "d": 0.3}, **TIGHT), 5),
-    "table": (lambda: problem_of(table, [2.0], {"a": 0.9}, 4.5, **TIGHT), 2),
     "clip": (lambda: problem_of(clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 5.0, **TIGHT), 4),
     "driven": (lambda: problem_of(driven, np.zeros(2), {"mu": 0.3, "d": 0.3}, 5.0, inputs=PUSHES, **TIGHT), 4),
     "everything": (everything, 2),
@@ -395,7 +372,7 @@ CASES = {
 """Problems, and how many crossings their first experiments have at least."""
 
 
-QUICK = ("contact", "table", "clip", "driven", "everything")
+QUICK = ("contact", "clip", "driven", "everything")
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in CASES])
@@ -410,7 +387,7 @@ def test_derivatives_are_those_of_differences(name):
 def test_the_lagrangian_of_guards_and_terminal_constraints_has_its_derivatives():
     """Crossings, and a transition whose time is an unknown that a guard constrains."""
     system = sf.HybridSystem({"a": spring, "b": clipped}, [1.0, 0.0], guards={("a", "b"): lambda t, x, p: x[0] + 0.31})
-    data = [samples(), sf.TerminalConstraint(lambda x, p: x[0] - 0.2)]
+    data = [samples(count=30), sf.TerminalConstraint(lambda x, p: x[0] - 0.2)]
     run = sf.Experiment(data, ("a", "b"), (2.1,), 0.0, 4.0)
     problem = sf.Problem(system, run, {"k": 4.0, "c": 0.3, "s": 0.4}, **TIGHT)
     evaluator, multipliers = Evaluator(problem), np.array([0.7, -0.4])
@@ -505,9 +482,8 @@ def test_costs_do_not_depend_on_what_was_evaluated_before(rtol):
 
 
 def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
-    times = np.linspace(0.0, 2.0, 41)[1:]
-    rng = np.random.default_rng(1)
-    values = value_of(block_at, times, [0.63, 6.0, 0.3]) + 1e-3 * rng.standard_normal(40)
+    times = samples(2.0).times
+    values = value_of(block_at, times, [0.63, 6.0, 0.3]) + 1e-3 * np.random.default_rng(1).standard_normal(40)
     fit = sf.estimate(block(0.6, {"a": 5.5, "mu": 0.33}, values, 1e-3))
     assert fit.success
     assert fit.verdict.level != "bad"
@@ -530,7 +506,7 @@ def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint", "autodiff"])
-@pytest.mark.parametrize("name", ["driven", "backlash", "contact"])
+@pytest.mark.parametrize("name", ["driven", "contact"])
 def test_all_methods_agree(name, method):
     problem = CASES[name][0]()
     found, expected = sf.evaluate(problem, method=method), sf.evaluate(problem)
@@ -626,17 +602,11 @@ def test_a_solver_that_is_stuck_makes_no_corner_steep_beyond_which_the_field_is_
 # --- fits -------------------------------------------------------------------------------------------------------------
 
 
-def fit_of(mode, start, truth, guess, tf, count, sigma, seed=0):
+def fit_of(mode, start, truth, guess, tf, count, sigma):
     """A fit to simulated noisy samples of the first state, from a guess."""
-    times = np.linspace(0.0, tf, count + 1)[1:]
-
-    def given(values, parameters):
-        data = sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=sigma)
-        run = sf.Experiment(data, ("m",), (), 0.0, tf)
-        return sf.Problem(sf.HybridSystem({"m": mode}, start), run, parameters)
-
-    clean = sf.simulate(given(np.zeros(count), truth), times=times).states[:, 0]
-    return sf.estimate(given(clean + sigma * np.random.default_rng(seed).standard_normal(count), guess))
+    clean = sf.simulate(problem_of(mode, start, truth, tf, count=count), times="samples").states[:, 0]
+    noisy = clean + sigma * np.random.default_rng(0).standard_normal(count)
+    return sf.estimate(problem_of(mode, start, guess, tf, samples(tf, count, noisy, sigma)))
 
 
 def slowing(t, x, p):
@@ -645,7 +615,6 @@ def slowing(t, x, p):
 
 
 FITS = {
-    "friction": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.3}, 0.7, 4.0, 80, 1e-3),
     "rest": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.9}, 1.3, 8.0, 160, 1e-3),
     "contact": (contact, [1.0, 0.0], {"k": 1e4, "c": 5.0}, 0.7, 2.0, 200, 2e-3),
     "clip": (clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 1.3, 5.0, 100, 1e-2),
@@ -672,7 +641,7 @@ def test_a_tank_that_empties_is_fitted_with_the_errors_of_its_closed_form():
     fit = fit_of(tank, start, {"x0": 1.5, "k": 0.8}, {"x0": 1.2, "k": 1.0}, 5.0, 60, 1e-2)
     assert fit.status.successful, fit.message
     assert fit.verdict.level != "bad"
-    times = np.linspace(0.0, 5.0, 61)[1:]
+    times = samples(5.0, 60).times
     _, slopes, _ = differentiate(lambda q: tank_at(times, q), fit.theta)
     expected = np.sqrt(np.diag(1e-4 * np.linalg.inv(slopes.T @ slopes)))
     np.testing.assert_allclose(fit.standard_errors, expected, rtol=0.1)
@@ -717,20 +686,16 @@ def random_problem(seed):
         "b": rng.standard_normal((4, n)) * np.array([1.5, 1.5, 1.0, 0.3])[:, None],
         "n": rng.standard_normal((2, n)),
     }
-    times = np.array([0.71, 1.43, 2.0])
-    data = sf.Measurements(times, rng.standard_normal((3, n)), sigma=1.0)
-    run = sf.Experiment(data, ("m",), (), 0.0, 2.0)
+    data = sf.Measurements([0.71, 1.43, 2.0], rng.standard_normal((3, n)), sigma=1.0)
     start = [sf.Parameter(float(rng.standard_normal())), *rng.standard_normal(n - 1).tolist()]
     unknown = {"a": 1.0, "d": 0.5 * float(rng.standard_normal())}
     constants = {name: sf.Parameter(value, fixed=True) for name, value in fixed.items()}
-    return sf.Problem(sf.HybridSystem({"m": mode}, start), run, {**unknown, **constants}, **TIGHT)
+    return problem_of(mode, start, unknown | constants, 2.0, data, **TIGHT), fixed
 
 
-def integrate_with_one_corner(problem, theta):
+def integrate_with_one_corner(problem, fixed):
     """J of the model with one plane, from an integrator that knows its corner (`benchmarks.sharp.corners`)."""
-    known = {name: np.asarray(value.value) for name, value in problem.parameters.items()}
-    a, d, x0 = theta
-    A, b, normal = known["A"], known["b"], known["n"][0]
+    (a, d, x0), (A, b, normals) = problem.initial_theta, fixed.values()
 
     def field(t, x, sides):
         return A[0] @ x * a + b[0] if sides[0] > 0 else A[1] @ x + b[1]
@@ -738,7 +703,7 @@ def integrate_with_one_corner(problem, theta):
     data = problem.experiments[0].data[0]
     start = [x0, *(entry.value for entry in problem.system.initial_state[1:])]
     states, _ = integrate(
-        field, lambda x: [normal @ x - d], start, 0.0, 2.0, data.times, rtol=1e-11, atol=1e-12, method="DOP853"
+        field, lambda x: [normals[0] @ x - d], start, 0.0, 2.0, data.times, rtol=1e-11, atol=1e-12, method="DOP853"
     )
     return 0.5 * np.sum((states - data.values) ** 2)
 
@@ -748,11 +713,10 @@ def test_random_systems():
     """Differences of J, where the path and the samples between its crossings are the same at all of their points:
     J has corners of its own elsewhere, as where a trajectory grazes a plane.
     """
-    skipped, slid, crossed, worst = [], 0, 0, np.zeros(2)
+    skipped, slid, crossed = 0, 0, 0
     for seed in range(100):
-        problem = random_problem(seed)
-        theta, paths = problem.initial_theta, set()
-        evaluator = Evaluator(problem)
+        problem, fixed = random_problem(seed)
+        theta, paths, evaluator = problem.initial_theta, set(), Evaluator(problem)
         engine = evaluator.engines[0]
 
         def cost(theta, evaluator=evaluator, engine=engine, paths=paths):
@@ -763,17 +727,15 @@ def test_random_systems():
 
         found = evaluator(theta)
         if seed // 2 % 2 == 0:
-            assert found.cost == pytest.approx(integrate_with_one_corner(problem, theta), rel=1e-7), seed
+            assert found.cost == pytest.approx(integrate_with_one_corner(problem, fixed), rel=1e-7), seed
         errors = measure_errors(theta, cost, found.gradient, found.hessian)
         if len(paths) > 1:
-            skipped.append(seed)
+            skipped += 1
             continue
         slid += any(0 in sides for sides in engine._split.path.sides[0])
         crossed += len(crossings_of(evaluator))
-        worst = np.maximum(worst, errors)
-    assert worst[0] < 1e-7
-    assert worst[1] < 1e-5
-    assert len(skipped) <= 2, skipped  # one, seed 11
+        assert np.all(errors < [1e-7, 1e-5]), seed
+    assert skipped <= 2, "one, seed 11"
     assert slid > 20
     assert crossed > 60
 
@@ -816,18 +778,15 @@ ROOTS = {
 def test_a_tank_that_is_or_ran_empty_is_filled_again(name, start):
     """sqrt(x) is not defined below zero, and its slope at zero is infinite: rows begin and end there all the same."""
     root, modes = ROOTS[name], ("drain", "fill") if start else ("fill", "drain")
-    system = sf.HybridSystem(
-        {"drain": lambda t, x, p: -p["c"] * root(x), "fill": lambda t, x, p: p["q"] - p["c"] * root(x)}, [start]
-    )
-    times = np.linspace(0.1, 10.0, 60)
+    drain, fill = (lambda t, x, p: -p["c"] * root(x)), (lambda t, x, p: p["q"] - p["c"] * root(x))
+    system = sf.HybridSystem({"drain": drain, "fill": fill}, [start])
 
     def build(values, tau, c, q):
-        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), modes, (tau,), 0.0, 10.0)
-        return sf.Problem(system, run, {"c": c, "q": q})
+        data = sf.Measurements(np.linspace(0.1, 10.0, 60), values, sigma=0.01)
+        return sf.Problem(system, sf.Experiment(data, modes, (tau,), 0.0, 10.0), {"c": c, "q": q})
 
-    truth = build(np.zeros((60, 1)), 6.0, 0.5, 0.3)
-    path = sf.simulate(truth)
-    values = np.interp(times, path.times, path.states[:, 0])[:, None]
+    truth = build(np.zeros(60), 6.0, 0.5, 0.3)
+    values = sf.simulate(truth, times="samples").states
     if name != "a small number in place of zero":
         evaluator = Evaluator(truth)
         assert np.isfinite(evaluator.cost(truth.initial_theta))

@@ -7,42 +7,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 from models import decay, rest
 from numpy.polynomial import Polynomial
 
 import switchfit as sf
-from switchfit.discretization.model import Piece
-from switchfit.engine.adaptive import refine_mesh
-from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.functions import use_float64
 
 # Inputs
 
 
-def integrator(t, x, p, u):
-    """The first state integrates the input times p, the second one integrates the first."""
-    return jnp.array([p["gain"] * u, x[0]])
+INTEGRATOR = sf.HybridSystem({"on": lambda t, x, p, u: jnp.array([p["gain"] * u, x[0]])}, [0.0, 0.0])
+"""The first state integrates the input times p, the second one integrates the first."""
 
-
-def final_state(x, p):
-    return x[0] + 2.0 * x[1]
-
-
-INTEGRATOR = sf.HybridSystem({"on": integrator}, [0.0, 0.0])
+FINAL_STATE = sf.TerminalCost(lambda x, p: x[0] + 2.0 * x[1])
 KNOTS = np.array([-0.5, 0.3711, 0.9, 1.7071, 2.0])
 LEVELS = np.array([2.0, -1.0, 4.0, 0.5, 7.0])
 CUBIC = Polynomial([1.0, -2.0, 0.7, 0.4])
 
 
-def integrated(inputs, gain=1.5):
-    run = sf.Experiment(sf.TerminalCost(final_state), ("on",), (), 0.0, 2.0, inputs=inputs)
-    return sf.evaluate(sf.Problem(INTEGRATOR, run, {"gain": gain}))
-
-
-def integral_of(pieces, gain=1.5):
-    """gain (int u + 2 int int u) over [0, 2] = gain int u (1 + 2 (2 - t)); pieces: (from, to, polynomial)."""
+def integral_of(pieces):
+    """p (int u + 2 int int u) over [0, 2] = p int u (1 + 2 (2 - t)) with p = 1.5; pieces: (from, to, polynomial)."""
     weighted = [(a, b, (u * Polynomial([5.0, -2.0])).integ()) for a, b, u in pieces]
-    return gain * sum(U(b) - U(a) for a, b, U in weighted)
+    return 1.5 * sum(U(b) - U(a) for a, b, U in weighted)
 
 
 def line(a, b, at_a, at_b):
@@ -50,57 +36,24 @@ def line(a, b, at_a, at_b):
 
 
 CLIPPED = np.clip(KNOTS, 0.0, 2.0)
-PIECES = {
-    "hold": [(CLIPPED[k], CLIPPED[k + 1], Polynomial([LEVELS[k]])) for k in range(4)],
-    "linear": [(CLIPPED[k], CLIPPED[k + 1], line(KNOTS[k], KNOTS[k + 1], LEVELS[k], LEVELS[k + 1])) for k in range(4)],
-    "cubic": [(0.0, 2.0, CUBIC)],
+CELLS = [(CLIPPED[k], CLIPPED[k + 1]) for k in range(4)]
+LINES = [line(KNOTS[k], KNOTS[k + 1], LEVELS[k], LEVELS[k + 1]) for k in range(4)]
+STEP = [(0.0, 0.5, Polynomial([1.0])), (0.5, 2.0, Polynomial([3.0]))]
+INPUTS = {
+    "hold": (sf.Input(KNOTS, LEVELS), [(a, b, Polynomial([u])) for (a, b), u in zip(CELLS, LEVELS[:4], strict=True)]),
+    "linear": (sf.Input(KNOTS, LEVELS, kind="linear"), [(a, b, u) for (a, b), u in zip(CELLS, LINES, strict=True)]),
+    "cubic": (sf.Input(KNOTS, CUBIC(KNOTS), kind="cubic"), [(0.0, 2.0, CUBIC)]),
+    "its last value is kept": (sf.Input([0.0, 0.5], [1.0, 3.0]), STEP),
 }
 
 
-@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
-def test_inputs_are_integrated_exactly_since_no_step_crosses_a_knot(kind):
+@pytest.mark.parametrize(("inputs", "pieces"), INPUTS.values(), ids=INPUTS)
+def test_inputs_are_integrated_exactly_since_no_step_crosses_a_knot(inputs, pieces):
     """Any step across the jump at 0.3711 would leave an error of the step length or of its square."""
-    values = CUBIC(KNOTS) if kind == "cubic" else LEVELS
-    found = integrated(sf.Input(KNOTS, values, kind=kind))
-    expected = integral_of(PIECES[kind])
+    run = sf.Experiment(FINAL_STATE, ("on",), (), 0.0, 2.0, inputs=inputs)
+    found, expected = sf.evaluate(sf.Problem(INTEGRATOR, run, {"gain": 1.5})), integral_of(pieces)
     assert found.cost == pytest.approx(expected, rel=1e-13)
     assert found.gradient[0] == pytest.approx(expected / 1.5, rel=1e-13)
-
-
-def test_a_held_input_starts_by_t0_and_keeps_its_last_value():
-    found = integrated(sf.Input([0.0, 0.5], [1.0, 3.0]))
-    expected = integral_of([(0.0, 0.5, Polynomial([1.0])), (0.5, 2.0, Polynomial([3.0]))])
-    assert found.cost == pytest.approx(expected, rel=1e-13)
-
-
-def pull(t, x, p, u):
-    return jnp.array([x[1], u[0] - p["k"] * jnp.sin(x[0]) - u[1] * x[1]])
-
-
-def distance(t, x, p):
-    return (x[0] - 0.5) ** 2 + p["k"] * x[1] ** 2
-
-
-def test_a_held_input_is_the_same_as_modes_that_switch_at_fixed_times():
-    """Two channels, three levels, on one mesh: cost, gradient and Hessian agree to rounding."""
-    jumps, levels = (0.37, 1.41), np.array([[1.0, 0.2], [-2.0, 0.5], [0.7, 0.1]])
-    cost, k = sf.RunningCost(distance), {"k": 1.2}
-    driven = sf.HybridSystem({"all": pull}, [0.3, 0.0])
-    inputs = sf.Input([0.0, *jumps], levels)
-    first = sf.Problem(driven, sf.Experiment(cost, ("all",), (), 0.0, 2.0, inputs=inputs), k)
-
-    def mode(level):
-        return lambda t, x, p: pull(t, x, p, level)
-
-    switched = sf.HybridSystem({f"level {i}": mode(level) for i, level in enumerate(levels)}, [0.3, 0.0])
-    times = [sf.Parameter(jump, fixed=True) for jump in jumps]
-    second = sf.Problem(switched, sf.Experiment(cost, tuple(switched.modes), times, 0.0, 2.0), k)
-    meshes = [refine_mesh(first, 0, first.initial_theta)]
-    theta = np.array([1.3])
-    a, b = Evaluator(first, meshes=meshes)(theta), Evaluator(second, meshes=meshes)(theta)
-    assert a.cost == pytest.approx(b.cost, rel=1e-12)
-    np.testing.assert_allclose(a.gradient, b.gradient, rtol=1e-12)
-    np.testing.assert_allclose(a.hessian, b.hessian, rtol=1e-12)
 
 
 # Reference signals
@@ -109,19 +62,6 @@ def test_a_held_input_is_the_same_as_modes_that_switch_at_fixed_times():
 IRREGULAR = np.array([0.0, 0.1, 0.35, 0.4, 0.9, 1.2, 1.25, 1.8, 2.0])
 DENSE = np.linspace(0.0, 2.0, 301)
 OTHER = Polynomial([0.3, 0.5, -1.0, 0.25])
-
-
-def test_the_derivatives_of_a_signal_in_a_cell_are_those_of_its_cubic():
-    """The rule for them is switchfit's own: value and three derivatives against NumPy's polynomials, along a curve."""
-    coefficients, at = np.array([[0.3, -1.0], [2.0, 0.7], [-0.4, 0.2], [1.1, -0.6]]), 0.37
-    with use_float64():
-        functions = [Piece(jnp.asarray(0.2), jnp.asarray(coefficients))]
-        for _ in range(4):
-            functions.append(jax.jacfwd(functions[-1]))
-        found = jax.jit(lambda t: [function(t) for function in functions])(at)
-    for order, values in enumerate(found):
-        exact = [Polynomial(c).deriv(order)(at - 0.2) for c in coefficients.T]
-        np.testing.assert_allclose(values, exact, rtol=1e-13, atol=1e-13)
 
 
 def two_cubics(times):
@@ -166,15 +106,7 @@ def test_the_lowpass_filter_keeps_the_phase(frequency, cutoff, amplitude, tolera
     np.testing.assert_array_less(np.abs(filtered(frequency, cutoff) - np.array([amplitude, 0.0])), tolerances)
 
 
-def at_rest(t, x, p):
-    return jnp.zeros(2)
-
-
-def resting_state(p):
-    return jnp.array([0.4, p["level"]])
-
-
-REST = sf.HybridSystem({"rest": at_rest}, resting_state)
+REST = sf.HybridSystem({"rest": rest}, lambda p: jnp.array([0.4, p["level"]]))
 
 
 def reference_cost(values=None, times=IRREGULAR, **settings):
@@ -212,15 +144,12 @@ def test_a_broken_reference_signal_is_integrated_up_to_the_break_and_from_it():
 # Measurements
 
 
-def second_mode(t, x, p):
-    return jnp.array([-p["k"] * x[0], p["k"] * x[0] - x[1]])
-
-
 def seen(t, x, p):
     return jnp.array([x[0] + x[1], p["k"] * x[1]])
 
 
-DECAYS = sf.HybridSystem({"first": decay, "second": second_mode}, [1.5, 0.8])
+SECOND = lambda t, x, p: jnp.array([-p["k"] * x[0], p["k"] * x[0] - x[1]])  # noqa: E731
+DECAYS = sf.HybridSystem({"first": decay, "second": SECOND}, [1.5, 0.8])
 THETA = np.array([0.83, 1.4])
 SAMPLED = np.array([0.0, 0.011, 0.4, 0.41, 0.8, 1.25, 2.0])
 RNG = np.random.default_rng(5)
@@ -238,26 +167,27 @@ def states(theta, t):
 
 
 @cache
-def closed_form_program(K):
-    def cost(theta, times, values, sigma):
-        x = jax.vmap(states, in_axes=(None, 0))(theta, times)
-        h = jnp.stack([x[:, 0] + x[:, 1], theta[1] * x[:, 1]], axis=1)
-        known = jnp.isfinite(values)
-        return 0.5 * jnp.sum((jnp.where(known, h - jnp.where(known, values, 0.0), 0.0) / sigma) ** 2)
+def observations():
+    """h at the samples with its first and second derivatives, (7, 2), (7, 2, 2) and (7, 2, 2, 2)."""
 
-    return jax.jit(lambda *given: (cost(*given), jax.grad(cost)(*given), jax.hessian(cost)(*given)))
+    def observe(theta):
+        x = jax.vmap(states, in_axes=(None, 0))(theta, SAMPLED)
+        return jnp.stack([x[:, 0] + x[:, 1], theta[1] * x[:, 1]], axis=1)
 
-
-def closed_form(times, values, sigma):
-    with jax.enable_x64(True):
-        given = [jnp.asarray(a, float) for a in (THETA, times, values, np.broadcast_to(sigma, values.shape))]
-        return [np.asarray(value) for value in closed_form_program(len(times))(*given)]
+    return differentiate(observe, THETA)
 
 
-def evaluated(times, values, sigma):
-    data = sf.Measurements(times, values, observe=seen, sigma=sigma)
-    run = sf.Experiment(data, ("first", "second"), THETA[:1], 0.0, 2.0)
-    return sf.evaluate(sf.Problem(DECAYS, run, {"k": THETA[1]}, rtol=1e-11, atol=1e-13))
+def closed_form(values, sigma):
+    """J, gradient and Hessian."""
+    h, slopes, curvatures = observations()
+    weight = np.where(np.isnan(values), 0.0, 1.0 / np.asarray(sigma, float) ** 2)
+    r = h - np.nan_to_num(values)
+    squares = np.einsum("kq,kqi,kqj->ij", weight, slopes, slopes)
+    return (
+        0.5 * np.sum(weight * r**2),
+        np.einsum("kq,kqi->i", weight * r, slopes),
+        squares + np.einsum("kq,kqij->ij", weight * r, curvatures),
+    )
 
 
 def with_gaps(*places):
@@ -281,9 +211,11 @@ def with_gaps(*places):
 )
 def test_measurements_in_closed_form(values, sigma):
     """Irregular times with one at t0 and one at tf; missing values leave no trace in any derivative."""
-    J, g, H = closed_form(SAMPLED, values, 1.0 if sigma is None else sigma)
-    found = evaluated(SAMPLED, values, sigma)
-    assert found.cost == pytest.approx(float(J), rel=1e-9)
+    J, g, H = closed_form(values, 1.0 if sigma is None else sigma)
+    data = sf.Measurements(SAMPLED, values, observe=seen, sigma=sigma)
+    run = sf.Experiment(data, ("first", "second"), THETA[:1], 0.0, 2.0)
+    found = sf.evaluate(sf.Problem(DECAYS, run, {"k": THETA[1]}, rtol=1e-11, atol=1e-13))
+    assert found.cost == pytest.approx(J, rel=1e-9)
     np.testing.assert_allclose(found.gradient, g, rtol=1e-8)
     np.testing.assert_allclose(found.hessian, H, rtol=1e-8)
 
@@ -337,7 +269,7 @@ def reference_over(*times):
         (ones([1.0, 2.0, 3.0]), {"t0": None, "tf": None}, (1.0, 3.0)),
         (ones([1.0, 2.0, 3.0], delay=0.25), {}, (0.75, 2.75)),
         (reference_over(-1.0, 0.0, 1.0, 4.0), {}, (-1.0, 4.0)),
-        ([ones([1.0, 2.0]), sf.TerminalCost(final_state), ones([1.5, 2.5])], {}, (1.0, 2.5)),
+        ([ones([1.0, 2.0]), FINAL_STATE, ones([1.5, 2.5])], {}, (1.0, 2.5)),
         ([ones([0.5, 2.0]), reference_over(0.0, 1.0, 2.0, 3.0)], {}, (0.0, 3.0)),
     ],
 )
@@ -351,13 +283,9 @@ def test_a_horizon_that_is_left_out_is_the_span_of_the_data(data, given, horizon
 def test_a_horizon_from_the_data_is_the_same_as_the_one_given():
     """x' = -x from x(t0) = 1, t0 being the first sample; a free tf keeps its own end."""
     data = ones([1.0, 2.0, 3.0])
-    system = sf.HybridSystem({"a": decay}, [1.0])
-    found = sf.evaluate(sf.Problem(system, sf.Experiment(data, ("a",), ()), {"k": 1.0}))
-    assert found.cost == pytest.approx(0.5 * ((1 - np.exp(-1)) ** 2 + (1 - np.exp(-2)) ** 2), rel=1e-8)
-    given = sf.evaluate(sf.Problem(system, sf.Experiment(data, ("a",), (), 1.0, 3.0), {"k": 1.0}))
-    np.testing.assert_array_equal(found.gradient, given.gradient)
-    trajectory = sf.simulate(sf.Problem(system, sf.Experiment(data, ("a",), ()), {"k": 1.0}))
-    assert (trajectory.times[0], trajectory.times[-1]) == (1.0, 3.0)
+    problem = sf.Problem(sf.HybridSystem({"a": decay}, [1.0]), sf.Experiment(data, ("a",), ()), {"k": 1.0})
+    assert sf.evaluate(problem).cost == pytest.approx(0.5 * ((1 - np.exp(-1)) ** 2 + (1 - np.exp(-2)) ** 2), rel=1e-8)
+    assert sf.simulate(problem).times[[0, -1]].tolist() == [1.0, 3.0]
     run = sf.Experiment(data, ("a",), (), tf=sf.Parameter(4.0, lower=3.0, upper=5.0))
     assert (run.t0, run.end, run.taken_from_data) == (1.0, 5.0, ("t0",))
 

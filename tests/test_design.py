@@ -1,13 +1,16 @@
 """Experiment design: information, criteria, samples, sensors and inputs, against closed forms and brute force."""
 
+import csv
 import json
+import tomllib
 from dataclasses import replace
 from itertools import combinations, product
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import STILL, charge, curve, decay, first_state
+from models import STILL, curve, decay, first_state
+from test_cli import catch_settings, run
 
 import switchfit as sf
 from switchfit.experiment_design import (
@@ -19,6 +22,7 @@ from switchfit.experiment_design import (
     stack_inputs,
 )
 from switchfit.fit.evaluator import Evaluator
+from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
 
 TIMES = np.linspace(0.0, 4.0, 9)
@@ -118,12 +122,8 @@ def test_guarded_times_are_no_unknowns_of_their_own():
     def fall(t, x, p):
         return jnp.stack([x[1], -p["g"] + 0.0 * x[0]])
 
-    system = sf.HybridSystem(
-        {"air": fall},
-        [1.0, 0.0],
-        reset_maps={("air", "air"): lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])},
-        guards={("air", "air"): lambda t, x, p: x[0]},
-    )
+    bounce = {("air", "air"): lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])}
+    system = sf.HybridSystem({"air": fall}, [1.0, 0.0], bounce, guards={("air", "air"): lambda t, x, p: x[0]})
     data = planned(np.linspace(0.1, 1.5, 15), observe=first_state, sigma=0.01)
     problem = sf.Problem(system, sf.Experiment(data, ("air", "air"), (0.5,), 0.0, 1.5), {"g": 9.8, "e": 0.8})
     plan = sf.design(problem)
@@ -217,9 +217,7 @@ def test_no_exchange_of_one_sample_is_better():
     for each in np.einsum("rni,rnj->rnij", slopes, slopes):
         candidates = Candidates(sensor, each, 0.1 * np.eye(3))
 
-        def rate(F):
-            return -np.linalg.slogdet(F)[1]
-
+        rate = lambda F: -np.linalg.slogdet(F)[1]  # noqa: E731
         value, taken = choose_samples(candidates, np.array([2, 3]), rate)
         np.testing.assert_array_equal(np.bincount(sensor, taken), [2, 3])
         for out, into in product(np.flatnonzero(taken), np.flatnonzero(~taken)):
@@ -229,11 +227,8 @@ def test_no_exchange_of_one_sample_is_better():
 
 def test_sensors_by_number_and_by_cost():
     problem = sensors_of_a_line()
-    each = {
-        "value": line_information(TIMES),
-        "slope": np.diag([0.0, len(TIMES[::2]) / 0.1**2]),
-        "fine": line_information(TIMES, 0.05),
-    }
+    slopes = np.diag([0.0, len(TIMES[::2]) / 0.1**2])
+    each = {"value": line_information(TIMES), "slope": slopes, "fine": line_information(TIMES, 0.05)}
     costs = {"value": 1.0, "slope": 1.5, "fine": 2.5}
     for settings, most, price in (
         ({"sensors": 2}, 2, dict.fromkeys(each, 1)),
@@ -264,15 +259,13 @@ def test_shares_of_the_information_add_up_to_one():
 
 
 KNOTS = [1.0, -0.4, 0.3, 0.8]
-NOISE, LATE = sf.Parameter(0.1, lower=0.01), sf.Parameter(0.2, lower=0.0, upper=0.4)
+NOISE_AND_DELAY = {"noise": sf.Parameter(0.1, lower=0.01), "late": sf.Parameter(0.2, lower=0.0, upper=0.4)}
 PROBLEMS = {
     "linear": lag(KNOTS, kind="linear"),
     "cubic": lag([*KNOTS, 0.2], kind="cubic"),
     "constant": lag([0.5]),
     "implicit": lag(KNOTS, solver="stiff"),
-    "sigma and delay": lag(
-        KNOTS[:2], data={"sigma": "noise", "delay": "late"}, parameters={"noise": NOISE, "late": LATE}
-    ),
+    "sigma and delay": lag(KNOTS[:2], data={"sigma": "noise", "delay": "late"}, parameters=NOISE_AND_DELAY),
     "robust": lag([1.0, 0.3], data={"loss": "cauchy"}, parameters={"b": sf.Parameter(2, prior=sf.Normal(2, 0.1))}),
     "two runs": two_lags(),
     "transitions at knots": transitions_at_knots(),
@@ -310,11 +303,8 @@ def test_inputs_against_all_corners(kind):
     """No input that is at its limits everywhere is better than the design."""
     problem = lag([0.1, 0.1, 0.1, 0.1])
     plan = sf.design(problem, free={"u": (-1.0, 1.0)}, criterion=kind)
-    corners = [
-        sf.design(replace_inputs(problem, 0, np.array(corner)[:, None]), criterion=kind).criterion_after
-        for corner in product((-1.0, 1.0), repeat=4)
-        if corner[0] > 0
-    ]
+    every = (np.array([1.0, *rest])[:, None] for rest in product((-1.0, 1.0), repeat=3))
+    corners = [sf.design(replace_inputs(problem, 0, each), criterion=kind).criterion_after for each in every]
     assert plan.criterion_after <= min(corners) + 1e-4 * abs(min(corners))
     assert np.all(np.abs(plan.inputs["u"]) <= 1.0)
 
@@ -352,11 +342,8 @@ def test_inputs_by_name_within_limits_of_each_knot_and_samples_together():
 
 def test_text_figure_and_file(tmp_path):
     plan = sunny(names="k", starts=1)[1]
-    text = str(plan)
-    assert text.startswith("D-optimal design of run1 for k.")
-    assert all(part in text for part in ("T: 3 of 8 samples, at ", "sun at 4 knots: 0.1, 0.1, 0.1, 0.1"))
-    assert f"{plan.standard_errors[0]:.3g}" in text
-    assert repr(plan).startswith("Design(run1, D of k: ")
+    shown = ("D-optimal design of run1 for k.", "T: 3 of 8 samples, at ", "sun at 4 knots: 0.1, 0.1, 0.1, 0.1")
+    assert all(part in str(plan) for part in (*shown, f"{plan.standard_errors[0]:.3g}"))
     assert [ax.get_ylabel() for ax in plan.plot().axes][-1] == "share of information"
     plan.save(tmp_path / "design.json")
     saved = json.loads((tmp_path / "design.json").read_text())
@@ -401,14 +388,118 @@ def test_wrong_limits(limits):
 
 
 def test_problems_that_cannot_be_designed():
-    with pytest.raises(TypeError, match=r"problem must be an sf\.Problem"):
-        sf.design(3)
-    with pytest.raises(ValueError, match="design needs Measurements with sigma, for the data of run1"):
-        sf.design(line(sigma=None))
-    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("on", "off"), (1.0,), 0.0, 2.0)
-    with pytest.raises(ValueError, match="design needs Measurements with sigma, for the data of run1"):
-        sf.design(sf.Problem(sf.HybridSystem({"on": charge, "off": decay}, [0.0]), cost, {"k": 1.0}))
-    system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + u}, [1.0])
-    run = sf.Experiment(planned(TIMES[1:]), ("on",), (), 0.0, 4.0, inputs=sf.Input([0.0], [1.0]))
-    with pytest.raises(ValueError, match="free cannot be used where"):
-        sf.design(sf.Problem(system, run, {"k": 1.0}), free={"u": (0.0, 1.0)})
+    one = lag([1.0])
+    cost = replace(one, experiments=replace(one.experiments[0], data=sf.RunningCost(lambda t, x, p: x[0] ** 2)))
+    corner = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + p["b"] * u}, [1.0])
+    for problem, free, error, message in (
+        (3, None, TypeError, r"problem must be an sf\.Problem"),
+        (line(sigma=None), None, ValueError, "design needs Measurements with sigma, for the data of run1"),
+        (cost, None, ValueError, "design needs Measurements with sigma, for the data of run1"),
+        (replace(one, system=corner), {"u": (0.0, 1.0)}, ValueError, "free cannot be used where"),
+    ):
+        with pytest.raises(error, match=message):
+            sf.design(problem, free=free)
+
+
+# --- `switchfit design`, and [design] in problem files ----------------------------------------------------------------
+
+
+MODEL = """
+import switchfit as sf
+
+def heat(t, x, p, u):
+    return p["b"] * u["power"] + u["sun"] - p["k"] * x
+
+system = sf.HybridSystem({"heat": heat}, [0.0], state_names=("T",))
+"""
+
+PROBLEM = """
+model = "model.py:system"
+
+[parameters]
+k = { value = 0.5, lower = 0.0 }
+b = 2.0
+
+[[experiments]]
+mode_sequence = ["heat"]
+t0 = 0.0
+tf = 4.0
+inputs = { file = "plan.csv", time = "t", columns = { power = "power", sun = "sun" } }
+
+[[experiments.data]]
+file = "plan.csv"
+time = "t"
+columns = ["T"]
+sigma = 0.1
+"""
+
+DESIGN = """
+[design]
+criterion = "A"
+samples = { T = 3 }
+sensors = { T = 1.0 }
+budget = 2.0
+starts = 0
+
+[design.names]
+k = 0.1
+b = 0.5
+
+[design.free]
+power = [0.0, 1.5]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "model.py").write_text(MODEL)
+    (tmp_path / "problem.toml").write_text(PROBLEM + DESIGN)
+    (tmp_path / "plain.toml").write_text(PROBLEM)
+    rows = [f"{t},0,1.0,0.2" for t in np.linspace(0.0, 4.0, 9)]
+    (tmp_path / "plan.csv").write_text("\n".join(["t,T,power,sun", *rows]) + "\n")
+    return tmp_path
+
+
+def test_a_design_is_printed_and_written(folder):
+    out = folder / "out" / "deep"
+    result = run("design", folder / "problem.toml", "--out", out)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("A-optimal design of run1 for k, b.\n")
+    names = ["design.json", "design.png", "design.txt", "input.csv", "samples.csv"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert (out / "design.txt").read_text() == result.stdout
+    problem = load_problem(folder / "problem.toml").problem
+    plan = sf.design(problem, **tomllib.loads(DESIGN)["design"])
+    assert str(plan) == result.stdout.rstrip("\n")
+    np.testing.assert_array_equal(sf.read_log(out / "input.csv")["power"], plan.inputs["power"])
+    np.testing.assert_array_equal(sf.read_log(out / "input.csv").times, np.linspace(0.0, 4.0, 9))
+    rows = list(csv.DictReader((out / "samples.csv").read_text().splitlines()))
+    assert {row["sensor"] for row in rows} == {"T"}
+    np.testing.assert_array_equal([float(row["t"]) for row in rows], plan.sample_times["T"])
+    saved = json.loads((out / "design.json").read_text())["design"]
+    assert saved["sample_times"]["T"] == plan.sample_times["T"].tolist()
+
+
+def test_options_override_the_file(folder, monkeypatch):
+    given = catch_settings(monkeypatch, "design")
+    result = run("design", folder / "plain.toml", "--criterion", "E", "--samples", 5)
+    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
+    assert given == {"criterion": "E", "samples": 5}
+    run("design", folder / "problem.toml", "--criterion", "D")
+    assert (given["criterion"], given["samples"], given["budget"]) == ("D", {"T": 3}, 2.0)
+
+
+def test_json_and_what_cannot_be_estimated(folder):
+    (folder / "plan.csv").write_text((folder / "plan.csv").read_text().replace("1.0,0.2", "0.0,0.0"))
+    result = run("design", folder / "plain.toml", "--json")
+    assert result.exit_code == 1
+    assert "k, b cannot be estimated from such an experiment" in result.stderr
+    shown = json.loads(result.stdout)
+    assert (shown["theta_names"], shown["covariance"]) == (["k", "b"], [[None, None], [None, None]])
+
+
+def test_a_mistake_in_the_file_is_said_with_its_key(folder):
+    (folder / "problem.toml").write_text((PROBLEM + DESIGN).replace('criterion = "A"', 'criterion = "T"'))
+    result = run("design", folder / "problem.toml")
+    assert result.exit_code == 2
+    assert "design.criterion" in result.stderr

@@ -13,26 +13,24 @@ from pathlib import Path
 import jax
 import matplotlib
 import pytest
+from functions import FALLS_BACK
 from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
+from switchfit.engine.native import arrays, trace
 from switchfit.io.problem_file import load_problem
 
 matplotlib.use("agg")
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted(
-    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*/README.md")]
-)
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*/README.md")])
 
 #: Pages that take a second or more.
-HEAVY = {
-    *(f"{name}.md" for name in ("figures", "report", "sampling", "command-line", "how-many-switches")),
-    *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "many-runs", "guards", "design", "online")),
-    *(f"{name}.md" for name in ("convergence", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
-    "sharp.md",
-}
+HEAVY = (
+    "figures report sampling command-line how-many-switches uncertainty validation terrain many-runs guards design "
+    "online convergence what-now vehicles real-logs dates fishing husky sharp"
+)
 
 #: Blocks that are files and commands of one session; tests/test_first_ten_minutes.py runs them in order.
 SESSIONS = {"first-ten-minutes.md"}
@@ -48,19 +46,18 @@ def blocks_of(page):
 
 
 def pages_with(*kinds):
+    pages = [page for page in PAGES if page.name not in SESSIONS and {kind for kind, _ in blocks_of(page)} & {*kinds}]
+    slow = [[pytest.mark.slow] * (page.stem in HEAVY.split()) for page in pages]
     return [
-        pytest.param(page, id=page.relative_to(ROOT).as_posix(), marks=[pytest.mark.slow] * (page.name in HEAVY))
-        for page in PAGES
-        if page.name not in SESSIONS and any(kind in kinds for kind, _ in blocks_of(page))
+        pytest.param(page, id=str(page.relative_to(ROOT)), marks=mark) for page, mark in zip(pages, slow, strict=True)
     ]
 
 
 def commands_of(page):
     """Command lines of a page, without prompts, comments, and what commands print."""
-    blocks = blocks_of(page)
-    lines = [line for kind, block in blocks if kind == "sh" for line in block.splitlines()]
-    shown = [line for kind, block in blocks if kind == "console" for line in block.splitlines()]
-    lines += [line.removeprefix("$ ") for line in shown if line.startswith("$ ")]
+    blocks = [(kind, block) for kind, block in blocks_of(page) if kind in ("sh", "console")]
+    lines = [(kind, line) for kind, block in blocks for line in block.splitlines()]
+    lines = [line.removeprefix("$ ") for kind, line in lines if kind == "sh" or line.startswith("$ ")]
     return [command for line in lines if (command := shlex.split(line, comments=True))]
 
 
@@ -132,17 +129,53 @@ def test_messages_that_are_quoted_exist(name):
     assert not [part for part in parts if part not in read_texts()]
 
 
+# What has machine code, and what JAX has to do
+
+
+def rows_of(section):
+    """Rows of the table of a section: lists of cells."""
+    text = (ROOT / "docs" / "engines.md").read_text().split(f"## {section}\n")[1].split("\n## ")[0]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"][2:]
+
+
+def test_the_page_names_what_jax_has_to_do():
+    left = {name for _, examples in rows_of("JAX") for name in re.findall(r"`([^`]*)`", examples)}
+    reasons = [reason for reason in FALLS_BACK.values() if "(limit" not in reason]
+    called = {found[1] for reason in reasons if (found := re.match(r"calls ([\w.]+\w)", reason))}
+    assert len(called) > 10
+    assert not called - left
+
+
+def test_the_page_claims_machine_code_only_for_what_has_it():
+    written = {name for _, examples, _ in rows_of("Machine code") for name in re.findall(r"`([^`]*)`", examples)}
+    fallen = {name for name in written for why in FALLS_BACK.values() if f"calls {name}" in why and "(limit" not in why}
+    assert len(written) > 30
+    assert not fallen
+
+
+@pytest.mark.parametrize(
+    ("row", "limits"),
+    [
+        ("branches, loops", (trace.MOST_NODES,)),
+        ("tables of numbers", (arrays.MOST_ROWS_OF_TABLE,)),
+        ("tables of parameters", (arrays.MOST_CHOICES,)),
+        ("indices that depend", (arrays.MOST_CHOICES,)),
+        ("linear systems", (arrays.MOST_ROWS_TO_PIVOT,)),
+        ("Cholesky", (arrays.MOST_ROWS, arrays.MOST_KNOWN_ROWS)),
+        ("sorting", (arrays.MOST_SORTED,)),
+    ],
+)
+def test_the_limits_on_the_page_are_those_of_the_code(row, limits):
+    (cell,) = (limit for what, _, limit in rows_of("Machine code") if what.startswith(row))
+    assert tuple(map(int, re.findall(r"\d+", cell))) == limits
+
+
+# What is written, and how much of it
+
+
 def test_every_public_name_is_in_the_reference():
     listed = set(re.findall(r"^   (\w+)$", (ROOT / "docs" / "api.rst").read_text(), re.MULTILINE))
     assert set(sf.__all__) <= listed, "add them to docs/api.rst, each to its topic"
-
-
-def test_every_page_is_in_the_contents():
-    """A page that no list of contents names is not found; pages of results are included in others."""
-    contents = re.findall(r"^```\{toctree\}\n(.*?)^```$", (ROOT / "docs" / "index.md").read_text(), re.M | re.S)
-    named = {line for block in contents for line in block.splitlines() if line and not line.startswith(":")}
-    pages = {path.stem for path in (ROOT / "docs").glob("*.md") if not path.stem.endswith("-results")}
-    assert pages - {"index"} <= named
 
 
 def test_the_documentation_is_short():
@@ -190,13 +223,3 @@ def test_no_page_loads_anything_from_a_network(site):
         loaded = [tag for tag in tags if "rel=" not in tag or re.search(r'rel="[^"]*(stylesheet|icon|preload)', tag)]
         sources = [re.search(r'\b(?:src|href)="([^"]*)"', tag) for tag in loaded]
         assert not [source[1] for source in sources if source and "//" in source[1]], page.name
-
-
-@pytest.mark.slow
-def test_formulas_are_mathml(site):
-    """Also those that converters get wrong: 1/2 without braces, letters with dots and hats."""
-    page = (site / "how-it-works.html").read_text(encoding="utf-8")
-    assert re.search(r"<mfrac>(<mrow>)?<mn>1</mn>(</mrow><mrow>)?<mn>2</mn>(</mrow>)?</mfrac>", page)
-    assert page.count("<math") > 8
-    assert "\\frac" not in page.replace("annotation", "")
-    assert "MathJax" not in page

@@ -44,9 +44,7 @@ def exists(name):
     """Whether a name in See Also leads to something, from the package or from its root."""
     item = sf
     for part in name.removeprefix("switchfit.").split("."):
-        fields = getattr(item, "__annotations__", {}) if inspect.isclass(item) else {}
-        inherited = {field for base in getattr(item, "__mro__", ()) for field in getattr(base, "__annotations__", {})}
-        if part in fields or part in inherited:
+        if part in {field for base in getattr(item, "__mro__", ()) for field in getattr(base, "__annotations__", {})}:
             return True
         if not hasattr(item, part):
             return False

@@ -1,8 +1,9 @@
 """estimate(): truth recovered, constraints and kinks named, uncertainties in closed form, all ways to end."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import product
+from unittest.mock import Mock
 
 import jax.numpy as jnp
 import models
@@ -15,8 +16,9 @@ import switchfit as sf
 from switchfit.estimation import estimator
 from switchfit.estimation.local_fit import _drop_noise_of_times
 from switchfit.fit.accuracy import Follower
-from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
+from switchfit.paper.vehicle import build_simulated_problem
 from switchfit.runtime.errors import Issue
 
 # A capacitor that is charged through one resistor and discharged through another one
@@ -43,8 +45,8 @@ def voltage(times, tau=TRUTH[0], k=TRUTH[1:]):
     return np.where(times < tau, 1.0 - np.exp(-k[0] * times), at_tau * np.exp(-k[1] * (times - tau)))
 
 
-def noise(seed, size=40):
-    return SIGMA * np.random.default_rng(seed).normal(size=size)
+def noise(seed):
+    return SIGMA * np.random.default_rng(seed).normal(size=40)
 
 
 def run(values, tau=GUESS[0]):
@@ -59,7 +61,6 @@ def test_truth_from_noisy_samples():
     problem = capacitor(voltage(TIMES) + noise(0))
     found = sf.estimate(problem)
     assert found.status is sf.Status.CONVERGED
-    assert found.optimality < 1e-7
     assert np.all(np.abs(found.theta - TRUTH) < 4 * found.standard_errors)
     assert 0.5 < found.residual_variance < 2.0
     assert np.all(found.standard_errors < 0.1)
@@ -71,7 +72,6 @@ def test_truth_from_noisy_samples():
     fitted = found.comparisons[0][0].fitted[:, 0]
     np.testing.assert_allclose(fitted, voltage(TIMES, found.theta[0], found.theta[1:]), rtol=0, atol=1e-8)
     assert found.history[-1].theta.tolist() == found.theta.tolist()
-    assert [record.iteration for record in found.history] == list(range(found.iterations + 1))
 
 
 def test_a_bound_that_is_reached_is_named():
@@ -84,10 +84,8 @@ def test_a_bound_that_is_reached_is_named():
     assert found.verdict.reasons[-1] == Issue("at bounds", ("k[0]",))
     assert "k[0] at its upper bound 1.6" in found.message
     assert found.gradient[1] < -1.0
-    np.testing.assert_allclose(found.gradient[[0, 2]], 0.0, atol=1e-7)
     assert found.optimality < 1e-7
-    assert found.standard_errors[1] == 0.0
-    assert np.all(found.standard_errors[[0, 2]] > 0.0)
+    assert (found.standard_errors > 0.0).tolist() == [True, False, True]
 
 
 def test_a_minimum_duration_that_is_reached_is_named():
@@ -118,8 +116,7 @@ def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     assert found.theta[0] == 0.5
     (kink,) = found.kinks
     assert (kink.unknown, kink.value) == ("tau_1", 0.5)
-    assert kink.left == pytest.approx(-0.7, rel=1e-9)
-    assert kink.right == pytest.approx(0.3, rel=1e-9)
+    assert (kink.left, kink.right) == pytest.approx((-0.7, 0.3), rel=1e-9)
     assert "kink of the cost: tau_1 = 0.5, where the derivative jumps from -7.0e-01 to 3.0e-01" in found.message
     assert found.optimality < 1e-12
     assert found.standard_errors[0] == 0.0
@@ -133,20 +130,6 @@ def test_a_fit_that_passes_samples_does_not_stop_at_them():
 
 
 # Unknowns that the data does not determine
-
-
-def test_unknowns_that_trade_off_are_named():
-    values = np.exp(-1.4 * TIMES) + noise(4)
-    system = sf.HybridSystem({"decay": lambda t, x, p: -(p["a"] + p["b"]) * x}, [1.0])
-    data = sf.Measurements(TIMES, values, sigma=SIGMA)
-    found = sf.estimate(sf.Problem(system, sf.Experiment(data, ("decay",), (), 0.0, 2.0), {"a": 0.5, "b": 0.5}))
-    assert found.status is sf.Status.SINGULAR
-    for said in ("flat to second order along", "0.71 a", "0.71 b", "Fix one of them or add data"):
-        assert said in found.message
-    assert found.parameters["a"] + found.parameters["b"] == pytest.approx(1.4, abs=0.02)
-    (reason,) = found.verdict.reasons
-    assert (found.verdict.level, reason.kind, set(reason.subjects)) == ("doubtful", "not determined", {"a", "b"})
-    assert np.isnan(found.covariance).all()
 
 
 @pytest.mark.parametrize(("slope", "status"), [(1e-6, sf.Status.SINGULAR), (10.0, sf.Status.SADDLE)])
@@ -163,19 +146,14 @@ def test_a_time_is_not_determined_if_the_others_gain_nothing_as_it_moves(slope, 
 # Scales
 
 
-UNITS = {
-    "charge": lambda t, x, p: p["k"][0] * p["unit"] * (1.0 - x),
-    "discharge": lambda t, x, p: -p["k"][1] * p["unit"] * x,
-}
-
-
 def test_badly_scaled_unknowns_take_the_same_iterates():
     """Rates in units of 1e6 per second beside times in seconds, and rates of 1e6 in 1e-6 per second."""
     values = voltage(TIMES) + noise(6)
     histories = []
     for unit in (1.0, 1e6, 1e-6):
-        parameters = {"k": GUESS[1:] / unit, "unit": sf.Parameter(unit, fixed=True)}
-        found = sf.estimate(sf.Problem(sf.HybridSystem(UNITS, [0.0]), run(values), parameters))
+        in_unit = lambda mode, unit: lambda t, x, p: mode(t, x, {"k": p["k"] * unit})  # noqa: E731
+        modes = {name: in_unit(mode, unit) for name, mode in CAPACITOR.modes.items()}
+        found = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run(values), {"k": GUESS[1:] / unit}))
         assert found.success
         size = np.array([1.0, 1.0 / unit, 1.0 / unit])
         assert np.all(np.abs(found.theta / size - TRUTH) < 4 * found.standard_errors / size)
@@ -191,39 +169,29 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
 
 
 def test_a_callback_that_returns_true_and_ctrl_c_stop_the_fit_at_the_best_point_so_far():
-    records = []
-
-    def callback(record):
-        records.append(record)
-        return len(records) == 3
-
-    found = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=callback)
-    assert found.status is sf.Status.INTERRUPTED
-    assert not found.success
-    assert len(records) == 3
-    assert found.theta.tolist() == min(records, key=lambda record: record.cost).theta.tolist()
-    assert f"Interrupted after {found.iterations} iteration" in found.message
-
     def interrupt(record):
         if record.iteration == 2:
             raise KeyboardInterrupt
 
-    interrupted = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=interrupt)
-    assert interrupted.status is sf.Status.INTERRUPTED
-    assert interrupted.iterations == 2
-    assert interrupted.cost == min(record.cost for record in interrupted.history) < interrupted.history[0].cost
+    for callback in (lambda record: record.iteration == 2, interrupt):
+        found = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=callback)
+        assert found.status is sf.Status.INTERRUPTED
+        assert not found.success
+        assert found.iterations == 2
+        best = min(found.history, key=lambda record: record.cost)
+        assert (found.cost, found.theta.tolist()) == (best.cost, best.theta.tolist())
+        assert best.cost < found.history[0].cost
+        assert "Interrupted after 2 iterations" in found.message
 
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
-    simulated = []
-    compare = estimator.compare
-    monkeypatch.setattr(estimator, "compare", lambda *at: simulated.append(at) or compare(*at))
+    simulate = Mock(side_effect=estimator.compare)
+    monkeypatch.setattr(estimator, "compare", simulate)
     fit = sf.estimate(capacitor(voltage(TIMES)))
-    assert fit.status.successful
-    assert not simulated
+    simulate.assert_not_called()
     assert fit.trajectories is fit.trajectories
     assert replace(fit, seconds=0.0).comparisons is fit.comparisons
-    assert len(simulated) == 1
+    simulate.assert_called_once()
     with pytest.raises(AttributeError, match="no attribute 'trajectorys'"):
         fit.trajectorys  # noqa: B018
 
@@ -258,10 +226,10 @@ def test_times_out_of_order_by_rounding_are_put_in_order():
 
 
 def with_a_mode_too_many(sequence, times):
-    modes = {"charge": charge, "discharge": discharge, "drain": lambda t, x, p: 0.0 * x - p["leak"]}
+    system = replace(CAPACITOR, modes={**CAPACITOR.modes, "drain": lambda t, x, p: 0.0 * x - p["leak"]})
     data = sf.Measurements(TIMES, voltage(TIMES) + noise(1), sigma=SIGMA)
     parameters = {"k": GUESS[1:], "leak": sf.Parameter(1.0, lower=0.1, upper=5.0)}
-    return sf.Problem(sf.HybridSystem(modes, [0.0]), sf.Experiment(data, sequence, times, 0.0, 2.0), parameters)
+    return sf.Problem(system, sf.Experiment(data, sequence, times, 0.0, 2.0), parameters)
 
 
 def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
@@ -282,7 +250,6 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     text = " ".join(found.report(full=True).split())
     for unsaid in ("not identified", "Fix one of", "add data", "hardly determine", "NOT UNIQUE"):
         assert unsaid not in text
-    assert "because a mode has collapsed" in " ".join(str(found.identifiability).split())
 
 
 def test_a_parameter_that_acts_only_in_a_mode_that_collapsed_at_the_start_is_named():
@@ -365,23 +332,10 @@ def test_covariance_of_a_linear_model_in_closed_form(known):
 # The mesh
 
 
-def follow(t, x, p):
-    return p["k"] * (jnp.cos(t) - x)
-
-
-def followed(times, k):
-    """x(t) of x' = k (cos t - x) from 0."""
-    return (k**2 * np.cos(times) + k * np.sin(times) - k**2 * np.exp(-k * times)) / (1.0 + k**2)
-
-
 @cache
 def refined_fit():
     """The guess is slow, the truth fast: the mesh of the guess is too coarse for it."""
-    times = np.linspace(0.4, 4.0, 10)
-    values = followed(times, 8.0) + noise(10, 10)
-    system = sf.HybridSystem({"follow": follow}, [0.0])
-    experiment = sf.Experiment(sf.Measurements(times, values, sigma=SIGMA), ("follow",), (), 0.0, 4.0)
-    return sf.estimate(sf.Problem(system, experiment, {"k": 1.0}, rtol=1e-5, atol=1e-7))
+    return sf.estimate(models.slow_guess(8.0, 10))
 
 
 @pytest.mark.usefixtures("quick_certificates")
@@ -399,47 +353,11 @@ def test_the_mesh_is_refined_where_the_solution_needs_it():
     assert abs(rough - fine) > 1e-3 * fine
     assert found.cost == pytest.approx(fine, rel=2e-5)
     times, values = found.comparisons[0][0].times, found.comparisons[0][0].measured[:, 0]
-    exact = scipy.optimize.least_squares(lambda k: (followed(times, k[0]) - values) / SIGMA, [7.0], xtol=1e-14)
+    exact = scipy.optimize.least_squares(lambda k: (models.followed(times, *k) - values) / SIGMA, [7.0], xtol=1e-14)
     assert found.theta[0] == pytest.approx(exact.x[0], rel=1e-5)
     assert [record.iteration for record in found.history] == list(range(len(found.history)))  # over all meshes
     assert found.iterations == found.history[-1].iteration > found.earlier_iterations > 0
     assert np.all(np.diff([record.evaluations for record in found.history]) > 0)
-
-
-# A tank that runs dry inside the last mode: the root of its level has no derivative there, whatever the mesh
-
-
-def run_dry(t, x, p):
-    level = jnp.where(x[0] > 0.0, x[0], 1.0)
-    return jnp.array([jnp.where(x[0] > 0.0, -p["k"] * jnp.sqrt(level), 0.0)])
-
-
-def level_of_tank(times, theta):
-    """x(t) in closed form: the root of the level falls at the rate k/2 while the valve is open, down to zero."""
-    opened, closed, again, k = theta
-    open_for = np.clip(times, opened, closed) - opened + np.maximum(times - again, 0.0)
-    return np.maximum(np.sqrt(2.0) - 0.5 * k * open_for, 0.0) ** 2
-
-
-@pytest.mark.parametrize(
-    ("sigma", "seed"), [*(pytest.param(*given, marks=pytest.mark.slow) for given in ((0.01, 1), (0.05, 2))), (0.05, 0)]
-)
-def test_a_tank_that_runs_dry(sigma, seed):
-    """J has kinks and jumps of the size of its integration error: a search does not creep along one of them."""
-    tank = sf.HybridSystem({"closed": lambda t, x, p: 0.0 * x, "open": run_dry}, [2.0])
-    times = np.linspace(0.0, 20.0, 61)[1:]
-    values = level_of_tank(times, (3.0, 7.0, 11.0, 0.45)) + sigma * np.random.default_rng(seed).normal(size=60)
-    data = sf.Measurements(times, values[:, None], sigma=sigma)
-    valve = sf.Experiment(data, ("closed", "open", "closed", "open"), (3.5, 6.5, 10.5), 0.0, 20.0)
-    found = sf.estimate(sf.Problem(tank, valve, {"k": sf.Parameter(0.4, lower=0.01)}), strategy="local")
-    exact = scipy.optimize.least_squares(
-        lambda theta: (level_of_tank(times, theta) - values) / sigma, found.theta, xtol=1e-14, ftol=1e-14
-    )
-    assert found.iterations < 200
-    assert found.status is not sf.Status.MAX_ITERATIONS
-    assert found.cost == pytest.approx(exact.cost, abs=1e-4)
-    errors = np.sqrt(np.linalg.inv(exact.jac.T @ exact.jac).diagonal())
-    assert (np.abs(found.theta - exact.x) < 0.02 * errors).all()
 
 
 def test_a_minimum_to_the_accuracy_of_its_cost_has_converged():
@@ -453,3 +371,116 @@ def test_a_minimum_to_the_accuracy_of_its_cost_has_converged():
     assert almost.cost - best.cost < almost.integration_error * best.cost
     assert almost.verdict.level == best.verdict.level == "good"
     assert "below the error of the cost" in almost.message
+
+
+# What is said about the integration error: of every output that a problem contains, and against finer meshes
+
+
+def pendulum(torque):
+    """Angle, angular velocity and a clock."""
+    return lambda t, x, p: jnp.stack([x[1], torque - jnp.sin(x[0]) - 0.1 * x[1] ** 2, 1.0 + 0 * x[0]])
+
+
+def fastest_swing(begin=0.0, **settings):
+    """From rest at 0 to rest at 2 rad in the shortest time: J is a clock, which every mesh integrates exactly."""
+    modes = {"push": pendulum(1.5), "brake": pendulum(-1.5), "done": lambda t, x, p: jnp.zeros(3)}
+    costs = [sf.TerminalCost(lambda x, p: x[2]), sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] - 2.0, x[1]]))]
+    times = (begin + 3.0, begin + 4.0)
+    run = sf.Experiment(costs, ("push", "brake", "done"), times, begin, begin + 20.0)
+    return sf.Problem(sf.HybridSystem(modes, np.zeros(3)), run, **settings)
+
+
+fit_locally = partial(sf.estimate, strategy="local")
+"""A cost without data is otherwise fitted from many starts, which all end here."""
+
+
+@cache
+def swing():
+    return fit_locally(fastest_swing())
+
+
+def misses(theta, begin=0.0):
+    """By how much the end is really missed: (angle, angular velocity)."""
+    return Evaluator(fastest_swing(begin, rtol=1e-13, atol=1e-15), theta).constrained(theta).constraints
+
+
+def test_the_mesh_is_refined_for_terminal_constraints():
+    fit = swing()
+    assert fit.success
+    np.testing.assert_allclose(misses(fit.theta), 0.0, rtol=0, atol=1e-8)
+    assert 1e-13 < fit.integration_error < 1e-8
+
+
+@pytest.mark.usefixtures("quick_certificates")
+def test_the_error_that_is_reported_is_that_of_the_end():
+    """With a coarse mesh, what is reported is by how much the end is missed, over the range of angle or velocity."""
+    fit = fit_locally(fastest_swing(rtol=1e-4, atol=1e-6))
+    ranges = np.ptp(fit.trajectory.states, axis=0)[:2]
+    errors = np.abs(misses(fit.theta) - [c for _, c, _ in fit.constraints]) / ranges
+    worst = int(np.argmax(errors))
+    assert fit.integration_error_of == f"terminal constraint {worst + 1}"
+    assert fit.integration_error == pytest.approx(errors[worst], rel=0.1)
+    assert f"{fit.integration_error:.1e}   (of terminal constraint {worst + 1}, relative" in str(fit)
+    assert f"the integration error of terminal constraint {worst + 1} is" in str(fit.certificate.failures[0])
+
+
+def test_the_error_does_not_depend_on_where_time_begins():
+    theta = swing().theta
+    early, late = (
+        sf.estimate(fastest_swing(t0, rtol=1e-4), start=theta + t0, max_iterations=0) for t0 in (0.0, 1024.0)
+    )
+    assert early.integration_error_of.startswith("terminal constraint")
+    assert late.integration_error_of == early.integration_error_of
+    assert late.integration_error == pytest.approx(early.integration_error, rel=1e-6)
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+def test_a_fit_from_a_start_judges_its_meshes_as_the_problem_s_own(rtol):
+    """Only the problem's own meshes are tried with halved cells first; what is reported is by halved rows."""
+    problem = fastest_swing(rtol=rtol)
+    own, given = fit_locally(problem), fit_locally(problem, start=problem.initial_theta)
+    assert given.integration_error == pytest.approx(own.integration_error, rel=1e-6)
+    np.testing.assert_allclose(given.theta, own.theta, rtol=1e-12)
+    assert given.iterations == own.iterations
+
+
+def test_the_mesh_is_refined_for_guards():
+    """J looks at the first state alone, which is a line; the guard hangs on a state that is not."""
+    fast = lambda t, x, p: jnp.stack([1.0 + 0 * x[0], p["w"] * x[2], -p["w"] * x[1]])  # noqa: E731
+    slow = lambda t, x, p: jnp.stack([0.1 + 0 * x[0], 0 * x[1], 0 * x[2]])  # noqa: E731
+    system = sf.HybridSystem({"a": fast, "b": slow}, [0.0, 0.0, 1.0], guards={("a", "b"): lambda t, x, p: x[1]})
+    w = 11.0
+    crossing = 6 * np.pi / w
+    data = sf.Measurements([0.5, 4.0], [[0.5], [crossing + 0.1 * (4.0 - crossing)]], lambda t, x, p: x[:1], sigma=0.1)
+    run = sf.Experiment(data, ("a", "b"), (1.7,), 0.0, 4.0)
+    loose = sf.Problem(system, run, {"w": sf.Parameter(w, fixed=True)}, rtol=1e-5, atol=1e-7)
+    fit = fit_locally(loose)
+    assert fit.success
+    assert fit.integration_error_of == "guard of tau_1 (a -> b)"
+    assert 0.0 < fit.integration_error < 1e-5
+    assert 0.0 < abs(fit.theta[0] - crossing) < 1e-5
+
+
+# What the defaults promise: J to some 1e-8, its derivatives to some 1e-7, and the solution to 1e-8
+
+
+AWAY = np.array([0.03, 0.02, 0.001])
+
+
+@pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), tuple(models.VEHICLE_TRUTH + AWAY)])
+def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
+    """The paper's problem on its reference of 0.1 s; the last theta is near the solution, where J almost vanishes."""
+    problem, theta = build_simulated_problem(), np.array(theta)
+    found = Evaluator(problem, theta)(theta)
+    exact = Evaluator(problem, theta).divide(4)(theta)
+    error = np.linalg.norm(found.gradient - exact.gradient) / np.linalg.norm(exact.gradient)
+    assert 1e-9 < error < 2e-7
+    assert np.linalg.norm(found.hessian - exact.hessian) / np.linalg.norm(exact.hessian) < 1e-7
+
+
+def test_default_tolerances_give_the_solution_to_1e_8():
+    fit = sf.estimate(build_simulated_problem())
+    exact = sf.estimate(sf.Problem(fit.problem.system, fit.problem.experiments, fit.problem.parameters, rtol=1e-12))
+    assert fit.success
+    assert exact.success
+    np.testing.assert_allclose(fit.theta, exact.theta, rtol=1e-8, atol=0)

@@ -5,11 +5,6 @@ from __future__ import annotations
 import re
 
 
-def squeezed(text: str) -> str:
-    """White space left out: longer units break lines and widen columns elsewhere."""
-    return re.sub(r"\s", "", text)
-
-
 def without_wall_time(text: str) -> str:
     """Seconds of the clock on the wall left out: they are never the same, and seconds whatever the unit of the log."""
     text = re.sub(r"(evaluations?),\s+[\d.e+-]+\s+s\b", r"\1", text)
