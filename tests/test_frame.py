@@ -1,60 +1,45 @@
 """The layout of XLA's frames that machine code reads, against the header of the JAX that is installed."""
 
-from __future__ import annotations
-
-import ctypes
 import re
 from pathlib import Path
 
 import jax
+import pytest
 
 from switchfit.engine.native import program
 
 HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
 
-WORDS = {"size_t": ctypes.c_size_t, "int64_t": ctypes.c_int64, "int32_t": ctypes.c_int32, "int": ctypes.c_int}
+
+def fields_of(name):
+    """Names of the fields of a struct, in order."""
+    body = re.search(rf"struct XLA_FFI_{name} \{{(.*?)\n\}}[^;]*;", HEADER, re.S)[1]
+    code = re.sub(r"//[^\n]*|/\*.*?\*/", "", body, flags=re.S)
+    return [declaration.split()[-1] for declaration in code.split(";") if declaration.strip()]
 
 
-def structure(name: str) -> type[ctypes.Structure]:
-    """A struct of the header as ctypes has it: pointers, integers, enumerations, and structs in it."""
-    body = re.search(rf"struct XLA_FFI_{name} \{{(.*?)\n\}}[^;]*;", HEADER, re.S)
-    assert body is not None, f"the header has no struct {name}"
-    code = re.sub(r"//[^\n]*|/\*.*?\*/", "", body[1], flags=re.S)
-    fields = []
-    for declaration in filter(None, (part.strip() for part in code.split(";"))):
-        kind, field = declaration.rsplit(maxsplit=1)
-        fields.append((field, kind_of(kind.removeprefix("struct ").removeprefix("const "))))
-    return type(name, (ctypes.Structure,), {"_fields_": fields})
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [  # up to the last one that is read; each takes eight bytes, but `args` in a frame, a struct of five such
+        ("CallFrame", "struct_size extension_start api ctx stage args rets"),
+        ("Args", "struct_size extension_start size types args"),
+        ("Rets", "struct_size extension_start size types rets"),
+        ("Buffer", "struct_size extension_start dtype data rank dims"),
+        ("Extension_Base", "struct_size type next"),
+        ("Metadata_Extension", "extension_base metadata"),
+        ("Metadata", "struct_size api_version traits"),
+        ("Api_Version", "struct_size extension_start major_version minor_version"),
+    ],
+)
+def test_structs_have_the_fields_of_which_the_offsets_are_known(name, fields):
+    assert fields_of(name)[: len(fields.split())] == fields.split()
 
 
-def kind_of(kind: str):
-    if kind.endswith("*"):
-        return ctypes.c_void_p
-    if kind in WORDS:
-        return WORDS[kind]
-    if re.search(rf"struct {kind} \{{", HEADER):
-        return structure(kind.removeprefix("XLA_FFI_"))
-    if re.search(rf"typedef uint32_t {kind};", HEADER):
-        return ctypes.c_uint32
-    assert re.search(rf"\}} {kind};", HEADER), f"the header has no {kind}"
-    return ctypes.c_int  # an enumeration
-
-
-def test_what_is_read_stands_where_the_header_says():
-    call, buffer = structure("CallFrame"), structure("Buffer")
-    assert call.extension_start.offset == program.EXTENSION
-    assert call.args.offset + structure("Args").args.offset == program.ARGUMENTS
-    assert call.rets.offset + structure("Rets").rets.offset == program.RESULTS
-    assert (buffer.data.offset, buffer.dims.offset) == (program.DATA, program.DIMENSIONS)
-    assert structure("Extension_Base").type.offset == 8
-    assert structure("Metadata_Extension").metadata.offset == 24
-    metadata, version = structure("Metadata"), structure("Api_Version")
-    assert metadata.api_version.offset + version.major_version.offset == 24
-    assert metadata.api_version.offset + version.minor_version.offset == 28
-    assert metadata.traits.offset == 32
-
-
-def test_the_version_of_the_interface_is_one_that_xla_takes():
+def test_the_offsets_and_the_version_are_those_of_the_header():
+    args, rets = (8 * fields_of(name).index(name.lower()) for name in ("Args", "Rets"))
+    assert 8 * fields_of("CallFrame").index("extension_start") == program.EXTENSION
+    assert (5 * 8 + args, 5 * 8 + 5 * 8 + rets) == (program.ARGUMENTS, program.RESULTS)
+    assert [8 * fields_of("Buffer").index(name) for name in ("data", "dims")] == [program.DATA, program.DIMENSIONS]
     major, minor = (int(re.search(rf"#define XLA_FFI_API_{name} (\d+)", HEADER)[1]) for name in ("MAJOR", "MINOR"))
     assert major == program.MAJOR
     assert minor >= program.MINOR

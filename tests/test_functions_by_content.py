@@ -139,8 +139,7 @@ def test_constants_are_copied_when_a_problem_is_built(shape):
     built = problem_of(lambda t, x, p: -np.ravel(g)[0] * jnp.sum(jnp.asarray(g)) * p["a"] * x)
     expected = sf.evaluate(problem_of(lambda t, x, p: -1.37 * (1.37 * g.size) * p["a"] * x)).cost
     g[...] = 5.0
-    assert sf.evaluate(built, method="forward").cost == pytest.approx(expected, rel=1e-12)
-    assert sf.evaluate(built).cost == pytest.approx(expected, rel=1e-12)
+    assert [sf.evaluate(built, method=method).cost for method in ("forward", "auto")] == pytest.approx([expected] * 2, rel=1e-12)
 
 
 def test_a_rule_for_derivatives_that_has_changed_is_another_function():
@@ -168,21 +167,14 @@ def test_functions_made_anew_share_their_programs():
         return problem_of(lambda t, x, p: -number * p["a"] * x, observe=lambda t, x, p: x[rows])
 
     one, other, different = made(1.0), made(1.0), made(np.nextafter(1.0, 2.0))
-    assert one.structures == other.structures
+    assert one.structures == other.structures != different.structures
     assert hash(one.structures) == hash(other.structures)
-    assert one.structures[0].modes[0] is other.structures[0].modes[0]
-    assert one.structures != different.structures
-
-
-def test_runs_with_functions_of_their_own_are_one_program():
-    runs = [problem_of(lambda t, x, p: x, observe=lambda t, x, p: x[:1]).experiments[0] for _ in range(3)]
     system = sf.HybridSystem({"fall": lambda t, x, p: -p["a"] * x}, [1.0])
-    assert sf.Problem(system, runs, {"a": 1.0}).alike == ((0, 1, 2),)
+    assert sf.Problem(system, [each.experiments[0] for each in (one, other)], {"a": 1.0}).alike == ((0, 1),)
 
 
 CHANGES = (
     lambda x, p: x - p["a"],
-    lambda x, p: p["a"] - x,
     lambda x, p: x - p["b"],
     lambda x, p: x + p["a"],
     lambda x, p: x - p["a"] * 1.0000000000000002,
@@ -191,10 +183,8 @@ CHANGES = (
     lambda x, p: jnp.roll(x, 1) - p["a"],
     lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x - p["a"], x),
     lambda x, p: jax.lax.fori_loop(0, 3, lambda k, x: x - p["a"], x),
-    lambda x, p: jax.lax.fori_loop(0, 2, lambda k, x: x + p["a"], x),
     lambda x, p: jnp.where(x > 0.0, x, p["a"]),
     lambda x, p: jnp.where(x >= 0.0, x, p["a"]),
-    lambda x, p: jax.nn.relu(x) - p["a"],
     lambda x, p: jax.nn.silu(x) - p["a"],
     lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[:, None], x) - p["a"],
     lambda x, p: jnp.linalg.solve(jnp.eye(2) + x[None, :], x) - p["a"],
@@ -260,7 +250,7 @@ def test_values_of_different_types_are_different():
 # A problem that travels
 
 
-def test_a_problem_that_is_pickled_is_the_same():
+def test_a_problem_that_is_pickled_is_the_same_or_is_refused_if_its_functions_have_changed():
     g = np.array([1.0])
     problem = problem_of(lambda t, x, p: -g * p["a"] * x)
     expected = sf.evaluate(problem).cost
@@ -268,11 +258,6 @@ def test_a_problem_that_is_pickled_is_the_same():
     assert travelled.structures == problem.structures
     assert "evaluator" not in travelled.__dict__, "it travels without its programs"
     assert sf.evaluate(travelled).cost == expected
-
-
-def test_a_problem_whose_functions_have_changed_is_not_pickled_in_silence():
-    g = np.array([1.0])
-    problem = problem_of(lambda t, x, p: -g * p["a"] * x)
     g[0] = 2.0
     blob = cloudpickle.dumps(problem)
     with pytest.raises(ValueError, match=r"mode 'fall' does something else .* Build the problem anew"):

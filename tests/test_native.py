@@ -20,7 +20,7 @@ import switchfit as sf
 from switchfit.engine.native import llvm
 from switchfit.engine.native import program as program_module
 from switchfit.engine.native.program import drop_programs
-from switchfit.engine.native.scalars import Graph, Node
+from switchfit.engine.native.scalars import Graph
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 
 # Functions as scalars
@@ -29,9 +29,8 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 def test_structural_zeros_and_repetitions_are_gone():
     graph = Graph()
     x, y = graph.load("x", 0), graph.load("x", 1)
-    assert (x * 0.0).number == 0.0
-    assert x * 1.0 is x
-    assert x + 0.0 is x
+    assert (x * 0.0).number == (graph.unit(0) * 0.0).number == 0.0
+    assert x * 1.0 is x + 0.0 is x
     assert x * y is y * x
     assert (-x) * y is -(x * y)
     assert graph.apply("neg", -x) is x
@@ -39,8 +38,6 @@ def test_structural_zeros_and_repetitions_are_gone():
     before = len(graph.nodes)
     assert x * y + x * y is x * y + x * y
     assert len(graph.nodes) == before + 1
-    assert (graph.unit(0) * 0.0).number == 0.0
-    assert isinstance(graph.unit(0) * x, Node)
     assert (graph.unit(0) * x).vector
 
 
@@ -64,37 +61,28 @@ def test_threads_do_not_disturb_one_another():
 
 
 def test_machine_code_is_kept_and_read_again(tmp_path, monkeypatch):
-    monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path))
-    module = llvm.Module(2)
-    graph = Graph()
-    module.write_straight_line("f", [("x", 1, graph.load("x", 0) * 3.0)])
-
+    module, parse = llvm.Module(2), llvm.llvm.parse_assembly
+    module.write_straight_line("f", [("x", 1, Graph().load("x", 0) * 3.0)])
     text = module.take()
 
-    def tripled():
+    def triple(cache, parse=parse):
+        monkeypatch.setenv("SWITCHFIT_CACHE", str(cache))
+        monkeypatch.setattr(llvm.llvm, "parse_assembly", parse)
         x = np.array([2.0, 0.0])
         program = llvm.compile_modules([text])
         program.function("f", llvm.ctypes.c_void_p)(x.ctypes.data)
         return x[1]
 
-    assert tripled() == 6.0
-    (file,) = tmp_path.glob("native-*")
-    monkeypatch.setattr(llvm.llvm, "parse_assembly", _only_empty(llvm.llvm.parse_assembly))
-    assert tripled() == 6.0, "read, not compiled again"
-    monkeypatch.undo()
-    monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path))
-    file.write_bytes(file.read_bytes()[:-100])
-    assert tripled() == 6.0, "a damaged file is compiled anew"
-    monkeypatch.setenv("SWITCHFIT_CACHE", "off")
-    assert tripled() == 6.0
-
-
-def _only_empty(parse):
-    def checked(text):
+    def parse_nothing(text):
         assert text == ""
         return parse(text)
 
-    return checked
+    assert triple(tmp_path) == 6.0
+    (file,) = tmp_path.glob("native-*")
+    assert triple(tmp_path, parse_nothing) == 6.0, "read, not compiled again"
+    file.write_bytes(file.read_bytes()[:-100])
+    assert triple(tmp_path) == 6.0, "a damaged file is compiled anew"
+    assert triple("off") == 6.0
 
 
 # Which engine, and why
@@ -114,7 +102,7 @@ SAMPLES = sf.Measurements(TIMES, np.stack([np.sin(TIMES), np.cos(TIMES)], 1), si
 
 def problem_with(mode, data=SAMPLES, **settings):
     run = sf.Experiment(data, ("m",), (), 0.0, 3.0)
-    return sf.Problem(sf.HybridSystem({"m": mode}, [0.4, 0.1]), run, {"k": sf.Parameter(1.0)}, **settings)
+    return sf.Problem(sf.HybridSystem({"m": mode}, [0.4, 0.1]), run, {"k": 1.0}, **settings)
 
 
 @pytest.mark.parametrize("mode", [copied, pytest.param(inner_copied, marks=pytest.mark.slow)])
@@ -123,15 +111,13 @@ def test_an_estimate_says_which_line_of_the_model_has_no_machine_code(mode, tmp_
     drop_programs()
     with caplog.at_level(logging.INFO, "switchfit"):
         estimate = sf.estimate(problem_with(mode), max_iterations=1)
-    where = f"(test_native.py:{inspect.getsourcelines(mode)[1] + 1})"
-    reason = f"mode 'm' calls jnp.copysign {where}"
+    reason = f"mode 'm' calls jnp.copysign (test_native.py:{inspect.getsourcelines(mode)[1] + 1})"
     assert (estimate.engine.name, estimate.engine.reason) == ("jax", reason)
     assert " ".join(str(estimate).split()).count(f"Evaluated by JAX: {reason}.") == 1
     said = [record.getMessage() for record in caplog.records if record.name == "switchfit"]
     # Once a program: without derivatives beside them, and with first ones; of the mode, and of its branches.
     assert f"Evaluated by JAX: {reason}." in said
     assert len(said) <= 4
-    assert all(each.endswith(f"{where}.") for each in said)
     estimate.save(tmp_path / "fit.json")
     assert sf.Estimate.load(tmp_path / "fit.json").engine == estimate.engine
 
@@ -191,11 +177,8 @@ def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
 
     drop_programs()
     monkeypatch.setattr(program_module, place, fails)
-    estimate = sf.estimate(problem_with(decay), max_iterations=1)
-    assert estimate.engine.name == "jax"
-    assert estimate.engine.reason == f"internal: {type(error).__name__}: {error}"
-    assert estimate.iterations == 1
-    monkeypatch.undo()
+    engine = sf.estimate(problem_with(decay), max_iterations=1).engine
+    assert (engine.name, engine.reason) == ("jax", f"internal: {type(error).__name__}: {error}")
     drop_programs()
 
 
@@ -206,7 +189,7 @@ def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
     waiting, release, done = threading.Event(), threading.Event(), []
     parse, wait = llvm.llvm.parse_assembly, llvm.wait
 
-    def slow(text):
+    def parse_slowly(text):
         release.wait(60.0)
         done.append(True)
         return parse(text)
@@ -215,17 +198,15 @@ def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
         waiting.set()
         return wait(*given, **settings)
 
-    def ctrl_c():
+    def press_ctrl_c():
         waiting.wait()
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
-    monkeypatch.setattr(llvm.llvm, "parse_assembly", slow)
+    monkeypatch.setattr(llvm.llvm, "parse_assembly", parse_slowly)
     monkeypatch.setattr(llvm, "wait", wait_seen)
-    problem = problem_of("plain")
-    threading.Thread(target=ctrl_c).start()
+    threading.Thread(target=press_ctrl_c).start()
     with pytest.raises(KeyboardInterrupt):
-        Evaluator(problem)
+        Evaluator(problem_of("plain"))
     assert not done, "not heard before the code was there"
     release.set()
-    monkeypatch.undo()
     drop_programs()
