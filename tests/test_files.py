@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,44 +14,24 @@ from switchfit.batch.chunks import run_chunks
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 from switchfit.runtime.files import write_atomically
 
-SOURCE = Path(__file__).parent.parent / "src"
-
-
-def start(program, argument):
-    """A Python process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(SOURCE)}
-    return subprocess.Popen(
-        [sys.executable, "-c", program, argument], env=environment, stdout=subprocess.PIPE, text=True
-    )
-
-
 # --- one writer -------------------------------------------------------------------------------------------------------
 
-SLOW_WRITER = """
-import os, sys, time
-from pathlib import Path
-from switchfit.runtime import files
-def sync(handle):
-    print("writing", flush=True)
-    time.sleep(60.0)
-os.fsync = sync
-files.write_atomically(b"new" * 1000, Path(sys.argv[1]))
-"""
 
-
-def test_a_killed_process_leaves_the_old_file(tmp_path):
-    """And another process, which writes while this one does, leaves the file alone that is not yet whole."""
-    path = tmp_path / "a.json"
+def test_the_old_file_is_there_until_the_new_one_is_whole(tmp_path, monkeypatch):
+    """So a process that is killed leaves it; and another process that writes leaves the file that is not yet whole."""
+    path, sync = tmp_path / "a.json", os.fsync
     path.write_text("old")
-    process = start(SLOW_WRITER, path)
-    assert process.stdout.readline() == "writing\n"
-    write_atomically("other", tmp_path / "b.json")
-    assert len(list(tmp_path.iterdir())) == 3
-    process.kill()
-    process.communicate()
-    assert path.read_text() == "old"
+
+    def look_around(handle):
+        monkeypatch.setattr(os, "fsync", sync)
+        write_atomically("other", tmp_path / "b.json")
+        assert len(list(tmp_path.iterdir())) == 3
+        assert path.read_text() == "old"
+
+    monkeypatch.setattr(os, "fsync", look_around)
     write_atomically("new", path)
     assert path.read_text() == "new"
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_links_devices_and_permissions(tmp_path):

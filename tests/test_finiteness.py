@@ -80,7 +80,6 @@ def test_a_line_search_that_failed_beside_what_is_undefined_says_so():
     assert found.status is sf.Status.LINE_SEARCH_FAILED
     assert f"log at test_finiteness.py:{mode.__code__.co_firstlineno + 1} is not finite" in found.message
     assert "mode 'm' has no finite value at t = 4, x = [" in str(found.verdict)
-    assert "kink" not in found.message
 
 
 def test_a_guess_that_cannot_be_integrated_names_the_operation():
@@ -106,16 +105,15 @@ def test_an_observation_is_named_at_its_samples_alone():
     def observe(t, x, p):
         return jnp.linalg.norm(x)[None]
 
-    later = make_problem(mode, TIMES[:, None], {"u": 1.0}, x0=(0.0, 0.0), observe=observe)
-    assert explain(later) is None
-    assert np.isfinite(sf.evaluate(later).gradient).all()
-    times = np.append(0.0, TIMES)
-    issue = explain(make_problem(mode, times[:, None], {"u": 1.0}, x0=(0.0, 0.0), times=times, observe=observe))
+    def build(times):
+        return make_problem(mode, times[:, None], {"u": 1.0}, x0=(0.0, 0.0), times=times, observe=observe)
+
+    assert explain(build(TIMES)) is None
+    issue = explain(build(np.append(0.0, TIMES)))
     line = observe.__code__.co_firstlineno + 1
     assert issue.subjects == ("observe 1", "jnp.linalg.norm", f"test_finiteness.py:{line}", "")
-    assert (issue.figures["t"], issue.figures["x"]) == (0.0, (0.0, 0.0))
-    assert issue.figures["valued"] == 1.0
-    assert "keep it from 0, as jnp.sqrt(jnp.sum(x**2) + 1e-12)" in str(issue).replace("Keep", "keep")
+    assert (issue.figures["t"], issue.figures["x"], issue.figures["valued"]) == (0.0, (0.0, 0.0), 1.0)
+    assert "eep it from 0, as jnp.sqrt(jnp.sum(x**2) + 1e-12)" in str(issue)
 
 
 def test_modes_with_inputs_and_the_second_of_two_modes():
@@ -125,14 +123,12 @@ def test_modes_with_inputs_and_the_second_of_two_modes():
     def empty(t, x, p, u):
         return -p["k"] * jnp.sqrt(u["flow"] - 1.0) * x
 
-    flow = sf.Input([0.0, 4.0], {"flow": [2.0, 0.0]}, kind="linear")
-    problem = make_problem({"fill": fill, "empty": empty}, TIMES, {"k": 1.0}, inputs=flow)
-    with pytest.raises(NotIntegrableError, match=r"mode 'empty' returned .* \(sqrt at test_finiteness.py"):
-        sf.estimate(problem, strategy="local")
-
     def drip(t, x, p, u):
         return -p["k"] * (jnp.maximum(u["flow"] - 1.0, 0.0) * x) ** 0.5
 
+    flow = sf.Input([0.0, 4.0], {"flow": [2.0, 0.0]}, kind="linear")
+    with pytest.raises(NotIntegrableError, match=r"mode 'empty' returned .* \(sqrt at test_finiteness.py"):
+        sf.evaluate(make_problem({"fill": fill, "empty": empty}, TIMES, {"k": 1.0}, inputs=flow))
     issue = explain(make_problem({"fill": fill, "drip": drip}, TIMES, {"k": 1.0}, inputs=flow))
     assert issue.subjects[:2] == ("mode 'drip'", "pow")
     assert issue.figures["t"] >= 2.0

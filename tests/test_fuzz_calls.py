@@ -107,19 +107,8 @@ BAD = [*TEXTS, *NUMBERS, *DATES, *ARRAYS, *LISTS, *TABLES, *OBJECTS, *OWN]
 WORDS = (
     *("at t =", "bound", "channel", "column", "cost", "entries", "estimate", "experiment", "file", "folder", "guard"),
     *("input", "jump", "known over", "latitude", "mode", "name", "observe", "parameter", "reach", "reset", "rows"),
-    *(
-        "samples",
-        "scale of",
-        "sf.problem",
-        "state",
-        "tau",
-        "the guess",
-        "transition",
-        "unknown",
-        "unwrap",
-        "values",
-        "x =",
-    ),
+    *("samples", "scale of", "sf.problem", "state", "tau", "the guess", "transition", "unknown", "unwrap", "values"),
+    "x =",
 )
 """What a message may name in place of an argument: something that the argument is about."""
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
+from models import decay, first_state
 from systems import P0, case
 
 import switchfit as sf
@@ -56,8 +57,7 @@ def block(**settings):
         "push": lambda t, x, p: jnp.stack([x[1], p["a"] - friction(x[1], p)]),
         "slide": lambda t, x, p: jnp.stack([x[1], -friction(x[1], p)]),
     }
-    data = sf.Measurements(TIMES, np.cos(TIMES), lambda t, x, p: x[:1], sigma=1.0)
-    run = sf.Experiment(data, ("push", "slide"), (0.47,), 0.0, 3.0)
+    run = sf.Experiment(sf.Measurements(TIMES, np.cos(TIMES), first_state, 1.0), ("push", "slide"), (0.47,), 0.0, 3.0)
     return sf.Problem(sf.HybridSystem(modes, [0.0, SLOW]), run, {"mu": 0.3, "a": 6.0}, solver="stiff", **settings)
 
 
@@ -169,7 +169,6 @@ def test_inside_a_program_of_jax():
 
 def test_constraints_costates_and_simulations_are_those_of_jax():
     native, by_jax = both("everything")
-    assert native.structures[0].implicit == (False, True)
     theta = native.problem.initial_theta
     one, other = (each.constrained(theta, 1, np.array([0.7])) for each in (native, by_jax))
     for name in ("cost", "gradient", "hessian", "constraints", "jacobian"):
@@ -178,8 +177,6 @@ def test_constraints_costates_and_simulations_are_those_of_jax():
     one, other = (each.engines[0].costates(tau, p, np.array([0.7])) for each in (native, by_jax))
     assert_close(one.costates, other.costates, 1e-11)
     one, other = (each.engines[0].simulate(tau, p, tangents=True) for each in (native, by_jax))
-    for name in ("nodes", "first_cell", "start", "end"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     for name in ("before", "after", "y_before", "y_after"):
         assert_close(getattr(one, name), getattr(other, name), 1e-12)
         assert_close(getattr(one.tangents, name), getattr(other.tangents, name), 1e-11)
@@ -203,12 +200,11 @@ def test_derivatives_are_those_of_differences(name):
     """The steps of the differences are short beside the layers of the stiff modes."""
     native, theta = both(name)[0], both(name)[0].problem.initial_theta
     found = native(theta)
-    for k in range(len(theta)):
+    for k, unit in enumerate(np.eye(len(theta))):
         step = 3e-8 * max(abs(theta[k]), 0.1)
-        ends = [native(np.where(np.arange(len(theta)) == k, theta + sign * step, theta)) for sign in (-1, 1)]
-        slope = (ends[1].cost - ends[0].cost) / (2 * step)
+        before, after = native(theta - step * unit), native(theta + step * unit)
+        slope, bend = ((getattr(after, name) - getattr(before, name)) / (2 * step) for name in ("cost", "gradient"))
         assert slope == pytest.approx(found.gradient[k], rel=2e-5, abs=1e-7 * np.abs(found.gradient).max())
-        bend = (ends[1].gradient - ends[0].gradient) / (2 * step)
         assert_close(bend, found.hessian[k], 1e-3)
 
 
@@ -223,14 +219,12 @@ def test_a_routine_for_the_linear_systems(monkeypatch):
     """It takes the place of straight-line code in large and dense systems: here in all rows, and adaptive steps."""
     native, by_jax = both("everything")
     theta = native.problem.initial_theta
-    straight_line = native(theta).hessian
     monkeypatch.setattr(elimination, "MOST_PRODUCTS", 0)
     drop_programs()
-    mesh = refine_mesh(native.problem, 0, theta)
-    assert mesh.cells == native.meshes[0].cells
+    assert refine_mesh(native.problem, 0, theta).cells == native.meshes[0].cells
     found, expected = Evaluator(native.problem, meshes=native.meshes)(theta), by_jax(theta)
     assert found.cost == pytest.approx(expected.cost, rel=1e-12)
-    assert (found.hessian != straight_line).any()
+    assert (found.hessian != native(theta).hessian).any()
     assert_close(found.gradient, expected.gradient, 1e-12)
     assert_close(found.hessian, expected.hessian, 1e-11)
     drop_programs()
@@ -296,17 +290,17 @@ def test_a_late_sample_in_a_row_that_does_not_converge_has_no_cost():
     assert np.isnan(coarse(coarse.problem.check_theta([0.9, 0.6, 9.0, 0.01])).cost)
 
 
-def hang(t, x, p):
-    """A body at rest on a spring under a load: its velocity is the rest of forces that cancel, 1e-17 and less."""
-    return jnp.stack([x[1], 1e6 * (p["load"] - 3.0 * x[0]) - 1e5 * x[1]])
-
-
 def test_states_of_rounding_errors_and_zeros_converge():
+    """A body at rest on a spring under a load: its velocity is the rest of forces that cancel, 1e-17 and less."""
+
+    def hang(t, x, p):
+        return jnp.stack([x[1], 1e6 * (p["load"] - 3.0 * x[0]) - 1e5 * x[1]])
+
     evaluator = Evaluator(one_mode(hang, [0.1 / 3.0 + 1e-3, 0.0], {"load": 0.1}, 100.0, engine="native"))
     theta = evaluator.problem.initial_theta
     assert np.abs(evaluator.simulate(theta)[0].after[-1, 1]) < 1e-12
     assert np.isfinite(evaluator(theta).cost)
-    zero = Evaluator(one_mode(lambda t, x, p: -p["k"] * x, [0.0, 1.0], {"k": 1e3}, 1.0, engine="native"))
+    zero = Evaluator(one_mode(decay, [0.0, 1.0], {"k": 1e3}, 1.0, engine="native"))
     assert zero(zero.problem.initial_theta).cost == 0.0
 
 
@@ -318,23 +312,16 @@ def make_jacobian(rng, n, kind):
 
     That of a network is sparse: a chain of states, two of which are coupled to a third one.
     """
+    if kind == "any":
+        return rng.normal(size=(n, n)) * 10.0 ** rng.uniform(0, 9)
     if kind == "network":
-        flows = [*pairwise(range(n)), (0, n // 2), (n - 1, n // 2)]
         J = np.zeros((n, n))
-        for i, j in flows:
+        for i, j in [*pairwise(range(n)), (0, n // 2), (n - 1, n // 2)]:
             J[np.ix_([i, j], [i, j])] += 10.0 ** rng.uniform(-2, 9) * np.array([[-1.0, 1.0], [1.0, -1.0]])
         return J
     sizes, Q = 10.0 ** rng.uniform(-2, 9, n), np.linalg.qr(rng.normal(size=(n, n)))[0]
-    if kind == "stable":
-        return -Q @ np.diag(sizes) @ Q.T
-    if kind == "unstable":
-        return Q @ np.diag(np.where(rng.random(n) < 0.3, np.minimum(sizes, 3.0), -sizes)) @ Q.T
-    if kind == "vibrating":
-        rate = 10.0 ** rng.uniform(0, 4.5)
-        J = -np.diag(sizes)
-        J[:2, :2] = [[0.0, 1.0], [-(rate**2), -2.0 * rng.uniform() * rate]]
-        return J
-    return rng.normal(size=(n, n)) * 10.0 ** rng.uniform(0, 9)
+    unstable = (kind == "unstable") & (rng.random(n) < 0.3)
+    return Q @ np.diag(np.where(unstable, np.minimum(sizes, 3.0), -sizes)) @ Q.T
 
 
 def compile_solve(filled, kind):
@@ -377,8 +364,7 @@ WAYS = "plain", "transposed", "vectors"
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize(
-    ("kind", "n", "limit"),
-    [("stable", 3, 5e-15), ("unstable", 3, 5e-15), ("vibrating", 3, 5e-15), ("any", 3, 1e-11), ("network", 20, 5e-15)],
+    ("kind", "n", "limit"), [("stable", 3, 5e-15), ("unstable", 3, 5e-15), ("any", 3, 1e-11), ("network", 20, 5e-15)]
 )
 def test_elimination_needs_no_pivots(kind, n, limit, way):
     """The backward error is hardly larger than that of LAPACK, which chooses pivots; `any` grows by 1e9 in a step.

@@ -82,11 +82,15 @@ def test_a_large_log_is_referred_to(tmp_path, monkeypatch):
 
 
 def test_positions_are_east_and_north(tmp_path):
-    rows = (f"{k},{48 + 1e-5 * max(k - 20, 0)},{11 + 1e-5 * min(k, 20)}\n" for k in range(50))
-    (tmp_path / "track.csv").write_text("t,lat,lon\n" + "".join(rows))
-    channels, _ = choose_channels(sf.read_log(tmp_path / "track.csv"))
+    points = "".join(
+        f'<trkpt lat="{48 + 1e-5 * max(k - 20, 0)}" lon="{11 + 1e-5 * min(k, 20)}">'
+        f"<time>2024-05-01T10:00:{k:02d}Z</time></trkpt>"
+        for k in range(50)
+    )
+    (tmp_path / "track.gpx").write_text(f'<gpx version="1.1" creator="t"><trk><trkseg>{points}</trkseg></trk></gpx>')
+    channels, _ = choose_channels(sf.read_log(tmp_path / "track.gpx"))
     assert channels == ["east", "north"]
-    write_first_problem(tmp_path / "new", tmp_path / "track.csv")
+    write_first_problem(tmp_path / "new", tmp_path / "track.gpx")
     assert load_problem(tmp_path / "new" / "problem.toml").problem
 
 

@@ -267,7 +267,7 @@ def test_rates_beside_jumps_and_collapsed_modes():
     given = sf.Problem(FISHING, run, min_duration=0.5)
     close = Schedule(("idle", "fishing", "idle", "fishing"), np.array([3.0, 3.6, 4.2]), 0.0, 12.0)
     assert rate(given, close).trajectory.jump_times.tolist() == [5.9]
-    gone = replace(TWO, times=np.array([3.0, 3.0]))
+    gone = Schedule(TWO.sequence, np.array([3.0, 3.0]), 0.0, 12.0)
     found, expected = (rate(fishing((), max_transitions=10), each).best() for each in (gone, EMPTY))
     assert found[0] == expected[0]
     assert found[1] == pytest.approx(expected[1], abs=0.5)

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from derivatives import differentiate
-from models import ball, fishing, linear, tracked_drive
+from models import fishing, linear, tracked_drive
 
 import switchfit as sf
 
@@ -38,26 +37,6 @@ def test_fishing_from_published_times():
     expected = [2.4420392297, 4.1168721058, 4.4197702383, 4.6699644285,
                 5.1828371488, 5.3537063284, 6.3557436884, 6.4527645889]  # fmt: skip
     np.testing.assert_allclose(found.transition_times[0], expected, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "method", ["adjoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "discrete-adjoint"))]
-)
-def test_bouncing_ball_against_closed_form(method):
-    """Height at 15 s after two impacts at free times, in closed form, differentiated by JAX."""
-    times, e = (3.1, 8.2), 0.8
-
-    def height(theta):
-        t1, t2, e = theta
-        h, v = 50.0 - 4.9 * t1**2, -9.8 * t1 * -e
-        h, v = h + v * (t2 - t1) - 4.9 * (t2 - t1) ** 2, -e * (v - 9.8 * (t2 - t1))
-        return (h + v * (15.0 - t2) - 4.9 * (15.0 - t2) ** 2 - 20.0) ** 2
-
-    J, g, H = differentiate(height, [*times, e])
-    found = sf.evaluate(ball(times), method=method)
-    assert found.cost == pytest.approx(float(J), rel=1e-10)
-    np.testing.assert_allclose(found.gradient, g, rtol=1e-10)
-    np.testing.assert_allclose(found.hessian, H, rtol=1e-10)
 
 
 def test_exact_orders_of_the_skid_steered_vehicle():

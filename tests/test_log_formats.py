@@ -85,22 +85,16 @@ def test_positions_that_cannot_be_made(text, options, message, tmp_path):
 # --- GPX and NMEA -----------------------------------------------------------------------------------------------------
 
 
-def write_gpx(path):
-    gpx = gpxpy.gpx.GPX()
-    gpx.tracks.append(gpxpy.gpx.GPXTrack())
-    gpx.tracks[0].segments.append(gpxpy.gpx.GPXTrackSegment())
-    for t, x in zip(TIMES, X, strict=True):
-        latitude, longitude, altitude = globe(x, 2 * x)
-        time = START + timedelta(seconds=t)
-        point = gpxpy.gpx.GPXTrackPoint(latitude, longitude, altitude, time, horizontal_dilution=1.2)
-        gpx.tracks[0].segments[0].points.append(point)
-    gpx.waypoints.append(gpxpy.gpx.GPXWaypoint(*ORIGIN[:2], time=START + timedelta(seconds=0.5), name="gate"))
-    path.write_text(gpx.to_xml())
-    return path
-
-
 def test_gpx(tmp_path):
-    log = sf.read_log(write_gpx(tmp_path / "a.gpx"), range_error=5)
+    gpx, segment = gpxpy.gpx.GPX(), gpxpy.gpx.GPXTrackSegment()
+    for t, x in zip(TIMES, X, strict=True):
+        time = START + timedelta(seconds=t)
+        segment.points.append(gpxpy.gpx.GPXTrackPoint(*globe(x, 2 * x), time, horizontal_dilution=1.2))
+    gpx.tracks.append(gpxpy.gpx.GPXTrack())
+    gpx.tracks[0].segments.append(segment)
+    gpx.waypoints.append(gpxpy.gpx.GPXWaypoint(*ORIGIN[:2], time=START + timedelta(seconds=0.5), name="gate"))
+    (tmp_path / "a.gpx").write_text(gpx.to_xml())
+    log = sf.read_log(tmp_path / "a.gpx", range_error=5)
     np.testing.assert_array_equal(log.times, TIMES)
     assert (log.start, log.time_unit) == (START, "s")
     np.testing.assert_allclose(log[["east", "north"]], np.stack([X, 2 * X], axis=1), atol=1e-5)
@@ -126,13 +120,21 @@ def sentences(t, x, quality="1", status="A"):
     ]
 
 
+@pytest.fixture
+def read_nmea(tmp_path):
+    def read(lines, name="a.nmea"):
+        (tmp_path / name).write_text("\r\n".join(map(str, lines)))
+        return sf.read_log(tmp_path / name)
+
+    return read
+
+
 @pytest.mark.parametrize("name", ["a.nmea", "a.log"])
-def test_nmea(tmp_path, name):
-    lines = [str(s) for t, x in zip(TIMES, X, strict=True) for s in sentences(t, x)]
-    lines += [str(pynmea2.ZDA("GP", "ZDA", ("235959.00", "01", "02", "2024", "00", "00")))]  # no position
-    lines += [str(pynmea2.RMC("GP", "RMC", ("", "V", "", "", "", "", "", "", "", "", "")))]  # no time
-    (tmp_path / name).write_text("\r\n".join(lines))
-    log = sf.read_log(tmp_path / name)
+def test_nmea(read_nmea, name):
+    lines = [s for t, x in zip(TIMES, X, strict=True) for s in sentences(t, x)]
+    lines.append(pynmea2.ZDA("GP", "ZDA", ("235959.00", "01", "02", "2024", "00", "00")))  # no position
+    lines.append(pynmea2.RMC("GP", "RMC", ("", "V", "", "", "", "", "", "", "", "", "")))  # no time
+    log = read_nmea(lines, name)
     np.testing.assert_allclose(log.times, TIMES, atol=2e-6)
     assert log.start == START
     np.testing.assert_allclose(log[["east", "north"]], np.stack([X, 2 * X], axis=1), atol=1e-3)
@@ -142,11 +144,9 @@ def test_nmea(tmp_path, name):
     np.testing.assert_array_equal(log.rows, [1, 4, 7, 10])
 
 
-def test_nmea_with_damage_and_without_a_fix(tmp_path):
-    lines = [str(s) for s in sentences(0, 0)] + [str(s) for s in sentences(1, 1, quality="0", status="V")]
-    lines += [str(s) for s in sentences(2, 2)[:1]] + [str(sentences(3, 3)[0]).replace("520.0", "530.0"), "noise", "$GP"]
-    (tmp_path / "a.nmea").write_text("\n".join(lines))
-    log = sf.read_log(tmp_path / "a.nmea")
+def test_nmea_with_damage_and_without_a_fix(read_nmea):
+    lines = [*sentences(0, 0), *sentences(1, 1, quality="0", status="V"), sentences(2, 2)[0]]
+    log = read_nmea([*lines, str(sentences(3, 3)[0]).replace("520.0", "530.0"), "noise", "$GP"])
     np.testing.assert_allclose(log.times, [0, 1, 2], atol=2e-6)
     np.testing.assert_allclose(log["east"], [0, np.nan, 2], atol=1e-3)
     np.testing.assert_array_equal(log["sigma_east"], [0.25, 0.25, np.nan])
@@ -154,17 +154,12 @@ def test_nmea_with_damage_and_without_a_fix(tmp_path):
     assert "a.nmea, line 8 (and 1 more): no sentence, or with a wrong checksum; left out." in said[0]
 
 
-def test_nmea_over_midnight_without_a_date(tmp_path):
-    lines = [str(sentences(12 * 3600 + t, t)[0]) for t in (-1, 0, 1)]
-    (tmp_path / "a.nmea").write_text("\n".join(lines))
-    log = sf.read_log(tmp_path / "a.nmea")
-    np.testing.assert_array_equal(log.times, [86399, 86400, 86401])
-    assert log.start is None
-    lines[1] = str(sentences(12 * 3600, 0)[1])  # with a date
-    (tmp_path / "a.nmea").write_text("\n".join(lines))
-    log = sf.read_log(tmp_path / "a.nmea")
-    np.testing.assert_array_equal(log.times, [0, 1, 2])
-    assert log.start == START + timedelta(seconds=12 * 3600 - 1)
+@pytest.mark.parametrize(("dated", "first", "start"), [(0, 86399, None), (1, 0, START + timedelta(seconds=43199))])
+def test_nmea_over_midnight(read_nmea, dated, first, start):
+    """Without a date in its sentences, and with one in the second of them."""
+    log = read_nmea([sentences(43199, -1)[0], sentences(43200, 0)[dated], sentences(43201, 1)[0]])
+    np.testing.assert_array_equal(log.times, first + np.arange(3))
+    assert log.start == start
 
 
 # --- ROS --------------------------------------------------------------------------------------------------------------
@@ -175,47 +170,33 @@ def turned(place, yaw):
     return {f"{place}.z": np.sin(yaw / 2), f"{place}.w": np.cos(yaw / 2)}
 
 
+COVARIANCES = {3: np.diag([0.04, 0.09, 0.25]).ravel(), 6: np.diag([0.01, 0.04, 0, 0, 0, 0.0025]).ravel()}
+UNKNOWN = np.r_[-1.0, np.zeros(8)]
+
 MESSAGES = {
-    "/fix": (
-        "sensor_msgs/msg/NavSatFix",
-        lambda x: {
-            **dict(zip(("latitude", "longitude", "altitude"), globe(x, 2 * x), strict=True)),
-            "position_covariance": np.diag([0.04, 0.09, 0.25]).ravel(),
-            "position_covariance_type": 2,
-        },
-    ),
-    "/odom": (
-        "nav_msgs/msg/Odometry",
-        lambda x: {
-            **{"pose.pose.position.x": x, "twist.twist.linear.x": x, "twist.twist.angular.z": 2 * x},
-            **turned("pose.pose.orientation", 0.1 * x),
-            "pose.covariance": np.diag([0.01, 0.04, 0, 0, 0, 0.0025]).ravel(),
-        },
-    ),
-    "/pose": (
-        "geometry_msgs/msg/PoseStamped",
-        lambda x: (
-            {f"pose.position.{axis}": value for axis, value in zip("xyz", (x, 1.0, 2.0), strict=True)}
-            | turned("pose.orientation", 3.0)
-        ),
-    ),
+    "/fix": ("sensor_msgs/msg/NavSatFix", lambda x: {
+        **dict(zip(("latitude", "longitude", "altitude"), globe(x, 2 * x), strict=True)),
+        "position_covariance": COVARIANCES[3], "position_covariance_type": 2,
+    }),
+    "/odom": ("nav_msgs/msg/Odometry", lambda x: turned("pose.pose.orientation", 0.1 * x) | {
+        "pose.pose.position.x": x, "twist.twist.linear.x": x, "twist.twist.angular.z": 2 * x,
+        "pose.covariance": COVARIANCES[6],
+    }),
+    "/pose": ("geometry_msgs/msg/PoseStamped", lambda x: turned("pose.orientation", 3.0) | {
+        "pose.position.x": x, "pose.position.y": 1.0, "pose.position.z": 2.0,
+    }),
     "/twist": ("geometry_msgs/msg/TwistStamped", lambda x: {"twist.linear.x": x, "twist.angular.z": -x}),
     "/cmd_vel": ("geometry_msgs/msg/Twist", lambda x: {"linear.x": x, "angular.z": -x}),
     "/force": ("geometry_msgs/msg/WrenchStamped", lambda x: {"wrench.force.x": x}),
-    "/imu": (
-        "sensor_msgs/msg/Imu",
-        lambda x: {
-            **turned("orientation", 0.5),
-            "orientation_covariance": np.zeros(9) if x else np.r_[-1.0, np.zeros(8)],  # -1: it is not known
-            **{"angular_velocity.z": x, "linear_acceleration.x": x, "linear_acceleration.z": 9.81},
-        },
-    ),
-    "/joints": (
-        "sensor_msgs/msg/JointState",
-        lambda x: {"name": ["hip", "knee"], "position": np.array([x, -x]), "velocity": np.array([1.0, x])},
-    ),
+    "/imu": ("sensor_msgs/msg/Imu", lambda x: turned("orientation", 0.5) | {
+        "orientation_covariance": np.zeros(9) if x else UNKNOWN,
+        "angular_velocity.z": x, "linear_acceleration.x": x, "linear_acceleration.z": 9.81,
+    }),
+    "/joints": ("sensor_msgs/msg/JointState", lambda x: {
+        "name": ["hip", "knee"], "position": np.array([x, -x]), "velocity": np.array([1.0, x]),
+    }),
     "/log": ("std_msgs/msg/String", lambda x: {"data": f"at {x:g}"}),
-}
+}  # fmt: skip
 """Types of topics, and the fields of a message that are not zero."""
 
 
@@ -238,7 +219,7 @@ def make_blank(store, kind):
 def make_message(store, kind, stamp, fields):
     message = make_blank(store, kind)
     if hasattr(message, "header"):
-        fields = fields | dict(zip(("header.stamp.sec", "header.stamp.nanosec"), divmod(stamp, 10**9), strict=True))
+        message.header.stamp = type(message.header.stamp)(*divmod(stamp, 10**9))
     for place, value in fields.items():
         *parts, name = place.split(".")
         setattr(reduce(getattr, parts, message), name, value)
@@ -399,17 +380,20 @@ def test_vectors(write_mat):
 def test_structs(write_mat):
     drive = {"Time": TIMES, "Data": X, "signals": {"values": 2 * X}}
     path = write_mat(drive=drive, still={"t": TIMES, "x": X}, note="calibrated")
-    with pytest.raises(InputError, match=r"several structs with times \(drive, still\).*Name one: topic"):
-        sf.read_log(path)
     log = sf.read_log(path, topic="drive")
     np.testing.assert_array_equal(log.times, TIMES)
     assert log.channels == ("Data", "signals.values")
     np.testing.assert_array_equal(log["signals.values"], 2 * X)
     assert log.source.endswith("a.mat (drive)")
-    with pytest.raises(InputError, match=r"has no struct 'dive' with times; those that have are drive, still"):
-        sf.read_log(path, topic="dive")
+    for topic, message in (
+        (None, r"several structs with times \(drive, still\).*Name one: topic"),
+        ("dive", r"has no struct 'dive' with times; those that have are drive, still"),
+    ):
+        with pytest.raises(InputError, match=message):
+            sf.read_log(path, topic=topic)
+    path = write_mat(x=X, y=X)
     with pytest.raises(InputError, match=r"a\.mat has no vector of times; its variables are x, y\. Name the one with"):
-        sf.read_log(write_mat(x=X, y=X))
+        sf.read_log(path)
     np.testing.assert_array_equal(sf.read_log(path, time="x")["y"], X)
 
 
@@ -437,18 +421,20 @@ def test_parquet(tmp_path):
     fields = [
         pa.field("time", pa.float64(), metadata={"unit": "ms"}),
         pa.field("x", pa.int64(), metadata={"units": "m"}),
+        pa.field("mode", pa.string()),
     ]
-    columns = [pa.array(1e3 * TIMES), pa.array([0, None, 3, 6])]
-    names = pa.field("mode", pa.string())
-    pq.write_table(pa.table([*columns, pa.array(list("abcd"))], schema=pa.schema([*fields, names])), path)
+    columns = [pa.array(1e3 * TIMES), pa.array([0, None, 3, 6]), pa.array(list("abcd"))]
+    pq.write_table(pa.table(columns, schema=pa.schema(fields)), path)
     log = sf.read_log(path)
     assert (log.channels, log.units, log.time_unit) == (("x",), {"x": "m"}, "ms")
     np.testing.assert_array_equal(log.times, 1e3 * TIMES)
     np.testing.assert_array_equal(log["x"], [0, np.nan, 3, 6])
-    with pytest.raises(InputError, match=r"a\.parquet has no column 'z'; its columns are time, x, mode"):
-        sf.read_log(path, time="z")
-    with pytest.raises(InputError, match=r"a\.parquet: column 'mode' has neither numbers nor dates\. Name the"):
-        sf.read_log(path, time="mode")
+    for time, message in (
+        ("z", r"a\.parquet has no column 'z'; its columns are time, x, mode"),
+        ("mode", r"a\.parquet: column 'mode' has neither numbers nor dates\. Name the"),
+    ):
+        with pytest.raises(InputError, match=message):
+            sf.read_log(path, time=time)
 
 
 def test_parquet_of_pandas(tmp_path):
