@@ -139,7 +139,6 @@ def test_bad_values(values, error, message):
     ("left", "values", "message"),
     [
         ("k", NAMED, "mode 'pull' reads 'k', which is not there: p has k; u has left, right"),
-        (0, NAMED, "reads 0, which is not there: p has k; u has left, right"),
         ("left", np.ones((7, 2)), r"mode 'pull'.* u has no names: give sf.Input a dict of name -> samples"),
     ],
 )

@@ -335,9 +335,6 @@ def test_problem_file_with_dates(folder, values):
     problem = load_problem(folder / "problem.toml").problem
     np.testing.assert_array_equal(problem.experiments[0].jump_times, DOSES)
     assert "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00" in describe_experiments(problem.experiments)
-    (folder / "problem.toml").write_text(f"{text}time_scale = 2.0\n")  # that a jump is a date suffices
-    with pytest.raises(ValueError, match="has dates, which are converted to time_unit by themselves"):
-        load_problem(folder / "problem.toml")
 
 
 @pytest.mark.parametrize(
@@ -345,8 +342,6 @@ def test_problem_file_with_dates(folder, values):
     [
         ('"model.py:dose"', '"model.py:doze"', r"jumps\[1\].map .*defines no 'doze'"),
         ("time = 24", "tim = 24", "tim"),
-        ("time = 24", "time = 'noon'", r"jumps\[2\].time.* must be a number or a date such as 2024-05-01"),
-        ("time = 24", "time = [24.0, 2024-05-01]", r"jumps\[2\]: Jump time must be numbers or dates, not both"),
         ("time = 24", "time = 2024-05-01", "times of Jump is a date, but not all times of the data are"),
     ],
 )
