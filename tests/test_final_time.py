@@ -101,7 +101,8 @@ def test_the_time_to_a_level_and_its_standard_error_follow_from_the_rate(cooled)
     residual, slope = cooled.problem.experiments[0].data[0].values[:, 0] - decayed, -TIMES * decayed
     assert residual @ slope == pytest.approx(0.0, abs=1e-6)
     error = 0.01 * (slope @ slope - residual @ (TIMES**2 * decayed)) ** -0.5
-    np.testing.assert_allclose(cooled.standard_errors, [tf / k * error, error], rtol=1e-5)
+    assert cooled.standard_errors[1] == pytest.approx(error, rel=1e-5)
+    assert cooled.standard_errors[0] == pytest.approx(tf / k * cooled.standard_errors[1], rel=1e-7)
     path = sf.simulate(cooled.problem, [9.0, 0.5])  # tf at its upper bound
     assert (path.times[-1], path.states[-1, 0]) == (9.0, pytest.approx(np.exp(-4.5), rel=1e-8))
 
@@ -196,7 +197,7 @@ def test_minimum_time_is_found_from_anywhere_whatever_the_upper_bound(upper, sta
     fit = sf.estimate(minimum_time(upper), start=start, strategy="local")
     assert fit.success
     assert fit.evaluations < 40
-    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
     # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.
     assert fit.constraints[0][2] == pytest.approx(-1.0, abs=1e-7)
 
@@ -262,7 +263,7 @@ def straight(target=1.0, min_duration=0.0, **bounds):
 )
 def test_bounds_and_minimum_duration_hold_tf(settings, end, active):
     fit = sf.estimate(straight(**settings))
-    assert fit.theta == pytest.approx([end], abs=1e-8)
+    assert fit.theta == pytest.approx([end], abs=1e-12 if active else 1e-8)
     assert [str(constraint) for constraint in fit.active] == active
 
 

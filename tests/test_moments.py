@@ -91,6 +91,9 @@ def test_both_one_sided_derivatives_are_those_of_the_closed_form(this, side):
         J, gradient, _ = expected(tau, side)
         assert found.cost == pytest.approx(J, rel=1e-11)
         np.testing.assert_allclose(found.gradient, gradient, rtol=1e-9, atol=1e-11)
+    for node in nodes:
+        costs = [evaluator(np.array([np.nextafter(node, to), 2.9]), side).cost for to in (0.0, node, 4.0)]
+        np.testing.assert_allclose(costs, costs[0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("where", MOMENTS)
