@@ -372,25 +372,15 @@ def write(folder, text):
     return path
 
 
-COLUMN = """(name, source, column) => {
+COLUMN = """(source, column) => {
+  const found = Bokeh.documents.map((doc) => doc.get_model_by_name(source)).find(Boolean);
+  return Array.from(found.data[column]).map((v) => (Number.isNaN(v) ? null : v));
+}"""
+
+SET = """(name, value, event) => {
   const element = document.getElementById(name);
-  for (const doc of Bokeh.documents) {
-    const found = doc.get_model_by_name(source);
-    if (found) return Array.from(found.data[column]).map((v) => (Number.isNaN(v) ? null : v));
-  }
-}"""
-
-MOVE = """(k, position) => {
-  const slider = document.getElementById(`slider-${k}`);
-  slider.value = position;
-  slider.dispatchEvent(new Event("input"));
-}"""
-
-
-CHOOSE = """(value) => {
-  const chooser = document.getElementById("run");
-  chooser.value = value;
-  chooser.dispatchEvent(new Event("change"));
+  element.value = value;
+  element.dispatchEvent(new Event(event));
 }"""
 
 
@@ -399,7 +389,7 @@ def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
     sliders = {slider["name"]: (k, slider) for k, slider in enumerate(payload_of(toss_page)["sliders"])}
 
     def read(source, column):
-        return np.array(browser.evaluate(f"({COLUMN})('run-0', '{source}', '{column}')"), float)
+        return np.array(browser.evaluate(f"({COLUMN})('{source}', '{column}')"), float)
 
     def cost():
         return browser.evaluate("document.getElementById('cost').textContent")
@@ -407,7 +397,7 @@ def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
     before = {source: read(source, "y0") for source in ("curve-0", "samples-0")}
     assert cost() == f"J = {toss.cost:.7e} (at the estimate)".replace("e-0", "e-")
     k, slider = sliders["mu"]
-    browser.evaluate(f"({MOVE})({k}, 400)")
+    browser.evaluate(f"({SET})('slider-{k}', 400, 'input')")
     change, slope = slider["values"][-1] - slider["theta"], f"d{slider['place']}_0"
     for source, old in before.items():
         np.testing.assert_allclose(read(source, "y0"), old + change * read(source, slope), rtol=1e-9, atol=1e-15)
@@ -415,7 +405,7 @@ def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
     assert "(evaluated)" in cost()
 
     k, slider = sliders["tau_1"]
-    browser.evaluate(f"({MOVE})({k}, 0)")
+    browser.evaluate(f"({SET})('slider-{k}', 0, 'input')")
     assert "(by the quadratic approximation)" in cost()
     moved = read("transitions", "x")[0], read("modes", "right")[0], read("modes", "left")[1]
     assert moved == pytest.approx((slider["values"][0],) * 3)
@@ -434,7 +424,7 @@ def test_runs_are_chosen_channels_switched_off_and_all_of_it_printed(browser, tm
     height = "document.getElementById('run-0').getBoundingClientRect().height"
     assert (browser.evaluate(shown), browser.evaluate(names)) == ("0", "run4.tau_1,v")
     for value, runs in (("2", "2"), ("all", "0,1,2,3")):
-        browser.evaluate(f"({CHOOSE})('{value}')")
+        browser.evaluate(f"({SET})('run', '{value}', 'change')")
         browser.wait("[...document.querySelectorAll('#fit .run.shown .figure')].every((f) => f.offsetHeight > 300)")
         assert browser.evaluate(shown) == runs
     before = browser.evaluate(height)
@@ -454,7 +444,7 @@ def test_every_kind_of_problem_is_shown_without_an_error(browser, tmp_path, kind
     check_alone(text)
     browser.open(write(tmp_path, text))
     for k in range(len(payload_of(text)["sliders"])):
-        browser.evaluate(f"({MOVE})({k}, 300)")
+        browser.evaluate(f"({SET})('slider-{k}', 300, 'input')")
     browser.evaluate("document.querySelectorAll('[data-channel]').forEach((box) => { if (!box.checked) box.click(); })")
     browser.evaluate("new Promise((done) => setTimeout(done, 200))")
     assert browser.evaluate("window.hacked") is None
