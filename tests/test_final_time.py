@@ -10,9 +10,8 @@ from derivatives import differentiate
 from models import decay
 
 import switchfit as sf
-from switchfit.strategy.starts import is_minimum_time
 
-METHODS = ("auto", "forward", "autodiff", "adjoint")
+COOLS = sf.HybridSystem({"cools": decay}, [1.0])
 
 
 def grow(t, x, p):
@@ -38,7 +37,8 @@ def closed_cost(theta):
     ("method", "engine"),
     [
         ("auto", "native"),
-        *(pytest.param(method, "jax", marks=[pytest.mark.slow] * (method != "adjoint")) for method in METHODS),
+        ("adjoint", "jax"),
+        *(pytest.param(method, "jax", marks=pytest.mark.slow) for method in ("auto", "forward", "autodiff")),
     ],
 )
 def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
@@ -51,7 +51,7 @@ def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     np.testing.assert_allclose(found.hessian, expected[2], rtol=0, atol=1e-8)
 
 
-def hard_problem():
+def test_derivatives_pass_every_check():
     """Two transitions, one with a reset map and one with a guard, a reference signal, late samples and costs of every
     kind, all of them nonlinear and dependent on time."""
     costs = [
@@ -63,11 +63,7 @@ def hard_problem():
     system = sf.HybridSystem(protocol.MODES, [0.4, 0.1], protocol.BOUNCE, guards=protocol.GUARDS)
     tf = sf.Parameter(2.4, lower=1.6, upper=3.0)
     run = sf.Experiment(costs, ("swing", "fall", "swing"), (0.83, 1.57), 0.0, tf)
-    return sf.Problem(system, run, protocol.PARAMETERS | protocol.MORE)
-
-
-def test_derivatives_pass_every_check():
-    found = sf.check_derivatives(hard_problem())
+    found = sf.check_derivatives(sf.Problem(system, run, protocol.PARAMETERS | protocol.MORE))
     assert found.passed, str(found)
 
 
@@ -85,9 +81,8 @@ def cooling_run(seed=0, start=1.0, name=None, tf=None, more=()):
     return sf.Experiment(data, ("cools",), (), 0.0, tf, initial_state=[start], name=name)
 
 
-def cooling(*runs):
-    system = sf.HybridSystem({"cools": decay}, [1.0])
-    return sf.Problem(system, list(runs) or cooling_run(), {"k": sf.Parameter(0.6, lower=0.05, upper=3.0)})
+def cooling(*runs, **more):
+    return sf.Problem(COOLS, list(runs) or cooling_run(), {"k": sf.Parameter(0.6, lower=0.05, upper=3.0)} | more)
 
 
 @pytest.fixture(scope="module")
@@ -95,46 +90,35 @@ def cooled():
     return sf.estimate(cooling())
 
 
-def test_simulation_ends_at_the_given_tf():
-    for tf in (3.3, 9.0):  # and at its upper bound
-        path = sf.simulate(cooling(), [tf, 0.5])
-        assert (path.times[0], path.times[-1]) == (0.0, tf)
-        assert path.states[-1, 0] == pytest.approx(np.exp(-0.5 * tf), rel=1e-8)
-
-
 def test_the_time_to_a_level_and_its_standard_error_follow_from_the_rate(cooled):
     """tf = ln(1 / level) / k, which the samples up to 2 s determine through k."""
-    fit = cooled
-    assert fit.success
     assert cooling(cooling_run(tf=sf.Parameter(3.0, fixed=True))).theta_names == ("k",)
-    assert fit.theta_names == ("tf", "k")
-    tf, k = fit.theta
+    assert cooled.theta_names == ("tf", "k")
+    tf, k = cooled.theta
     assert tf == pytest.approx(np.log(1 / LEVEL) / k, rel=1e-8)
-    assert fit.final_times == (tf,)
-    assert [len(times) for times in fit.transition_times] == [0]
-    assert fit.standard_errors[0] == pytest.approx(tf / k * fit.standard_errors[1], rel=1e-7)
-    residual = fit.problem.experiments[0].data[0].values[:, 0] - np.exp(-k * TIMES)
-    slope = -TIMES * np.exp(-k * TIMES)
+    assert cooled.final_times == (tf,)
+    decayed = np.exp(-k * TIMES)
+    residual, slope = cooled.problem.experiments[0].data[0].values[:, 0] - decayed, -TIMES * decayed
     assert residual @ slope == pytest.approx(0.0, abs=1e-6)
-    curvature = (slope @ slope - residual @ (TIMES**2 * np.exp(-k * TIMES))) / 0.01**2
-    assert fit.standard_errors[1] == pytest.approx(curvature**-0.5, rel=1e-5)
+    error = 0.01 * (slope @ slope - residual @ (TIMES**2 * decayed)) ** -0.5
+    assert cooled.standard_errors[1] == pytest.approx(error, rel=1e-5)
+    assert cooled.standard_errors[0] == pytest.approx(tf / k * cooled.standard_errors[1], rel=1e-7)
+    path = sf.simulate(cooled.problem, [9.0, 0.5])  # tf at its upper bound
+    assert (path.times[-1], path.states[-1, 0]) == (9.0, pytest.approx(np.exp(-4.5), rel=1e-8))
 
 
 @pytest.mark.slow
 def test_what_is_printed_drawn_predicted_and_saved_ends_at_tf(cooled, tmp_path):
     fit = cooled
     tf = fit.final_times[0]
-    assert fit.trajectory.times[-1] == tf
     assert fit.trajectory.mode_spans == [("cools", 0.0, tf)]
     assert "  tf   3.986  ± 0.033" in str(fit)
     assert {ax.get_xlim() for ax in fit.plot(bands=True).axes} == {(0.0, tf)}
     assert fit.predict().times[-1] == tf
-    at_end = fit.predict([1.0, tf])
-    assert at_end.outputs[1, 0] == pytest.approx(LEVEL, rel=1e-9)
     # At a fixed time: x(t) = exp(-k t), whatever tf is.
-    np.testing.assert_allclose(
-        at_end.output_errors[:, 0], at_end.times * at_end.outputs[:, 0] * fit.standard_errors[1], rtol=1e-6
-    )
+    at_end = fit.predict([1.0, tf])
+    expected = at_end.times * at_end.outputs[:, 0] * fit.standard_errors[1]
+    np.testing.assert_allclose(at_end.output_errors[:, 0], expected, rtol=1e-6)
     fit.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json")
     assert str(loaded) == str(fit)
@@ -149,7 +133,6 @@ def test_each_of_several_runs_has_its_own_tf_beside_runs_without():
     assert problem.theta_names == ("hot.tf", "warm.tf", "k")
     assert sf.check_derivatives(problem).passed
     fit = sf.estimate(problem)
-    assert fit.success
     k = fit.parameters["k"]
     np.testing.assert_allclose(fit.final_times, [np.log(1 / LEVEL) / k, 2.5, np.log(0.6 / LEVEL) / k], rtol=1e-8)
     assert [path.times[-1] for path in fit.trajectories] == list(fit.final_times)
@@ -157,16 +140,12 @@ def test_each_of_several_runs_has_its_own_tf_beside_runs_without():
 
 
 def test_multistart_draws_tf_between_its_bounds_and_monte_carlo_varies_it():
-    problem = cooling()
-    starts = sf.multistart(problem, starts=16, seed=2)
+    starts = sf.multistart(cooling(), starts=16, seed=2)
     drawn = starts.start[1:, 0]
-    assert drawn.min() >= 2.0
-    assert drawn.max() <= 9.0
-    assert np.ptp(drawn) > 4.0
+    assert 2.0 <= drawn.min() < drawn.max() - 4.0 <= 5.0
     assert starts.success.all()  # some with constraints that are nearly met all the way, and never better than at first
-    found = starts.theta
-    np.testing.assert_allclose(found, np.broadcast_to(found[0], found.shape), rtol=1e-6)
-    fits = sf.monte_carlo(problem, runs=12, seed=3, theta=[np.log(1 / LEVEL) / RATE, RATE])
+    np.testing.assert_allclose(starts.theta, np.broadcast_to(starts.theta[0], starts.theta.shape), rtol=1e-6)
+    fits = sf.monte_carlo(cooling(), runs=12, seed=3, theta=[np.log(1 / LEVEL) / RATE, RATE])
     assert fits.success.all()
     np.testing.assert_allclose(fits.theta[:, 0], np.log(1 / LEVEL) / fits.theta[:, 1], rtol=1e-7)
     assert np.ptp(fits.theta[:, 0]) > 0.02
@@ -185,68 +164,61 @@ def test_a_constraint_that_hardly_depends_on_the_unknowns_at_the_start_is_met(st
 @pytest.mark.slow
 def test_batches_without_constraints_take_a_free_tf_in_their_compiled_program():
     """A prior on tf and a cost of x(tf): the program that all fits share, and one fit alone, end in the same place."""
-    system = sf.HybridSystem({"cools": decay}, [1.0])
-    data = [
-        sf.Measurements(TIMES, np.exp(-RATE * TIMES), sigma=0.01),
-        sf.TerminalCost(lambda x, p: 9 * (x[0] - 0.3) ** 2),
-    ]
-    tf = sf.Parameter(4.0, lower=2.0, upper=9.0, prior=sf.Normal(3.5, 0.5))
-    problem = sf.Problem(system, sf.Experiment(data, ("cools",), (), 0.0, tf), {"k": sf.Parameter(0.5, lower=0.1)})
-    alone = sf.estimate(problem)
-    assert alone.success
-    by_hand = lambda tf: 9 * (np.exp(-alone.theta[1] * tf) - 0.3) ** 2 + 0.5 * (tf - 3.5) ** 2 / 0.25  # noqa: E731
-    for step in (1e-4, -1e-4):
-        assert by_hand(alone.theta[0] + step) > by_hand(alone.theta[0])
+    samples = sf.Measurements(TIMES, np.exp(-RATE * TIMES), sigma=0.01)
+    data, prior = [samples, sf.TerminalCost(lambda x, p: 9 * (x[0] - 0.3) ** 2)], sf.Normal(3.5, 0.5)
+    problem, *others = (
+        cooling(sf.Experiment(data, ("cools",), (), 0.0, sf.Parameter(value, lower=2.0, upper=9.0, prior=prior)))
+        for value in (4.0, 2.5, 6.0)
+    )
+    tf, k = sf.estimate(problem).theta
+    slope = -18 * k * np.exp(-k * tf) * (np.exp(-k * tf) - 0.3) + (tf - 3.5) / 0.25
+    assert slope == pytest.approx(0.0, abs=1e-6)
     assert sf.monte_carlo(problem, runs=6, seed=5, theta=np.array([3.2, RATE])).success.all()
-    run = problem.experiments[0]
-    others = [replace(problem, experiments=replace(run, tf=replace(tf, value=value))) for value in (2.5, 6.0)]
-    np.testing.assert_allclose(sf.estimate_many(others).theta, [alone.theta] * 2, rtol=1e-6)
+    np.testing.assert_allclose(sf.estimate_many(others).theta, [[tf, k]] * 2, rtol=1e-6)
 
 
-def minimum_time(tf=None, **settings):
+def minimum_time(upper=5.0):
     """From rest to rest over 1 m with at most 1 m/s^2: one switch half way, 2 s."""
     push, brake = (lambda t, x, p, u=u: jnp.stack([x[1], u * jnp.ones(())]) for u in (1.0, -1.0))
-    system = sf.HybridSystem({"push": push, "brake": brake}, [0.0, 0.0])
     ends = [sf.TerminalConstraint(lambda x, p: x[0] - 1.0), sf.TerminalConstraint(lambda x, p: x[1:2])]
-    costs = [sf.RunningCost(lambda t, x, p: jnp.ones(())), *ends]
-    tf = sf.Parameter(2.5, upper=5.0) if tf is None else tf
-    return sf.Problem(system, sf.Experiment(costs, ("push", "brake"), (0.7,), 0.0, tf), **settings)
+    run = sf.Experiment([LASTING, *ends], ("push", "brake"), (0.7,), 0.0, sf.Parameter(2.5, upper=upper))
+    return sf.Problem(sf.HybridSystem({"push": push, "brake": brake}, [0.0, 0.0]), run)
 
 
-@pytest.mark.parametrize("upper", [2.6, 5.0, 8.0, 50.0])
-def test_minimum_time_does_not_depend_on_the_upper_bound(upper):
-    fit = sf.estimate(minimum_time(sf.Parameter(2.5, upper=upper)), strategy="local")
-    assert fit.success
-    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
-    assert fit.cost == pytest.approx(2.0, abs=1e-9)
-    # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.
-    assert fit.constraints[0][2] == pytest.approx(-1.0, abs=1e-7)
-    assert [name for name, _, _ in fit.constraints] == ["terminal constraint 1", "terminal constraint 2"]
-
-
-@pytest.mark.parametrize("start", [[0.363, 0.379], [0.01, 0.02], [0.02, 4.9], [4.9, 4.99], [1.929, 2.284]])
-def test_minimum_time_is_found_from_far_away(start):
-    """The first leads through a node of the mesh at which derivatives jump by the error of integration alone."""
-    fit = sf.estimate(minimum_time(), start=start, strategy="local")
+@pytest.mark.parametrize(
+    ("upper", "start"),
+    [
+        (2.6, [0.7, 2.5]), (50.0, [0.7, 2.5]), (5.0, [0.01, 0.02]), (5.0, [0.02, 4.9]), (5.0, [4.9, 4.99]),
+        # Through a node of the mesh at which derivatives jump by the error of integration alone
+        (5.0, [0.363, 0.379]),
+    ],
+)  # fmt: skip
+def test_minimum_time_is_found_from_anywhere_whatever_the_upper_bound(upper, start):
+    fit = sf.estimate(minimum_time(upper), start=start, strategy="local")
     assert fit.success
     assert fit.evaluations < 40
-    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
+    # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.
+    assert fit.constraints[0][2] == pytest.approx(-1.0, abs=1e-7)
 
 
 PENDULUM_ARCS = (1.0, np.pi, np.pi, 2.0)
 
 
-def pendulum(**settings):
+LASTING = sf.RunningCost(lambda t, x, p: jnp.ones(()))
+"""Its integral is the time that a run takes."""
+
+
+def pendulum():
     """x'' + x = u with |u| <= 1, from four arcs away to rest at 0 in the least time."""
     start = np.zeros(2)
     for u, arc in zip((1, -1, 1, -1), PENDULUM_ARCS[::-1], strict=True):
         turn = np.array([[np.cos(arc), -np.sin(arc)], [np.sin(arc), np.cos(arc)]])
         start = [u, 0.0] + turn @ (start - [u, 0.0])
-    fields = {u: lambda t, x, p, u=u: jnp.stack([x[1], u - x[0]]) for u in (1.0, -1.0)}
-    system = sf.HybridSystem({"up": fields[1.0], "down": fields[-1.0]}, start.tolist())
-    costs = [sf.RunningCost(lambda t, x, p: jnp.ones(())), sf.TerminalConstraint(lambda x, p: x)]
-    tf = sf.Parameter(15.6, upper=37.0)
-    return sf.Problem(system, sf.Experiment(costs, ("down", "up") * 2, (1.0, 9.0, 10.5), 0.0, tf, **settings))
+    up, down = (lambda t, x, p, u=u: jnp.stack([x[1], u - x[0]]) for u in (1.0, -1.0))
+    data, tf = [LASTING, sf.TerminalConstraint(lambda x, p: x)], sf.Parameter(15.6, upper=37.0)
+    run = sf.Experiment(data, ("down", "up") * 2, (1.0, 9.0, 10.5), 0.0, tf)
+    return sf.Problem(sf.HybridSystem({"up": up, "down": down}, start.tolist()), run)
 
 
 def test_a_fit_that_ends_where_constraints_are_not_met_is_not_taken_for_a_better_one():
@@ -254,9 +226,7 @@ def test_a_fit_that_ends_where_constraints_are_not_met_is_not_taken_for_a_better
     problem, start = pendulum(), [0.467, 3.036, 4.731, 5.951]
     alone = sf.estimate(problem, start=start, strategy="local")
     assert alone.status.name == "INFEASIBLE"
-    assert not alone.success
     assert alone.cost < 9.0
-    assert alone.violated
     found = sf.estimate(problem, start=start)
     np.testing.assert_allclose(found.theta, np.cumsum(PENDULUM_ARCS), rtol=0, atol=1e-6)
     assert found.steps[-1].strategy == "many starts"
@@ -274,18 +244,6 @@ def test_a_slower_way_is_left_for_the_fastest():
     assert found.verdict.level == "good"  # those that ended at slower ways before do not count against it
 
 
-def test_a_problem_is_recognised_as_one_of_minimum_time():
-    problem = minimum_time()
-    assert is_minimum_time(problem, sf.estimate(problem, strategy="local"))
-    effort = [sf.RunningCost(lambda t, x, p: 1.0 + x[1] ** 2), sf.TerminalConstraint(lambda x, p: x[0] - 1.0)]
-    run = replace(problem.experiments[0], data=effort)
-    other = sf.Problem(problem.system, run)
-    assert not is_minimum_time(other, sf.estimate(other, strategy="local"))
-    late = replace(problem.experiments[0], transition_times=(sf.Parameter(0.7, lower=0.5, upper=2.0),))
-    bounded = sf.Problem(problem.system, late)
-    assert not is_minimum_time(bounded, sf.estimate(bounded, strategy="local"))
-
-
 def straight(target=1.0, min_duration=0.0, **bounds):
     """x' = 1, and a cost of how far x(tf) is from a target."""
     system = sf.HybridSystem({"goes": lambda t, x, p: jnp.ones(1)}, [0.0])
@@ -294,23 +252,26 @@ def straight(target=1.0, min_duration=0.0, **bounds):
     return sf.Problem(system, run, min_duration=min_duration)
 
 
-def test_bounds_and_minimum_duration_hold_tf():
-    assert sf.estimate(straight()).theta == pytest.approx([1.0], abs=1e-8)
-    late = sf.estimate(straight(target=7.0))
-    assert (late.theta.tolist(), [str(c) for c in late.active]) == ([4.0], ["tf at its upper bound 4"])
-    early = sf.estimate(straight(lower=1.5))
-    assert (early.theta.tolist(), [str(c) for c in early.active]) == ([1.5], ["tf at its lower bound 1.5"])
-    long = sf.estimate(straight(min_duration=1.25))
-    assert long.theta == pytest.approx([1.25], abs=1e-12)
-    assert [c.kind for c in long.active] == ["minimum duration"]
+@pytest.mark.parametrize(
+    ("settings", "end", "active"),
+    [
+        ({}, 1.0, []),
+        ({"target": 7.0}, 4.0, ["tf at its upper bound 4"]),
+        ({"lower": 1.5}, 1.5, ["tf at its lower bound 1.5"]),
+        ({"min_duration": 1.25}, 1.25, ["mode 1 ('goes') is at its minimum duration"]),
+    ],
+)
+def test_bounds_and_minimum_duration_hold_tf(settings, end, active):
+    fit = sf.estimate(straight(**settings))
+    assert fit.theta == pytest.approx([end], abs=1e-12 if active else 1e-8)
+    assert [str(constraint) for constraint in fit.active] == active
 
 
 def test_a_last_mode_that_vanishes_is_reported_as_collapsed():
     """x rises at 1, then at 1/2: the way to 1 is short in the first mode, which then takes all of the time."""
     system = sf.HybridSystem({"fast": lambda t, x, p: jnp.ones(1), "slow": lambda t, x, p: 0.5 * jnp.ones(1)}, [0.0])
-    costs = [sf.RunningCost(lambda t, x, p: jnp.ones(())), sf.TerminalConstraint(lambda x, p: x - 1.0)]
-    run = sf.Experiment(costs, ("fast", "slow"), (0.5,), 0.0, sf.Parameter(1.5, upper=4.0))
-    fit = sf.estimate(sf.Problem(system, run))
+    data, tf = [LASTING, sf.TerminalConstraint(lambda x, p: x - 1.0)], sf.Parameter(1.5, upper=4.0)
+    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("fast", "slow"), (0.5,), 0.0, tf)))
     np.testing.assert_allclose(fit.theta, [1.0, 1.0], rtol=0, atol=1e-8)
     assert [(c.kind, c.mode, c.position) for c in fit.active] == [("collapsed", "slow", 1)]
 
@@ -320,18 +281,12 @@ def test_a_last_mode_that_vanishes_is_reported_as_collapsed():
 
 GRID = np.linspace(0.0, 4.0, 9)
 SIGNAL = sf.ReferenceSignal.from_samples(GRID, GRID[:, None])
-LONG = sf.ReferenceSignal.from_samples(np.linspace(0.0, 5.0, 21), np.exp(-RATE * np.linspace(0.0, 5.0, 21))[:, None])
+LONG = sf.ReferenceSignal.from_samples(np.linspace(0.0, 5.0, 5), np.zeros((5, 1)))
+SHORT = sf.Input(GRID, GRID, kind="linear")
 
 
 def cool(data=SIGNAL, sequence=("cools",), times=(), **given):
     return sf.Experiment(data, sequence, times, 0.0, sf.Parameter(3.0, lower=2.0, upper=5.0), **given)
-
-
-def cool_late(lower):
-    """Samples from 1.1 to 3 s that are late by at least `lower`."""
-    late = sf.Measurements(TIMES + 1.0, np.exp(-RATE * TIMES), sigma=0.01, delay="lag")
-    lag = sf.Parameter(0.6, lower=lower, upper=1.05)
-    return sf.Problem(sf.HybridSystem({"cools": decay}, [1.0]), cool(late), {"k": 0.5, "lag": lag})
 
 
 def cool_until(**tf):
@@ -339,22 +294,14 @@ def cool_until(**tf):
 
 
 REFUSED = {
-    "A free tf needs a finite upper bound, .*; got the upper bound inf": lambda fit: cool_until(
-        lower=2.0, upper=np.inf
-    ),
+    "A free tf needs a finite upper bound, .*; got the upper bound inf": lambda fit: cool_until(upper=np.inf),
     "1.5, the lower bound of tf.; 5 of 20 do not, the first is": lambda fit: cool_until(lower=1.5),
-    r"tf must be a single number .* the shape \(2,\)": lambda fit: cool_until(value=[5.0, 6.0]),
     "tf has the unit 'h', but time_unit of .* is 's'": lambda fit: cool_until(lower=2.0, unit="h"),
     r"over \(t0, tf\) = \(0.0, 5.0, the upper bound of tf\)": lambda fit: cool(),
-    r"Input must be known over \(t0, tf\) = \(0.0, 5.0\)": lambda fit: cool(
-        LONG, inputs=sf.Input(GRID, GRID, kind="linear")
-    ),
-    r"strictly inside \(t0, tf\) = \(0.0, 3.0\); got \[3.0\]": lambda fit: cool(LONG, ("a", "b"), (3.0,)),
+    r"Input must be known over \(t0, tf\) = \(0.0, 5.0\)": lambda fit: cool(LONG, inputs=SHORT),
     r"\(t0, tf\) = \(0.0, 5.0\), with the upper bound": lambda fit: sf.simulate(minimum_time(), [1.0, 5.5]),
     "must not decrease": lambda fit: sf.simulate(minimum_time(), [2.0, 1.5]),
-    r"only from 1 to 1.1 s are all samples .* = \(0.0, 2.0\)": lambda fit: cool_late(0.4),
     "a profile does not support guards and terminal constraints": lambda fit: fit.profile("tf"),
-    "times must not lie after tf where tf is": lambda fit: fit.predict([fit.final_times[0] + 1e-3]),
 }
 
 

@@ -37,12 +37,6 @@ def pour(t, x, p):
 SQRT = f"sqrt at test_finiteness.py:{pour.__code__.co_firstlineno + 1}"
 
 
-def make_tank(k=0.8):
-    """A tank that runs empty at t = 2 / k."""
-    noise = 1e-2 * np.random.default_rng(0).normal(size=len(TIMES))
-    return make_problem(drain, np.maximum(1.0 - 0.4 * TIMES, 0.0) ** 2 + noise, {"q": 0.0, "k": k})
-
-
 @pytest.mark.parametrize("strategy", ["local", "auto"])
 def test_a_tank_that_is_empty_at_the_start_is_told_at_once(strategy):
     problem = make_problem(pour, 1.0 - np.exp(-TIMES), {"q": 1.0, "k": 0.8}, x0=(0.0,))
@@ -52,9 +46,7 @@ def test_a_tank_that_is_empty_at_the_start_is_told_at_once(strategy):
     assert time.perf_counter() - began < 1.0
     assert found.status is sf.Status.NONFINITE_START
     assert found.steps == ()
-    issue = found.reason
-    assert (issue.kind, issue.subjects) == ("undefined", ("mode 'm'", *SQRT.split(" at "), ""))
-    assert (issue.figures["t"], issue.figures["x"][0]) == (0.0, 0.0)
+    assert found.reason.subjects == ("mode 'm'", *SQRT.split(" at "), "")
     assert f"mode 'm' has no finite derivatives at t = 0, x = [0.0]: the derivative of {SQRT}" in str(found.verdict)
     assert "jnp.sqrt(jnp.maximum(x, 1e-9)), or make what happens there a mode of its own." in str(found.verdict)
     assert "Mode 'm' has no finite derivatives at t = 0" in found.message
@@ -62,8 +54,10 @@ def test_a_tank_that_is_empty_at_the_start_is_told_at_once(strategy):
 
 @pytest.mark.parametrize("k", [0.8, 0.3])
 def test_a_tank_that_runs_empty_is_fitted(k):
-    """From a guess that runs empty, and from one that does not: the slope of the root is infinite at 0."""
-    found = sf.estimate(make_tank(k))
+    """From a guess that runs empty, at t = 2 / k, where the root has an infinite slope, and from one that does not."""
+    noise = 1e-2 * np.random.default_rng(0).normal(size=len(TIMES))
+    values = np.maximum(1.0 - 0.4 * TIMES, 0.0) ** 2 + noise
+    found = sf.estimate(make_problem(drain, values, {"q": 0.0, "k": k}))
     assert found.verdict.level == "good"
     assert found.parameters["k"] == pytest.approx(0.8, abs=0.01)
     assert found.engine.name == "native"
@@ -86,24 +80,18 @@ def test_a_line_search_that_failed_beside_what_is_undefined_says_so():
     assert found.status is sf.Status.LINE_SEARCH_FAILED
     assert f"log at test_finiteness.py:{mode.__code__.co_firstlineno + 1} is not finite" in found.message
     assert "mode 'm' has no finite value at t = 4, x = [" in str(found.verdict)
-    assert "kink" not in found.message
 
 
 def test_a_guess_that_cannot_be_integrated_names_the_operation():
     def mode(t, x, p):
         return -p["k"] * x ** p["n"]
 
-    problem = make_problem(mode, np.zeros(len(TIMES)), {"k": 1.5, "n": 0.5})
-    place = rf"\(pow at test_finiteness.py:{mode.__code__.co_firstlineno + 1}\)"
-    with pytest.raises(NotIntegrableError, match=rf"returned \[nan\] at t = 1\.33.* {place}"):
-        sf.estimate(problem, strategy="local")
-
-
-def test_a_state_that_grows_without_bound_accuses_no_operation():
-    problem = make_problem(lambda t, x, p: p["k"] * x * x, np.zeros(len(TIMES)), {"k": 1.0})
-    with pytest.raises(NotIntegrableError) as raised:
-        sf.estimate(problem, strategy="local")
-    assert "test_finiteness" not in str(raised.value)
+    line = mode.__code__.co_firstlineno + 1
+    with pytest.raises(NotIntegrableError, match=rf"\[nan\] at t = 1\.33.* \(pow at test_finiteness.py:{line}\)"):
+        sf.estimate(make_problem(mode, np.zeros(len(TIMES)), {"k": 1.5, "n": 0.5}), strategy="local")
+    # A state that grows without bound accuses no operation
+    with pytest.raises(NotIntegrableError, match=r"^((?!test_finiteness).)*$"):
+        sf.estimate(make_problem(lambda t, x, p: p["k"] * x * x, np.zeros(len(TIMES)), {"k": 1.0}), strategy="local")
 
 
 def explain(problem):
@@ -117,16 +105,15 @@ def test_an_observation_is_named_at_its_samples_alone():
     def observe(t, x, p):
         return jnp.linalg.norm(x)[None]
 
-    later = make_problem(mode, TIMES[:, None], {"u": 1.0}, x0=(0.0, 0.0), observe=observe)
-    assert explain(later) is None
-    assert np.isfinite(sf.evaluate(later).gradient).all()
-    times = np.append(0.0, TIMES)
-    issue = explain(make_problem(mode, times[:, None], {"u": 1.0}, x0=(0.0, 0.0), times=times, observe=observe))
+    def build(times):
+        return make_problem(mode, times[:, None], {"u": 1.0}, x0=(0.0, 0.0), times=times, observe=observe)
+
+    assert explain(build(TIMES)) is None
+    issue = explain(build(np.append(0.0, TIMES)))
     line = observe.__code__.co_firstlineno + 1
     assert issue.subjects == ("observe 1", "jnp.linalg.norm", f"test_finiteness.py:{line}", "")
-    assert (issue.figures["t"], issue.figures["x"]) == (0.0, (0.0, 0.0))
-    assert issue.figures["valued"] == 1.0
-    assert "keep it from 0, as jnp.sqrt(jnp.sum(x**2) + 1e-12)" in str(issue).replace("Keep", "keep")
+    assert (issue.figures["t"], issue.figures["x"], issue.figures["valued"]) == (0.0, (0.0, 0.0), 1.0)
+    assert "eep it from 0, as jnp.sqrt(jnp.sum(x**2) + 1e-12)" in str(issue)
 
 
 def test_modes_with_inputs_and_the_second_of_two_modes():
@@ -136,43 +123,39 @@ def test_modes_with_inputs_and_the_second_of_two_modes():
     def empty(t, x, p, u):
         return -p["k"] * jnp.sqrt(u["flow"] - 1.0) * x
 
-    flow = sf.Input([0.0, 4.0], {"flow": [2.0, 0.0]}, kind="linear")
-    problem = make_problem({"fill": fill, "empty": empty}, TIMES, {"k": 1.0}, inputs=flow)
-    with pytest.raises(NotIntegrableError, match=r"mode 'empty' returned .* \(sqrt at test_finiteness.py"):
-        sf.estimate(problem, strategy="local")
-
     def drip(t, x, p, u):
         return -p["k"] * (jnp.maximum(u["flow"] - 1.0, 0.0) * x) ** 0.5
 
+    flow = sf.Input([0.0, 4.0], {"flow": [2.0, 0.0]}, kind="linear")
+    with pytest.raises(NotIntegrableError, match=r"mode 'empty' returned .* \(sqrt at test_finiteness.py"):
+        sf.evaluate(make_problem({"fill": fill, "empty": empty}, TIMES, {"k": 1.0}, inputs=flow))
     issue = explain(make_problem({"fill": fill, "drip": drip}, TIMES, {"k": 1.0}, inputs=flow))
     assert issue.subjects[:2] == ("mode 'drip'", "pow")
     assert issue.figures["t"] >= 2.0
 
 
 def test_other_functions_and_runs_are_named():
-    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, lambda p: jnp.sqrt(p["x0"])[None])
+    modes = {"m": lambda t, x, p: -p["k"] * x}
     log = sf.Measurements(TIMES, TIMES, sigma=1.0)
     runs = [
         sf.Experiment(log, ("m",), (), 0.0, 4.0, parameter_map={"x0": name}, name=run)
         for name, run in (("a", "first"), ("b", "second"))
     ]
+    system = sf.HybridSystem(modes, lambda p: jnp.sqrt(p["x0"])[None])
     issue = explain(sf.Problem(system, runs, {"k": 1.0, "a": 1.0, "b": 0.0}))
-    assert (issue.subjects[0], issue.subjects[1], issue.subjects[3]) == ("initial_state 1", "sqrt", "second")
     assert "initial_state 1 of second has no finite derivatives: the derivative of sqrt" in str(issue).lower()
-    cost = sf.TerminalCost(lambda x, p: jnp.sqrt(-x[0]))
-    run = sf.Experiment(cost, ("m",), (), 0.0, 1.0)
-    issue = explain(sf.Problem(sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, [1.0]), run, {"k": 1.0}))
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: jnp.sqrt(-x[0])), ("m",), (), 0.0, 1.0)
+    issue = explain(sf.Problem(sf.HybridSystem(modes, [1.0]), run, {"k": 1.0}))
     assert issue.subjects[:2] == ("TerminalCost 1", "sqrt")
     assert issue.figures["valued"] == 0.0
     assert "t" not in issue.figures
 
 
-def find(mode, states, n=1):
-    problem = make_problem(mode, np.ones((30, n)), {"a": 1.5}, x0=(0.3,) * n)
+def find(mode, states):
+    problem = make_problem(mode, np.ones(30), {"a": 1.5}, x0=(0.3,))
     states = np.array(states, dtype=float)
     found = find_undefined(problem.structures[0].modes[0], [np.zeros(len(states)), states], {"a": 1.5})
-    if found is not None:
-        assert found.line == f"test_finiteness.py:{mode.__code__.co_firstlineno}"
+    assert found is None or found.line == f"test_finiteness.py:{mode.__code__.co_firstlineno}"
     return None if found is None else (found.point, found.operation, found.order, found.valued)
 
 
@@ -182,9 +165,7 @@ def find(mode, states, n=1):
     [
         (lambda t, x, p: -jnp.log(x) * p["a"], [[1.0], [-1.0]], (1, "log", 0, False)),
         (lambda t, x, p: -p["a"] / x, [[1.0], [2.0], [0.0]], (2, "div", 0, False)),
-        (lambda t, x, p: -(x ** p["a"]), [[1.0], [-0.1]], (1, "pow", 0, False)),
         (lambda t, x, p: -p["a"] * x**1.5, [[1.0], [0.0]], (1, "pow", 2, True)),
-        (lambda t, x, p: p["a"] * jnp.abs(x) ** 0.5, [[0.0], [1.0]], (0, "pow", 1, True)),
         (lambda t, x, p: jnp.where(x > 0, jnp.sqrt(x), 0.0) * p["a"], [[1.0], [-1.0]], (1, "sqrt", 0, True)),
         (lambda t, x, p: jax.lax.fori_loop(0, 3, lambda k, y: jnp.sqrt(y), x) * p["a"], [[0.0]], (0, "scan", 1, True)),
         (lambda t, x, p: jax.jit(lambda y: jnp.sqrt(y))(x) * p["a"], [[0.0]], (0, "sqrt", 1, True)),
@@ -197,7 +178,6 @@ def find(mode, states, n=1):
         # Finite throughout
         (lambda t, x, p: jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0) * p["a"], [[1.0], [-1.0]], None),
         (lambda t, x, p: jnp.sqrt(jnp.zeros(1)) + jnp.sqrt(t) + p["a"] * x, [[0.0]], None),
-        (lambda t, x, p: jax.nn.softplus(x) * p["a"], [[0.0], [1e3]], None),
         # No operation is undefined: it overflows
         (lambda t, x, p: p["a"] * x * x, [[1e200]], None),
     ],

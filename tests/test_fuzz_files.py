@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import random
 import re
-import signal
 import traceback
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import jax
 import pytest
@@ -22,8 +20,7 @@ from switchfit.engine.native.program import drop_programs
 from switchfit.io.problem_file import tables
 
 SIZES = [pytest.param(40, id="short"), pytest.param(1200, id="long", marks=pytest.mark.fuzz)]
-LONGEST = 120
-"""Seconds after which a command hangs."""
+
 
 ODD = (
     "true", "0", "1", "-1", "2", "3", "1" + "0" * 30, "1" + "0" * 5000, "0.0", "-0.0", "0.5", "3.0", "1e308", "1e-320",
@@ -94,39 +91,15 @@ PIECES = {
 }  # fmt: skip
 """What is put into a file of each kind."""
 
-WORDS = (
-    "fit", "check", "simulate", "paper", "--help", "--version", "--out", "--out=", "--hessian", "exact", "none",
-    "newton", "--tolerance", "1e-3", "-1", "nan", "inf", "0", "abc", "1e400", "--max-iterations", "1", "2.5",
-    "--no-run", "--no-figures", "--certificate", "--debug", "--quick", "--only", "trial", "--", "-", "-x", "--nothing",
-    "é", "🙂", "problem.toml", "log.csv", "room.py", ".", "/dev/null", "/dev/zero", "nowhere.toml", "nowhere/",
-    "problem.toml/x", "log.csv/out", "--install-completion", "", "a\0b", "\udcff", "x" * 300, "x" * 5000, str(10**30),
-)  # fmt: skip
-
-
-class Hangs(BaseException):
-    """A command that takes too long."""
-
 
 def outcome(*arguments: str) -> str:
     """What became of a command: its exit code, or what is wrong with the way it ended."""
-
-    def ring(number: int, frame: Any) -> None:
-        raise Hangs
-
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.alarm(LONGEST)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of numbers near the limits of float64, and those of the model's own text
-            result = CliRunner().invoke(cli.app, list(arguments))
-    except Hangs:
-        return "hangs"
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of numbers near the limits of float64, and those of the model's own text
+        result = CliRunner().invoke(cli.app, list(arguments))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         return "".join(traceback.format_exception(result.exception))
-    if result.exit_code not in (0, 1, 2) or ("Traceback" in result.stderr and "--debug" not in arguments):
+    if result.exit_code not in (0, 1, 2) or "Traceback" in result.stderr:
         return f"exit code {result.exit_code}\n{result.stderr}"
     if result.exit_code and not result.stderr.strip():
         return f"exit code {result.exit_code} without a word"
@@ -179,19 +152,21 @@ def test_damaged_files(count, name, change, least, folder):
     assert found["2"] >= least * count, found
 
 
-@pytest.mark.parametrize("count", SIZES)
-def test_command_lines(count, folder, monkeypatch):
+@pytest.mark.parametrize("command", ["fit", "check", "simulate", "paper"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["nowhere.toml"], ["."], ["/dev/zero"], ["problem.toml/x"], [""], ["a\0b"], ["\udcff"], ["x" * 5000]),
+        *(["problem.toml", *more] for more in (["--out"], ["--out", "log.csv/out"], ["--nothing"], ["-x"], ["é"])),
+        *(["problem.toml", "--max-iterations", number] for number in ("-1", "2.5", "nan", "1e400", str(10**30))),
+        *(["problem.toml", "--hessian", "newton"], ["--only", "nothing"], ["--", "-"]),
+    ],
+    ids=lambda words: ascii(" ".join(words))[:40],
+)
+def test_command_lines(command, words, folder, monkeypatch):
     def enough(*arguments, **options):
         raise ValueError("enough")
 
     for module, name in ((sf, "estimate"), (sf, "check_derivatives"), (sf, "simulate"), (paper, "run")):
         monkeypatch.setattr(module, name, enough)
-    found: Counter[str] = Counter()
-    for number in range(count):
-        rng = random.Random(number)
-        words = [rng.choice(WORDS) for _ in range(rng.choice([0, 1, 2, 3, 5]))]
-        arguments = [rng.choice(["check", "fit", "simulate", "paper"]), *words] if rng.random() < 0.7 else words
-        said = outcome(*arguments)
-        assert said in "012", f"{arguments}: {said}"
-        found[said] += 1
-    assert found["2"] >= 0.5 * count, found
+    assert outcome(command, *words) == "2"

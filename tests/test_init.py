@@ -1,6 +1,5 @@
 """Problems to begin with: `switchfit init` and `switchfit examples`."""
 
-import ast
 import re
 import shutil
 import tomllib
@@ -46,14 +45,12 @@ def test_without_a_log_an_example_is_written_that_can_be_fitted(tmp_path, monkey
 
 def test_from_a_log(tmp_path):
     log = write_log(tmp_path / "tank.csv")
-    result = run("init", tmp_path / "tank", "--from", log)
-    assert result.exit_code == 0, result.output
     folder = tmp_path / "tank"
+    result = run("init", folder, "--from", log)
+    assert result.exit_code == 0, result.output
     assert (folder / "tank.csv").read_bytes() == log.read_bytes()
-    contents = tomllib.loads((folder / "problem.toml").read_text())
-    (data,) = contents["experiments"][0]["data"]
+    (data,) = tomllib.loads((folder / "problem.toml").read_text())["experiments"][0]["data"]
     assert (data["file"], data["time"], data["columns"]) == ("tank.csv", "t", ["level"])  # idle: constant; count: rows
-    ast.parse((folder / "model.py").read_text())
     loaded = load_problem(folder / "problem.toml")
     fit = sf.estimate(loaded.problem, **loaded.options)
     assert fit.verdict.level == "good"
@@ -86,13 +83,11 @@ def test_a_large_log_is_referred_to(tmp_path, monkeypatch):
 
 def test_positions_are_east_and_north(tmp_path):
     points = "".join(
-        f'<trkpt lat="{48 + 1e-5 * max(k - 20, 0)}" lon="{11 + 1e-5 * min(k, 20)}"><ele>500</ele>'
+        f'<trkpt lat="{48 + 1e-5 * max(k - 20, 0)}" lon="{11 + 1e-5 * min(k, 20)}">'
         f"<time>2024-05-01T10:00:{k:02d}Z</time></trkpt>"
         for k in range(50)
     )
-    (tmp_path / "track.gpx").write_text(
-        f'<gpx version="1.1" creator="t" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
-    )
+    (tmp_path / "track.gpx").write_text(f'<gpx version="1.1" creator="t"><trk><trkseg>{points}</trkseg></trk></gpx>')
     channels, _ = choose_channels(sf.read_log(tmp_path / "track.gpx"))
     assert channels == ["east", "north"]
     write_first_problem(tmp_path / "new", tmp_path / "track.gpx")
@@ -103,32 +98,26 @@ def test_positions_are_east_and_north(tmp_path):
 
 
 def test_nothing_is_overwritten(tmp_path):
-    (tmp_path / "room").mkdir()
-    (tmp_path / "room" / "notes.txt").write_text("mine")
-    for command in (("init", tmp_path / "room"), ("examples", "toss", tmp_path / "room")):
+    room = tmp_path / "room"
+    room.mkdir()
+    assert run("init", room).exit_code == 0  # into an empty folder
+    written = {path: path.read_text() for path in room.iterdir()}
+    for command in (("init", room), ("examples", "toss", room), ("init", room / "log.csv")):
         result = run(*command)
         assert result.exit_code == 2
         assert "exists already, and nothing is overwritten" in result.stderr
-    assert [path.name for path in (tmp_path / "room").iterdir()] == ["notes.txt"]
-    (tmp_path / "file").write_text("mine")
-    assert run("init", tmp_path / "file").exit_code == 2
-    (tmp_path / "empty").mkdir()
-    assert run("init", tmp_path / "empty").exit_code == 0
+    assert {path: path.read_text() for path in room.iterdir()} == written
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("t,a\n" + "".join(f"{k},1.0\n" for k in range(20)), "has no channel with 8 samples or more that changes"),
-        ("t,a\n0,1\n1,2\n", "has no channel"),
-        (None, "missing.csv"),
-    ],
+    ("rows", "message"),
+    [(["1.0"] * 20, "has no channel with 8 samples or more that changes"), ("12", "has no channel"), (None, "log.csv")],
+    ids=["constant", "short", "missing"],
 )
-def test_logs_that_cannot_be_used(content, message, tmp_path):
-    log = tmp_path / "missing.csv"
-    if content is not None:
-        log.write_text(content)
-    result = run("init", tmp_path / "new", "--from", log)
+def test_logs_that_cannot_be_used(rows, message, tmp_path):
+    if rows:
+        (tmp_path / "log.csv").write_text("t,a\n" + "".join(f"{k},{value}\n" for k, value in enumerate(rows)))
+    result = run("init", tmp_path / "new", "--from", tmp_path / "log.csv")
     assert result.exit_code == 2
     assert message in result.stderr
     assert not (tmp_path / "new").exists()
@@ -138,22 +127,17 @@ def test_logs_that_cannot_be_used(content, message, tmp_path):
 
 
 def test_examples_are_listed_with_what_they_are_about():
-    result = run("examples")
-    assert result.exit_code == 0
-    listed = [line.split(maxsplit=1) for line in result.stdout.splitlines()]
+    listed = [line.split(maxsplit=1) for line in run("examples").stdout.splitlines()]
     assert {name for name, _ in listed} == {path.stem for path in EXAMPLES.iterdir() if not path.name.startswith("_")}
     assert all(len(about) > 10 for _, about in listed)
 
 
 def test_an_example_is_copied_and_can_be_fitted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    result = run("examples", "toss")
-    assert result.exit_code == 0, result.output
-    assert "switchfit fit toss/problem.toml" in result.stdout
+    assert "switchfit fit toss/problem.toml" in run("examples", "toss").stdout
     names = {path.name for path in EXAMPLES.joinpath("toss").iterdir()} - {"__pycache__"}
     assert {path.name for path in Path("toss").iterdir()} == names
-    result = run("examples", "own_model", "mine")
-    assert "python mine/own_model.py" in result.stdout
+    assert "python mine/own_model.py" in run("examples", "own_model", "mine").stdout
     assert Path("mine", "own_model.py").is_file()
     assert "switchfit modes covid/search.toml" in run("examples", "covid").output
     result = run("examples", "moon")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import FISHING, fishing, linear
+from models import FISHING, LATE_RAMP, RAMP, fishing
 from test_protocol import BOUNCE, DATA, GUARDS, MODES, MORE, problem, samples
 
 import switchfit as sf
@@ -63,38 +63,36 @@ def dosed():
     return sf.Problem(sf.HybridSystem(MODES, [0.4, 0.1]), run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
 
 
-def rates_of(given, theta=None):
+def rates_of(given):
     """The rates, and the meshes that they were computed on."""
     whole = add_all_modes(given)
-    theta = given.initial_theta if theta is None else theta
-    evaluator = Evaluator(whole, theta)
-    return compute_rates(evaluator, theta), evaluator.meshes
+    evaluator = Evaluator(whole, given.initial_theta)
+    return compute_rates(evaluator, given.initial_theta), evaluator.meshes
 
 
-def with_pulse(given, e, mode, time, length=0.0):
-    """The problem and theta with a pulse behind the transitions up to `time`, and the place of its end in theta."""
+def with_pulse(given, e, mode, time):
+    """The problem and theta with a pulse of no length behind the transitions up to `time`, and its end's place."""
     run, theta = given.experiments[e], given.initial_theta
     tau = theta[given.unknowns.times[e]]
     i = int(np.searchsorted(tau, time, "right"))
     sequence = [*run.mode_sequence[: i + 1], mode, *run.mode_sequence[i:]]
     count = len(run.transition_times)
-    times = np.concatenate([np.insert(tau[:count], i, [time, time + length]), tau[count:]])
+    times = np.concatenate([np.insert(tau[:count], i, [time, time]), tau[count:]])
     guess = tuple(np.sort(times[: count + 2]) + 1e-4 * np.arange(1, count + 3))
     runs = list(given.experiments)
     runs[e] = replace(run, mode_sequence=sequence, transition_times=guess)
     longest = max(len(r.transition_times) + len(r.jump_times) for r in given.experiments)
     more = replace(given, experiments=runs, max_transitions=longest + 2)
     where, at = more.unknowns.times[e], np.zeros(len(more.theta_names))
-    kept = np.setdiff1d(np.arange(len(at)), where)
-    at[kept] = np.delete(theta, given.unknowns.times[e])
+    at[np.setdiff1d(np.arange(len(at)), where)] = np.delete(theta, given.unknowns.times[e])
     at[where] = times
     return more, at, int(where[i + 1])
 
 
-def derivative(given, meshes, e, mode, time, side=1):
+def derivative(given, meshes, e, mode, time):
     """dJ/d(length) of a pulse, as the gradient in the second of two equal transition times."""
     more, theta, place = with_pulse(given, e, mode, time)
-    return Evaluator(more, meshes=meshes)(theta, side).gradient[place]
+    return Evaluator(more, meshes=meshes)(theta).gradient[place]
 
 
 CASES = {name: lambda data=data: problem(data, parameters=MORE, rtol=1e-11, atol=1e-13) for name, data in KINDS.items()}
@@ -112,17 +110,14 @@ def test_rates_are_derivatives_of_sequences_with_a_pulse_of_no_length(name):
     knots = {0.5, 1.0, 2.0} if name == "inputs" else {0.2, 1.0, 2.4}
     rows = [r for r, t in enumerate(found.times) if any(abs(t - knot) < 1e-9 for knot in (0.0, 1.1, 2.3, *knots))]
     assert len(rows) >= 4
-    assert name != "jumps, free tf" or found.times[-1] < 2.5
     rows += [*(r - 1 for r in rows[1:]), 1, len(found.times) // 2, len(found.times) - 1]  # also before a knot
     compared = 0
     for r in rows:
-        for k, mode in enumerate(found.modes):
-            if k == found.active[r]:
-                assert found.rate[r, k] == 0.0
-            elif np.isfinite(found.rate[r, k]):
-                expected = derivative(given, meshes, 0, mode, found.times[r])
-                assert found.rate[r, k] == pytest.approx(expected, abs=2e-8 * scale)
-                compared += abs(expected) > 1e-3 * scale
+        assert found.rate[r, found.active[r]] == 0.0
+        for k in set(np.flatnonzero(np.isfinite(found.rate[r]))) - {found.active[r]}:
+            expected = derivative(given, meshes, 0, found.modes[k], found.times[r])
+            assert found.rate[r, k] == pytest.approx(expected, abs=2e-8 * scale)
+            compared += abs(expected) > 1e-3 * scale
     assert compared >= 8
 
 
@@ -141,18 +136,17 @@ def test_engines_agree(name):
         np.testing.assert_allclose(found.rate, expected.rate, rtol=1e-10, atol=1e-11 * np.nanmax(abs(found.rate)))
 
 
-def test_rates_with_reset_maps_are_not_defined():
+@pytest.mark.parametrize("system", [None, sf.HybridSystem(MODES, [0.4, 0.1], guards=GUARDS)], ids=["reset", "guard"])
+def test_rates_are_not_defined_where_a_pulse_would_end_with_a_reset_map_or_guard(system):
     """A bounce from falling to swinging: a pulse of falling in swinging would end with it, one of resting would not."""
-    found = sf.insertion(problem(samples()))
+    found = sf.insertion(problem(samples(), **({} if system is None else {"system": system})))
     names = np.array(found.modes)[found.active]
     swing, fall, rest = (found.rate[:, found.modes.index(mode)] for mode in ("swing", "fall", "rest"))
     np.testing.assert_array_equal(np.isnan(fall), names == "swing")
-    np.testing.assert_array_equal(np.isnan(swing), names == "fall")
     assert np.isfinite(rest).all()
-    guarded = sf.HybridSystem(MODES, [0.4, 0.1], guards=GUARDS)
-    found = sf.insertion(problem(samples(), system=guarded))
-    names = np.array(found.modes)[found.active]
-    np.testing.assert_array_equal(np.isnan(found.rate[:, found.modes.index("fall")]), names == "swing")
+    if system is None:
+        np.testing.assert_array_equal(np.isnan(swing), names == "fall")
+        assert str(found).splitlines()[-1].endswith("a pulse of fall in swing, swing in fall.")
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
@@ -163,28 +157,25 @@ def test_guards_move_with_the_pulse(engine):
     run = sf.Experiment(samples(), ("swing", "fall"), (1.1,), 0.0, 3.0)
     given = sf.Problem(system, run, fixed, rtol=1e-11, atol=1e-13, engine=engine)
 
-    def solve(start):
+    def solve(given, theta):
         """Newton's method on the guard."""
-        theta = start.copy()
         for _ in range(20):
-            at = sf.evaluate(given_at, theta)
-            theta = theta - at.constraints[0] / at.jacobian[0, free] * unit
-        assert abs(sf.evaluate(given_at, theta).constraints[0]) < 1e-12
+            at = sf.evaluate(given, theta)
+            theta = theta - at.constraints[0] / at.jacobian[0, 0]
+        assert abs(sf.evaluate(given, theta).constraints[0]) < 1e-12
         return theta
 
-    given_at, free, unit = given, 0, np.array([1.0])
-    theta = solve(np.array([0.9]))
+    theta = solve(given, np.array([0.9]))
     found = sf.insertion(given, theta)
     r = int(np.argmin(abs(found.times - 0.4)))
-    rate = found.rate[r, found.modes.index("rest")]
     costs = []
-    for length in (0.0, 2e-4, 4e-4):
-        pulse = [sf.Parameter(found.times[r] + s, fixed=True) for s in (0.0, max(length, 1e-9))]
+    for length in (1e-9, 2e-4, 4e-4):
+        pulse = [sf.Parameter(found.times[r] + s, fixed=True) for s in (0.0, length)]
         longer = replace(run, mode_sequence=("swing", "rest", "swing", "fall"), transition_times=(*pulse, theta[0]))
-        given_at = replace(given, experiments=longer, engine="auto")
-        costs.append(sf.evaluate(given_at, solve(theta)).cost)
+        pulsed = replace(given, experiments=longer, engine="auto")
+        costs.append(sf.evaluate(pulsed, solve(pulsed, theta)).cost)
     slope = (4 * costs[1] - 3 * costs[0] - costs[2]) / 4e-4
-    assert rate == pytest.approx(slope, rel=1e-4)
+    assert found.rate[r, found.modes.index("rest")] == pytest.approx(slope, rel=1e-4)
 
 
 @pytest.mark.slow
@@ -202,13 +193,14 @@ def test_implicit_steps_have_rates_too():
 
 
 EMPTY = Schedule(("idle",), np.zeros(0), 0.0, 12.0)
+TWO = Schedule(("idle", "fishing", "idle"), np.array([2.6, 4.34]), 0.0, 12.0)
 NONE = np.zeros(0)
 
 
-def search(given, schedules, parameters=NONE, switch_cost=0.0, **settings):
+def search(given, schedules, parameters=NONE, **settings):
     """Return the best fit for each number of switches, and how many were fitted."""
     fitter = Fitter(given, build_library(given, **settings))
-    improver = Improver(fitter, Pool(Score.of(given, switch_cost), "cost"), lambda what: None)
+    improver = Improver(fitter, Pool(Score.of(given, 0.0), "cost"), lambda what: None)
     insert_modes(improver, schedules, parameters)
     return improver.pool.by_switches, fitter.fits
 
@@ -232,7 +224,6 @@ def cost_of(given, schedule):
 
 def test_a_problem_to_search_may_have_nothing_to_estimate():
     given = fishing((), max_transitions=10)
-    assert given.theta_names == ()
     assert sf.evaluate(given).cost == pytest.approx(6.062277, abs=1e-6)
     assert sf.simulate(given).states.shape[1] == 2
     calls = sf.estimate, sf.check_derivatives, lambda p: sf.multistart(p, 3), lambda p: sf.monte_carlo(p, 3)
@@ -243,101 +234,68 @@ def test_a_problem_to_search_may_have_nothing_to_estimate():
 
 def test_proposals_lower_j_as_the_rate_says():
     given = fishing((), max_transitions=10)
-    current = Schedule(("idle", "fishing", "idle"), np.array([2.6, 4.34]), 0.0, 12.0)
-    before = cost_of(given, current)
-    found = pulses(given, [current], max_switches=10)
+    found = pulses(given, [TWO], max_switches=10)
     changes, compared = [change for change, _ in found], 0
     assert changes == sorted(changes)
+    assert changes[-1] < 0
     assert {schedule.sequence.count("fishing") for _, [schedule] in found} == {2}
     for change, [schedule] in found:
-        sequence, times = schedule.sequence, schedule.times
-        new = np.append(np.setdiff1d(times, current.times), 12.0)  # the last one ends with the horizon
-        assert np.isclose(new[1] - new[0], [0.02 * 12.0, 0.1 * 12.0, 0.75 * 1.74]).any()
-        assert change < 0
-        if len(sequence) == 5:
-            short = np.where(times == new[1], new[0] + 1e-3, times)
-            fell = cost_of(given, current.replace(sequence, short)) - before
-            assert fell == pytest.approx(change / (new[1] - new[0]) * 1e-3, rel=2e-2)
+        begin, end = np.append(np.setdiff1d(schedule.times, TWO.times), 12.0)[:2]  # the last ends with the horizon
+        assert np.isclose(end - begin, [0.02 * 12.0, 0.1 * 12.0, 0.75 * 1.74]).any()
+        if len(schedule.sequence) == 5:
+            short = TWO.replace(schedule.sequence, np.where(schedule.times == end, begin + 1e-3, schedule.times))
+            fell = cost_of(given, short) - cost_of(given, TWO)
+            assert fell == pytest.approx(change / (end - begin) * 1e-3, rel=2e-2)
             compared += 1
     assert compared >= 3
 
 
 def test_a_library_is_respected():
     given = fishing((), max_transitions=10)
-    current = Schedule(("idle", "fishing", "idle"), np.array([2.6, 4.34]), 0.0, 12.0)
-    found = pulses(given, [current], max_switches=3)
+    found = pulses(given, [TWO], max_switches=3)
     assert {each.sequence for _, [each] in found} == {("idle", "fishing", "idle", "fishing")}  # inside it takes four
     assert pulses(given, [EMPTY], library=("idle",), max_switches=10) == []
-    for _, [each] in pulses(given, [current], max_switches=10, min_duration={"fishing": 2.0}):
+    for _, [each] in pulses(given, [TWO], max_switches=10, min_duration={"fishing": 2.0}):
         pairs = zip(each.durations, each.sequence, strict=True)
         assert all(lasted >= 2.0 for lasted, mode in pairs if mode == "fishing")
-    last = pulses(given, [current], max_switches=10, last="idle")
-    assert all(each.sequence[-1] == "idle" for _, [each] in last)
+    assert all(each.sequence[-1] == "idle" for _, [each] in pulses(given, [TWO], max_switches=10, last="idle"))
 
 
 def test_rates_beside_jumps_and_collapsed_modes():
     jump = sf.Jump([5.9], lambda t, x, p: x + jnp.array([0.3, 0.0]))
-    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
-    run = sf.Experiment(cost, ("idle", "fishing"), (6.0,), 0.0, 12.0, jumps=jump)
+    run = replace(fishing((6.0,)).experiments[0], jumps=jump)
     given = sf.Problem(FISHING, run, min_duration=0.5)
     close = Schedule(("idle", "fishing", "idle", "fishing"), np.array([3.0, 3.6, 4.2]), 0.0, 12.0)
     assert rate(given, close).trajectory.jump_times.tolist() == [5.9]
-    gone = Schedule(("idle", "fishing", "idle"), np.array([3.0, 3.0]), 0.0, 12.0)
+    gone = Schedule(TWO.sequence, np.array([3.0, 3.0]), 0.0, 12.0)
     found, expected = (rate(fishing((), max_transitions=10), each).best() for each in (gone, EMPTY))
     assert found[0] == expected[0]
     assert found[1] == pytest.approx(expected[1], abs=0.5)
 
 
-TABLE = {0: 6.062277, 1: 3.136445, 2: 1.382755, 4: 1.349674, 6: 1.346318, 8: 1.345295218, 10: 1.344846158}
-"""J of the fishing problem by the number of switches."""
-
-
 def test_fishing_from_the_empty_schedule():
+    """J by the number of switches is that of published times."""
     found, fits = search(fishing((), max_transitions=10), [EMPTY], max_switches=10)
-    for switches, cost in TABLE.items():
-        assert found[switches].cost == pytest.approx(cost, abs=1e-6)
+    table = {0: 6.062277, 1: 3.136445, 2: 1.382755, 4: 1.349674, 6: 1.346318, 8: 1.345295218, 10: 1.344846158}
+    assert {switches: found[switches].cost for switches in table} == pytest.approx(table, abs=1e-6, rel=0)
     assert fits < 200
-
-
-def test_a_cost_of_switches_ends_the_search():
-    """From 2 to 4 switches J falls by 0.033, from 4 to 6 by 0.0034."""
-    costs = {}
-    for switch_cost in (0.0, 0.01, 0.1):
-        found, _ = search(fishing((), max_transitions=10), [EMPTY], switch_cost=switch_cost, max_switches=10)
-        costs[switch_cost] = min(found, key=lambda n: found[n].cost + switch_cost * n), max(found)
-    assert costs[0.0] == (10, 10)
-    assert costs[0.01][0] == 4
-    assert costs[0.1][0] == 2
-    assert costs[0.1][1] < 10
-
-
-def test_two_unstable_modes_from_one():
-    """Five switches between them are a standard example; the search finds a schedule that is at least as good."""
-    given = linear((), max_transitions=5)
-    found, _ = search(given, [Schedule(("A1",), NONE, 0.0, 1.0)], max_switches=5)
-    expected = sf.estimate(linear()).cost
-    assert min(each.cost for each in found.values()) <= expected * (1 + 1e-6)
 
 
 def test_two_experiments_with_shared_parameters():
     """A pulse is inserted in the run that lacks it."""
-    modes = {"rest": lambda t, x, p: 0.0 * x, "rise": lambda t, x, p: p["v"] + 0.0 * x}
-    system = sf.HybridSystem(modes, [0.0])
     times = np.linspace(0.0, 4.0, 21)
 
     def run(begin, end, sequence, switches):
         log = sf.Measurements(times, 0.9 * np.clip(times - begin, 0.0, end - begin), sigma=0.05)
         return sf.Experiment(log, sequence, switches, 0.0, 4.0)
 
-    first = run(1.0, 2.0, ("rest", "rise", "rest"), (1.0, 2.0))
-    second = run(1.5, 3.0, ("rest",), ())
-    given = sf.Problem(system, [first, second], {"v": 0.9})
-    pair = [Schedule(("rest", "rise", "rest"), np.array([1.0, 2.0]), 0.0, 4.0), Schedule(("rest",), NONE, 0.0, 4.0)]
+    pulse = ("rest", "up", "rest")
+    given = sf.Problem(RAMP, [run(1.0, 2.0, pulse, (1.0, 2.0)), run(1.5, 3.0, ("rest",), ())], {"v": 0.9})
+    pair = [Schedule(pulse, np.array([1.0, 2.0]), 0.0, 4.0), Schedule(("rest",), NONE, 0.0, 4.0)]
     _, best = pulses(given, pair, np.array([0.9]), max_switches=4)[0]
-    assert [schedule.sequence for schedule in best] == [("rest", "rise", "rest")] * 2
+    assert [schedule.sequence for schedule in best] == [pulse] * 2
     np.testing.assert_array_equal(best[0].times, [1.0, 2.0])
     ends, _ = search(given, pair, np.array([0.9]), max_switches=4)
-    assert ends[4].cost == pytest.approx(0.0, abs=1e-6)
     np.testing.assert_allclose(ends[4].schedules[1].times, [1.5, 3.0], atol=1e-3)
 
 
@@ -354,18 +312,14 @@ def test_a_pulse_with_a_reset_map_is_not_proposed():
 # Text and figure
 
 
-def test_the_report_names_the_best_pulse_and_what_is_not_defined():
+def test_the_report_names_the_best_pulse_or_says_that_there_is_none():
     found = sf.insertion(fishing((2.6, 4.34)))
     mode, time = found.best()
     assert (mode, time) == (found.minima()[0].mode, found.minima()[0].time)
-    text = f"A short pulse of fishing at {time:.6g} s lowers J fastest: by 0.2727 per s of its length."
-    assert str(found).startswith(text)
+    assert str(found).startswith(f"A short pulse of fishing at {time:.6g} s lowers J fastest: by 0.2727 per s of its l")
     assert len(found.plot().axes) == 1
-    text = str(sf.insertion(problem(samples())))
-    assert text.splitlines()[-1].endswith("a pulse of fall in swing, swing in fall.")
-    still = {"stay": lambda t, x, p: 0.0 * x, "leave": lambda t, x, p: 1.0 + 0.0 * x}
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("stay",), (), 0.0, 2.0)
-    nothing = sf.insertion(sf.Problem(sf.HybridSystem(still, [0.5]), run, max_transitions=1))
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("wait",), (), 0.0, 2.0)
+    nothing = sf.insertion(sf.Problem(LATE_RAMP, run, max_transitions=1))
     assert (nothing.best(), nothing.minima()) == (None, [])
     assert str(nothing) == "No short pulse of any mode lowers J."
 
@@ -374,10 +328,6 @@ def test_minima_are_local_ones():
     rate = np.array([[0.0, -1.0], [-2.0, -3.0], [-2.0, np.nan], [-1.0, -2.0], [-4.0, -5.0], [0.5, -0.5]])
     found = sf.insertion(fishing((2.6, 4.34)))
     found = replace(found, times=np.arange(6.0), rate=rate, active=np.zeros(6, dtype=int))
-    assert [(p.mode, p.time, p.rate) for p in found.minima()] == [
-        ("fishing", 4.0, -5.0),
-        ("idle", 4.0, -4.0),
-        ("fishing", 1.0, -3.0),
-        ("idle", 2.0, -2.0),
-    ]
+    minima = [("fishing", 4.0, -5.0), ("idle", 4.0, -4.0), ("fishing", 1.0, -3.0), ("idle", 2.0, -2.0)]
+    assert [(p.mode, p.time, p.rate) for p in found.minima()] == minima
     assert [p.rate for p in found.minima(1)] == [-5.0, -4.0]

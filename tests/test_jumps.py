@@ -87,7 +87,6 @@ def test_fit_ends_where_least_squares_of_the_closed_form_ends(fit, values):
     other = least_squares(lambda at: (concentration(*at)[0] - values) / 0.1, [0.2, 8.0], xtol=1e-14, gtol=1e-14)
     np.testing.assert_allclose(fit.theta, other.x, rtol=1e-6)
     assert fit.verdict.level == "good"
-    assert fit.transition_times[0].shape == (0,)
     assert fit.trajectory.mode_spans == [("eliminate", 0.0, 36.0)]
     np.testing.assert_array_equal(fit.trajectory.jump_times, DOSES)
     assert fit.initial_state[0] == 0.0  # before the dose at t0
@@ -105,11 +104,11 @@ def speed_up(t, x, p):
 CHANGING = sf.HybridSystem({"slow": eliminate, "fast": speed_up}, [0.0])
 
 
-def make_changing(values, guess=10.5, **options):
+def make_changing(values, guess=10.5, system=CHANGING, **options):
     """Elimination becomes three times as fast at an unknown time."""
     log = sf.Measurements(TIMES, values, sigma=0.05)
     run = sf.Experiment(log, ["slow", "fast"], [guess], t0=0.0, time_unit="h", jumps=[ALL])
-    return sf.Problem(CHANGING, run, GUESS, **options)
+    return sf.Problem(system, run, GUESS, **options)
 
 
 def simulate_changing(tau):
@@ -124,35 +123,31 @@ def simulate_changing(tau):
 def test_a_transition_between_jumps_is_found(engine):
     problem = make_changing(simulate_changing(13.3), engine=engine)
     assert problem.theta_names == ("tau_1", "k", "V")
-    np.testing.assert_array_equal(problem.unknowns.lower[:1], [8.0])
-    np.testing.assert_array_equal(problem.unknowns.upper[:1], [16.0])
+    assert (problem.unknowns.lower[0], problem.unknowns.upper[0]) == (8.0, 16.0)
     fit = sf.estimate(problem)
     np.testing.assert_allclose(fit.theta, [13.3, 0.13, 11.0], rtol=1e-6)
     assert [mode for mode, _, _ in fit.trajectory.mode_spans] == ["slow", "fast"]
-    np.testing.assert_array_equal(fit.trajectory.jump_times, DOSES)
     assert [(t.before, t.after) for t in fit.transitions] == [("slow", "fast")]
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_the_sample_at_a_jump_is_of_the_state_before_on_both_sides_of_a_kink(engine):
     """The derivative to the left of a kink must not put the jumps before the samples at the same times."""
-    problem = make_changing(simulate_changing(13.3), guess=13.0, engine=engine)
-    evaluator, theta = Evaluator(problem), problem.initial_theta  # tau_1 = 13 is a sample, too
-    left, right = evaluator(theta, -1), evaluator(theta, 1)
-    assert left.cost == pytest.approx(right.cost, rel=1e-12)
-    for side, found in ((-1, left), (1, right)):
-        moved = theta.copy()
-        moved[0] += side * 1e-6
-        slope = (evaluator.cost(moved) - found.cost) / (side * 1e-6)
-        assert found.gradient[0] == pytest.approx(slope, rel=1e-4)
-    for method in ("adjoint", "forward") if engine == "jax" else ():
-        np.testing.assert_allclose(evaluator(theta, -1, method).gradient, left.gradient, rtol=1e-6)
+    evaluator = Evaluator(make_changing(simulate_changing(13.3), guess=13.0, engine=engine))
+    theta = evaluator.problem.initial_theta  # tau_1 = 13 is a sample, too
+    for side in (-1, 1):
+        found = evaluator(theta, side)
+        assert found.cost == pytest.approx(evaluator(theta, 1).cost, rel=1e-12)
+        moved = evaluator.cost(theta + side * 1e-6 * (np.arange(3) == 0))
+        assert found.gradient[0] == pytest.approx((moved - found.cost) / (side * 1e-6), rel=1e-4)
+        for method in ("adjoint", "forward") if engine == "jax" else ():
+            np.testing.assert_allclose(evaluator(theta, side, method).gradient, found.gradient, rtol=1e-6)
 
 
 def test_the_same_inside_the_programs_of_batches():
-    problem = make_changing(simulate_changing(13.3), guess=13.0)
-    evaluator, theta = Evaluator(problem), problem.initial_theta
-    (structure,), (arguments,), own = problem.structures, evaluator.arguments, problem.own_places[0][0]
+    evaluator = Evaluator(make_changing(simulate_changing(13.3), guess=13.0))
+    problem, (arguments,), theta = evaluator.problem, evaluator.arguments, evaluator.problem.initial_theta
+    (structure,), own = problem.structures, problem.own_places[0][0]
     places = places_in_library(structure)
     with use_float64():
         program = jax.jit(lambda tau, p, side: foreign_derivatives(structure, arguments, tau, p, side, places))
@@ -164,15 +159,12 @@ def test_the_same_inside_the_programs_of_batches():
 
 
 def test_a_transition_that_wants_past_a_jump_stops_there_and_says_so():
-    """The guess says between which jumps it lies."""
+    """The guess says between which jumps it lies; one that is proposed keeps away from them."""
     fit = sf.estimate(make_changing(simulate_changing(18.0), guess=12.0), strategy="local")
     assert fit.theta[0] == 16.0
     assert [str(active) for active in fit.active] == ["tau_1 at its upper bound 16"]
     after = sf.estimate(make_changing(simulate_changing(18.0), guess=17.0))
     np.testing.assert_allclose(after.theta, [18.0, 0.13, 11.0], rtol=1e-6)
-
-
-def test_guesses_that_are_proposed_keep_away_from_jumps():
     run = sf.Experiment(make_log(TIMES), ["slow", "fast"], None, t0=0.0, tf=36.0, jumps=sf.Jump(18.0, dose))
     assert 18.0 < run.initial_times[0] < 36.0
 
@@ -189,10 +181,9 @@ def test_a_collapsed_mode_with_a_jump_inside_is_not_idle():
     assert not idle_unknowns(make(sf.Jump(8.0, dose)), theta, False).any()
 
 
-def test_a_beam_passes_jumps(values):
+def test_a_beam_passes_jumps():
     problem = make_changing(simulate_changing(13.3), guess=9.0)
-    end = find_times(problem, problem.initial_theta)
-    np.testing.assert_allclose(end.theta, [13.3, 0.13, 11.0], rtol=1e-4)
+    np.testing.assert_allclose(find_times(problem, problem.initial_theta).theta, [13.3, 0.13, 11.0], rtol=1e-4)
 
 
 def test_with_a_free_final_time():
@@ -203,17 +194,18 @@ def test_with_a_free_final_time():
     run = sf.Experiment(data, ["run"], [], t0=0.0, tf=sf.Parameter(1.5, upper=6.0), jumps=[refill])
     fit = sf.estimate(sf.Problem(system, run))
     assert fit.theta[0] == pytest.approx(1.0 + np.log(3 * np.exp(-1.0) + 2.0), rel=1e-6)
-    np.testing.assert_array_equal(fit.trajectory.jump_times, [0.0, 1.0])
 
 
 def test_names_of_guards_count_transitions_alone():
     level = AMOUNT / TRUE["V"] * np.exp(-TRUE["k"] * np.array([12.0, 4.0])).sum()  # at 12 h, after two doses
-    system = dataclasses.replace(CHANGING, guards={("slow", "fast"): lambda t, x, p: x[0] - level})
-    log = make_log(simulate_changing(12.0))
-    run = sf.Experiment(log, ["slow", "fast"], [11.0], t0=0.0, jumps=sf.Jump(DOSES, dose))
-    problem = sf.Problem(system, run, GUESS)
+    guards = {("slow", "fast"): lambda t, x, p: x[0] - level}
+    problem = make_changing(simulate_changing(12.0), 11.0, system=dataclasses.replace(CHANGING, guards=guards))
     assert problem.constraint_names == ("guard of tau_1 (slow -> fast)",)
     np.testing.assert_allclose(sf.estimate(problem).theta, [12.0, 0.13, 11.0], rtol=1e-6)
+
+
+def wait(t, x, p):
+    return 0.0 * p["k"] * x
 
 
 # --- maps, several jumps ----------------------------------------------------------------------------------------------
@@ -222,25 +214,19 @@ def test_names_of_guards_count_transitions_alone():
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_jumps_at_one_time_act_in_order(engine):
     add, double = sf.Jump(1.0, lambda t, x, p: x + 1.0), sf.Jump(1.0, lambda t, x, p: 2.0 * x)
-    system = sf.HybridSystem({"rest": lambda t, x, p: 0.0 * p["k"] * x}, [3.0])
+    system = sf.HybridSystem({"rest": wait}, [3.0])
     for jumps, expected in (([add, double], 8.0), ([double, add], 7.0)):
         log = sf.Measurements([1.0, 2.0], [3.0, expected], sigma=1.0)
-        run = sf.Experiment(log, ["rest"], [], t0=0.0, jumps=jumps)
-        problem = sf.Problem(system, run, {"k": 1.0}, engine=engine)
+        problem = sf.Problem(system, sf.Experiment(log, ["rest"], [], jumps=jumps), {"k": 1.0}, engine=engine)
         assert sf.evaluate(problem).cost == pytest.approx(0.0, abs=1e-18)
         assert sf.simulate(problem).states[-1] == expected
 
 
 def test_at_the_time_of_a_fixed_transition_the_jump_comes_first():
-    system = sf.HybridSystem(
-        {"a": lambda t, x, p: 0.0 * p["k"] * x, "b": lambda t, x, p: 0.0 * x},
-        [3.0],
-        reset_maps={("a", "b"): lambda t, x, p: 2.0 * x},
-    )
+    system = sf.HybridSystem({"a": wait, "b": wait}, [3.0], {("a", "b"): lambda t, x, p: 2.0 * x})
     log = sf.Measurements([1.0, 2.0], [3.0, 8.0], sigma=1.0)
-    known = sf.Parameter(1.0, fixed=True)
-    run = sf.Experiment(log, ["a", "b"], [known], t0=0.0, jumps=sf.Jump(1.0, lambda t, x, p: x + 1.0))
-    problem = sf.Problem(system, run, {"k": 1.0})
+    known, add = sf.Parameter(1.0, fixed=True), sf.Jump(1.0, lambda t, x, p: x + 1.0)
+    problem = sf.Problem(system, sf.Experiment(log, ["a", "b"], [known], t0=0.0, jumps=add), {"k": 1.0})
     for side in (-1, 1):
         assert Evaluator(problem)(problem.initial_theta, side).cost == pytest.approx(0.0, abs=1e-18)
 
@@ -251,11 +237,10 @@ def test_at_the_time_of_a_fixed_transition_the_jump_comes_first():
 @pytest.mark.slow
 def test_logs_with_other_times_of_doses_are_not_confused():
     """The times of jumps are no unknowns: problems that differ in them alone cost differently."""
-    early = make_problem(concentration(**TRUE)[0])
-    late = make_problem(concentration(**TRUE)[0], jumps=sf.Jump([0.0, 9.0, 16.0, 24.0], dose))
-    fits = sf.estimate_many([early, late])
-    for k, problem in enumerate((early, late)):
-        np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-6)
+    clean = concentration(**TRUE)[0]
+    problems = make_problem(clean), make_problem(clean, jumps=sf.Jump([0.0, 9.0, 16.0, 24.0], dose))
+    fits = sf.estimate_many(problems)
+    np.testing.assert_allclose(fits.theta, [sf.estimate(problem).theta for problem in problems], rtol=1e-6)
     assert fits.cost[0] < 1e-8 < fits.cost[1]
 
 
@@ -265,36 +250,28 @@ import switchfit as sf
 def eliminate(t, x, p):
     return -p["k"] * x
 
-def dose(t, x, p):
-    return x + 100.0 / p["V"]
-
 def give(amount):
     return lambda t, x, p: x + amount / p["V"]
 
+dose = give(100.0)
 body = sf.HybridSystem({"eliminate": eliminate}, [0.0], state_names=("c",))
 """
 
 FILE = """
 model = "model.py:body"
-
-[parameters]
-k = 0.2
-V = { value = 8.0, lower = 1.0 }
-
-[[experiments]]
+parameters.k = 0.2
+parameters.V = { value = 8.0, lower = 1.0 }
+[experiments]
 mode_sequence = ["eliminate"]
 time_unit = "h"
 t0 = 0.0
-
 [[experiments.jumps]]
 time = [0.0, 8.0, 16.0]
 map = "model.py:dose"
-
 [[experiments.jumps]]
 time = 24
 map = { name = "model.py:give", arguments = { amount = 100.0 } }
-
-[[experiments.data]]
+[experiments.data]
 file = "log.csv"
 columns = ["c"]
 sigma = 0.1
@@ -303,11 +280,15 @@ sigma = 0.1
 
 @pytest.fixture
 def folder(tmp_path, values):
-    rows = [f"{t},{c!r}\n" for t, c in zip(TIMES.tolist(), values.tolist(), strict=True)]
-    (tmp_path / "log.csv").write_text("t,c\n" + "".join(rows))
+    write_log(tmp_path, TIMES.tolist(), values)
     (tmp_path / "model.py").write_text(MODEL)
     (tmp_path / "problem.toml").write_text(FILE)
     return tmp_path
+
+
+def write_log(folder, times, values):
+    rows = [f"{t},{c!r}\n" for t, c in zip(times, values.tolist(), strict=True)]
+    (folder / "log.csv").write_text("t,c\n" + "".join(rows))
 
 
 def test_problem_file(folder, values):
@@ -338,8 +319,8 @@ def test_times_may_be_dates(fit, values):
     np.testing.assert_array_equal(found.theta, fit.theta)
     assert "4 jumps at 2024-05-01 08:00" in " ".join(str(found).split())
     (summary,) = summarize_estimate(found)["runs"]
-    assert [dt.datetime.fromisoformat(date).astimezone(dt.UTC).isoformat() for date in summary["jump_dates"]] == [
-        at(hour) for hour in DOSES
+    assert [dt.datetime.fromisoformat(date) for date in summary["jump_dates"]] == [
+        START + dt.timedelta(hours=float(hour)) for hour in DOSES
     ]
     copy = dataclasses.replace(dated.experiments[0], name="again")  # its jumps are numbers by now
     np.testing.assert_array_equal(copy.jump_times, DOSES)
@@ -349,28 +330,20 @@ def test_times_may_be_dates(fit, values):
 
 
 def test_problem_file_with_dates(folder, values):
-    rows = [f"{at(t)},{c!r}\n" for t, c in zip(TIMES.tolist(), values.tolist(), strict=True)]
-    (folder / "log.csv").write_text("t,c\n" + "".join(rows))
+    write_log(folder, map(at, TIMES), values)
     text = FILE.replace("[0.0, 8.0, 16.0]", "[2024-05-01T06:00:00Z, 2024-05-01T14:00:00Z, '2024-05-01T22:00Z']")
     text = text.replace("time = 24", "time = 2024-05-02T08:00:00+02:00").replace("t0 = 0.0\n", "")
     (folder / "problem.toml").write_text(text)
     problem = load_problem(folder / "problem.toml").problem
     np.testing.assert_array_equal(problem.experiments[0].jump_times, DOSES)
     assert "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00" in write_experiments(problem.experiments)
-    (folder / "problem.toml").write_text(f"{text}time_scale = 2.0\n")  # that a jump is a date suffices
-    with pytest.raises(ValueError, match="has dates, which are converted to time_unit by themselves"):
-        load_problem(folder / "problem.toml")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"model.py:dose"', '"model.py:doze"', "jumps\\[1\\].map .*defines no 'doze'"),
-        ('"model.py:dose"', '"dose"', "jumps\\[1\\].map must be given as 'file.py:object'; got 'dose'"),
-        ("amount = 100.0", "size = 100.0", "jumps\\[2\\].map .*amount"),
+        ('"model.py:dose"', '"model.py:doze"', r"jumps\[1\].map .*defines no 'doze'"),
         ("time = 24", "tim = 24", "tim"),
-        ("time = 24", "time = 'noon'", "jumps\\[2\\].time.* must be a number or a date such as 2024-05-01"),
-        ("time = 24", "time = [24.0, 2024-05-01]", "jumps\\[2\\]: Jump time must be numbers or dates, not both"),
         ("time = 24", "time = 2024-05-01", "times of Jump is a date, but not all times of the data are"),
     ],
 )
@@ -383,9 +356,8 @@ def test_problem_file_with_a_wrong_jump(folder, old, new, message):
 def test_figure_page_and_file_have_the_jumps(fit, tmp_path):
     line = next(line for line in fit.plot().axes[0].lines if line.get_label() == "fitted")
     times, curve = line.get_data()
-    for time in DOSES:
-        there = curve[times == time]  # vertical, without a gap
-        assert there[-1] - there[0] == pytest.approx(AMOUNT / fit.parameters["V"])
+    heights = [np.subtract(*curve[times == time][[-1, 0]]) for time in DOSES]  # vertical, without a gap
+    np.testing.assert_allclose(heights, AMOUNT / fit.parameters["V"])
     fit.save(tmp_path / "fit.json")
     np.testing.assert_array_equal(sf.Estimate.load(tmp_path / "fit.json").trajectory.jump_times, DOSES)
     # The curves of the page are divided at the jumps; their derivatives have no jump's size.
@@ -417,13 +389,10 @@ def make_jumping(*jumps):
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: sf.Jump(np.nan, dose), ValueError, "Jump time must be finite; got nan"),
         (lambda: sf.Jump([], dose), ValueError, "Jump time must be a number or a sequence of numbers that"),
         (lambda: sf.Jump([2.0, 1.0], dose), ValueError, "Jump time .* that increase strictly; got \\[2.0, 1.0\\]"),
         (lambda: sf.Jump(1.0, 5.0), TypeError, "Jump map must be a function map\\(t, x, p\\); got 5.0"),
-        (lambda: sf.Jump(1.0, lambda x: x), TypeError, "cannot be called with 3 argument"),
         (lambda: sf.Jump("noon", dose), ValueError, "Jump time must be a number or a date; got 'noon'. Write dates as"),
-        (lambda: sf.Jump([at(1), at(1)], dose), ValueError, "Jump time .* that increase strictly; got"),
         (lambda: sf.Jump([at(0), 1.0], dose), TypeError, "Jump time must be numbers or dates, not both; got 1.0"),
         (lambda: make_dated(TIMES, sf.Jump([at(8), at(36)], dose)), ValueError, "the first is 2024-05-02 18:00:00"),
         (lambda: make_dated(TIMES, WALL), ValueError, "Measurements has a time zone .*, but times of Jump has none"),
@@ -435,7 +404,6 @@ def make_jumping(*jumps):
         ),
         (lambda: make_jumping(sf.Jump(-1.0, dose)), ValueError, "1 of 1 do not, the first is -1.0"),
         (lambda: make_jumping(dose), TypeError, "each of jumps must be an sf.Jump; got function"),
-        (lambda: make_problem(TIMES, 3.0), TypeError, "jumps must be an sf.Jump or a sequence"),
         (lambda: make_jumping(sf.Jump(1.0, lambda t, x, p: np.zeros(2))), ValueError, "the map of a Jump.*\\(2,\\)"),
         (lambda: make_changing(TIMES, guess=8.0), ValueError, "guess of transition time 1 is 8.0, the time of a jump"),
         (lambda: make_changing(TIMES, max_transitions=4), ValueError, "max_transitions is 4, but .* has 5 transitions"),

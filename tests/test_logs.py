@@ -74,7 +74,6 @@ def test_encodings_and_compression(write, tmp_path, encoding):
     "text",
     [
         "t,x,y\n0,,1\n1,2,\n2,,\n,3,4\n",
-        "t;x;y\n0;;1\n1;2;\n2;;\n;3;4\n",
         "t;x;y;\n0;;1;\n1;2;;\n2;;;\n;3;4;\n",
         "t,x,y\n0,NA,1\n1,2,nan\n2,,N/A\nNULL,3,4\n",
         't,x,y\n0,"",1\n1,2,""\n2,,\n,3,4\n',
@@ -103,8 +102,8 @@ def test_headers_of_other_shapes(write):
 def test_every_name_in_the_header_leads_to_its_channel(write):
     log = sf.read_log(write("Time;Position along X\ns;m\nt;x\n0;1\n1;2\n"))
     for name in ("x", "Position along X"):
-        np.testing.assert_array_equal(log[name], [1, 2])
         assert name in log
+        np.testing.assert_array_equal(log[name], [1, 2])
     with pytest.raises(InputError, match=r"a\.csv has no column 'z'; its columns are x\."):
         log["z"]
     with pytest.raises(TypeError, match=r'indexed by a name or a list of names, as in log\["x"\]; got 3'):
@@ -112,21 +111,19 @@ def test_every_name_in_the_header_leads_to_its_channel(write):
 
 
 @pytest.mark.parametrize(
-    ("header", "unit"),
+    ("header", "unit", "seconds"),
     [
-        ("t", ""), ("t [ms]", "ms"), ("time (msec)", "ms"), ("t_s", "s"), ("Time_us", "us"), ("timestamp [µs]", "us"),
-        ("t_min", "min"), ("elapsed time [h]", "h"), ("time (indoors)", ""),
-        ("millis", "ms"), ("__time", ""), ("seconds_elapsed", "s"), ("time_usec", "us"),
+        ("t", "", 1), ("t [ms]", "ms", 1e-3), ("time (msec)", "ms", 1e-3), ("t_s", "s", 1), ("Time_us", "us", 1e-6),
+        ("timestamp [µs]", "us", 1e-6), ("t_min", "min", 60), ("elapsed time [h]", "h", 3600), ("__time", "", 1),
+        ("time (indoors)", "", 1), ("millis", "ms", 1e-3), ("seconds_elapsed", "s", 1), ("time_usec", "us", 1e-6),
     ],
 )  # fmt: skip
-def test_units_of_time(write, header, unit):
-    log = sf.read_log(write(f"x,{header}\n5,0\n6,36\n7,72\n"))
-    assert log.time_unit == unit
+def test_units_of_time(write, header, unit, seconds):
+    path = write(f"x,{header}\n5,0\n6,36\n7,72\n")
+    log, converted = sf.read_log(path), sf.read_log(path, time_unit="s")
+    assert (log.time_unit, converted.time_unit) == (unit, "s")
     np.testing.assert_array_equal(log.times, [0, 36, 72])
-    seconds = sf.read_log(write(f"x,{header}\n5,0\n6,36\n7,72\n"), time_unit="s")
-    factor = {"": 1, "ms": 1e-3, "us": 1e-6, "s": 1, "min": 60, "h": 3600}[unit]
-    np.testing.assert_allclose(seconds.times, np.array([0, 36, 72]) * factor, rtol=1e-15)
-    assert seconds.time_unit == "s"
+    np.testing.assert_allclose(converted.times, log.times * seconds, rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +136,6 @@ def test_units_of_time(write, header, unit):
         ("x,start_time,y", 1),
         ("k,x,y", 0),  # the first one, as it rises
         ("x,T,hours", 2),
-        ("T,y,Time", 2),
         ("x,T,y", 1),  # as [T, Y] = ode45(...) has it
     ],
 )
@@ -155,49 +151,37 @@ def test_a_channel_that_is_asked_for_is_a_temperature(write):
     assert sf.read_log(path).time_name == "T"
 
 
-@pytest.mark.parametrize(
-    ("times", "unit"),
-    [
-        (["1700000000.25", "1700000000.5"], "s"),
-        (["1700000000250", "1700000000500"], "ms"),
-        (["1700000000250000", "1700000000500000"], "us"),
-        (["1700000000250000001", "1700000000500000001"], "ns"),
-    ],
-)
-def test_times_since_1970(write, times, unit):
-    log = sf.read_log(write(f"timestamp,x\n{times[0]},1\n{times[1]},2\n"))
+NOVEMBER, MAY = "2023-11-14 22:13:20", "2024-05-01 12:00:00"
+TIMES = [
+    # Since 1970; nanoseconds too, which doubles cannot hold
+    ("timestamp,x\n1700000000.25,1\n1700000000.5,2", [0, 0.25], "s", NOVEMBER),
+    ("timestamp,x\n1700000000250,1\n1700000000500,2", [0, 250], "ms", NOVEMBER),
+    ("timestamp,x\n1700000000250000,1\n1700000000500000,2", [0, 250_000], "us", NOVEMBER),
+    ("timestamp,x\n1700000000250000001,1\n1700000000500000001,2", [0, 250_000_000], "ns", NOVEMBER),
+    # Since boot, in microseconds
+    ("timestamp,x\n1700000000,1\n1700004001,2", [1.7e9, 1700004001], "", None),
+    # Dates
+    ("time,x\n2024-05-01T12:00:00Z,1\n2024-05-01T12:00:01.5Z,2", [0, 1.5], "s", MAY),
+    ("time;x\n2024-05-01 12:00:00,000;1,0\n2024-05-01 12:00:01,500;2,0", [0, 1.5], "s", MAY),
+    ("time;x\n01.05.2024 12:00:00;1\n01.05.2024 12:00:01.5;2", [0, 1.5], "s", MAY),
+    ("time;x\n2024/05/01 12:00:00;1\n2024/5/1 12:00:01.5;2", [0, 1.5], "s", MAY),
+    ("time,x\n2024-05-01T14:00:00+02:00,1\n2024-05-01T14:00:01.5+02:00,2", [0, 1.5], "s", MAY),
+    ("Date,Time,x\n2024-05-01,12:00:00,1\n2024-05-01,12:00:01.5,2", [0, 1.5], "s", MAY),
+    # Times of day
+    ("time,x\n12:00:01.5,1\n12:01,2", [43201.5, 43260], "s", None),
+]
+
+
+@pytest.mark.parametrize(("text", "times", "unit", "start"), TIMES)
+def test_times(write, text, times, unit, start):
+    log = sf.read_log(write(text))
+    np.testing.assert_array_equal(log.times, times)
     assert log.time_unit == unit
-    per_second = {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
-    np.testing.assert_array_equal(log.times, [0, 0.25 * per_second])  # nanoseconds too, which doubles cannot hold
-    assert f"{log.start:%Y-%m-%d %H:%M:%S}" == "2023-11-14 22:13:20"
-
-
-def test_microseconds_since_boot_are_not_seconds_since_1970(write):
-    log = sf.read_log(write("timestamp,x\n1700000000,1\n1700004001,2\n1700008002,3\n"))
-    assert (log.times[0], log.start, log.time_unit) == (1.7e9, None, "")
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [
-        ["time,x", "2024-05-01T12:00:00Z,1", "2024-05-01T12:00:01.5Z,2"],
-        ["time;x", "2024-05-01 12:00:00,000;1,0", "2024-05-01 12:00:01,500;2,0"],
-        ["time;x", "01.05.2024 12:00:00;1", "01.05.2024 12:00:01.5;2"],
-        ["time;x", "2024/05/01 12:00:00;1", "2024/5/1 12:00:01.5;2"],
-        ["time,x", "2024-05-01T14:00:00+02:00,1", "2024-05-01T14:00:01.5+02:00,2"],
-        ["Date,Time,x", "2024-05-01,12:00:00,1", "2024-05-01,12:00:01.5,2"],
-    ],
-)
-def test_dates(write, rows):
-    log = sf.read_log(write("\n".join(rows)))
-    np.testing.assert_array_equal(log.times, [0, 1.5])
-    assert (f"{log.start:%Y-%m-%d %H:%M:%S}", log.time_unit) == ("2024-05-01 12:00:00", "s")
+    assert (log.start and f"{log.start:%Y-%m-%d %H:%M:%S}") == start
     np.testing.assert_array_equal(log["x"], [1, 2])
-
-
-def test_times_of_day(write):
-    log = sf.read_log(write("time,x\n12:00:00,1\n12:00:01.5,2\n12:01,3\n"))
-    np.testing.assert_array_equal(log.times, [43200, 43201.5, 43260])
+    if unit == "ms":
+        words = f"a.csv: 2 samples, 0 to 250 ms from {NOVEMBER} UTC\n  channels: x"
+        assert str(log).endswith(words)
 
 
 # --- what is wrong is said --------------------------------------------------------------------------------------------
@@ -207,17 +191,14 @@ def test_times_of_day(write):
     ("text", "message"),
     [
         ("", r"a\.csv is empty; it needs a line with the names"),
-        ("\n# only this\n", r"a\.csv is empty"),
         ("t,x\n", r"a\.csv has a header but no rows"),
         ("t,y\n0,1\n", r"a\.csv has no column 'x'; its columns are t, y\."),
         ("t,x,x\n0,1,2\n", r"a\.csv has 2 columns 'x'; rename all but one"),
         ("t,x\n0,1\n\n1,two\n", r"a\.csv, line 4, column 'x': 'two' is not a number; leave the cell empty"),
-        ('t,x\n0,1\n1,"1,234"\n', r"a\.csv, line 3, column 'x': '1,234' is not a number"),
         ('# a\nt,x\n0,1\n\n1,"2\n2,3"\n3,a\n', r"a\.csv, line 6, column 'x': '22,3' is not a number"),
         ("t,x\n0,1\n1,1_0\n", r"a\.csv, line 3, column 'x': '1_0' is not a number"),
         ("t,x\n0,1\nlate,2\n", r"a\.csv, line 3, column 't': 'late' is not a number"),
         ("t,x\n0,1\n1\n", r"a\.csv, line 3: 1 fields where the header has 2; is a field missing\? repair='drop-bro"),
-        ("t,x\n0,1\n1,2,3\n", r"a\.csv, line 3: 3 fields where the header has 2"),
         ("t,x\n0,5,1,5\n1,5,2,5\n", r"a\.csv, line 2: 4 fields .* decimal commas\? Then separate fields by semicolons"),
         ("t;x\n0,5;1.5\n1;2\n", r"with decimal commas and with decimal points: '0,5' in line 2, '1\.5' in line 2"),
         ('t,x\n0,1\n1,"2\n' + "3" * 200_000, r"a\.csv, line 4: field larger .*; is a quotation mark missing"),
@@ -232,6 +213,9 @@ def test_text_that_cannot_be_read(write, text, message):
         sf.read_log(write(text), columns=["x"])
 
 
+CUT_OFF = gzip.compress(b"t,x\n0,1\n" * 100, mtime=0)[:-20]
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -239,11 +223,7 @@ def test_text_that_cannot_be_read(write, text, message):
         ("", None, "is a folder; name a file in it"),
         ("a.bin", b"t,x\n\xff\xfe\x00", r"a\.bin is not a text file \(byte 6 is 0\); export it as CSV"),
         ("odd.csv", b"\xff\xfet", r"odd\.csv cannot be read as text in UTF-16: "),
-        (
-            "a.csv.gz",
-            gzip.compress(b"t,x\n0,1\n" * 100, mtime=0)[:-20],
-            r"gz cannot be read as a file that is compressed by gz",
-        ),
+        ("a.csv.gz", CUT_OFF, r"gz cannot be read as a file that is compressed by gz"),
         ("word " * 1000, None, r"path must name a file, with at most 255 characters; got '.*word word"),
         ("/dev/zero", None, "is a device; name a file"),
     ],
@@ -307,15 +287,15 @@ def test_repairs(write, times, repair, samples, said):
     assert said in " ".join(issues_of(mended).values())
 
 
-@pytest.mark.parametrize(("name", "turn"), [("yaw", 2 * np.pi), ("heading", 360), ("ang [deg]", 360), ("q [rad]", 0)])
+@pytest.mark.parametrize(
+    ("name", "turn"), [("yaw", 2 * np.pi), ("heading", 360), ("ang [deg]", 360), ("q [rad]", 2 * np.pi)]
+)
 def test_wrapped_angles(write, name, turn):
-    turn = turn or 2 * np.pi
     true = np.linspace(0, 2.5 * turn, 60)
     path = write(table(range(60), (true + turn / 2) % turn - turn / 2, name))
     log = sf.read_log(path)
     (channel,) = log.channels
     assert f"line 14 (and 2 more): the angle {channel!r} jumps by a turn of" in issues_of(log)["log: wrapped angle"]
-    assert abs(np.diff(log[channel])).max() > turn / 2
     mended = sf.read_log(path, repair=f"unwrap:{channel}")
     np.testing.assert_allclose(mended[channel], true, atol=1e-9 * turn)
     assert "unwrapped" in issues_of(mended)["log: wrapped angle"]
@@ -339,13 +319,6 @@ def test_broken_lines(write):
     with pytest.raises(InputError, match=r"line 8: 2 fields where the header has 3"):
         sf.read_log(path)
     log = sf.read_log(path, repair="drop-broken-lines")
-    np.testing.assert_array_equal(log.times, [0, 1, 3, 4])
-    np.testing.assert_array_equal(log["x"], [1, 2, 4, 5])
+    np.testing.assert_array_equal([log.times, log["x"]], [[0, 1, 3, 4], [1, 2, 4, 5]])
     assert "line 4 (and 2 more): broken; left out." in issues_of(log)["log: broken lines"]
     assert sf.read_log(write("t,x\n0,1\n1,2\n"), repair="drop-broken-lines").issues == ()  # with numbers alone
-
-
-def test_a_log_in_words(write):
-    text = str(sf.read_log(write("time [ms],x [m],y,mode\n1700000000250,1,2,a\n1700000000500,2,2,b\n")))
-    assert text.splitlines()[0].endswith("a.csv: 2 samples, 0 to 250 ms from 2023-11-14 22:13:20 UTC")
-    assert text.splitlines()[1:] == ["  channels: x (m), y", "  events: 2"]

@@ -42,16 +42,14 @@ def spoil(folder):
 
 
 def test_patterns_and_folders(tmp_path):
-    for name in ("b.csv", "a.csv", "a.csv.gz", "notes.md", ".hidden.csv", "c[1].csv"):
+    for name in ("b.csv", "a.csv", "a.csv.gz", "notes.md", ".hidden.csv", "c[1].csv", "bag/metadata.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("")
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "metadata.yaml").write_text("")
     (tmp_path / "empty").mkdir()
     assert find_logs(tmp_path, "*.csv") == ["a.csv", "b.csv", "c[1].csv"]
     assert find_logs(tmp_path, ".") == [f"./{name}" for name in ("a.csv", "a.csv.gz", "b.csv", "bag", "c[1].csv")]
     for one in ("a.csv", "missing.csv", "bag", "c[1].csv", "", "x" * 5000, "a\0b"):
         assert find_logs(tmp_path, one) is None
-    assert find_logs(tmp_path.parent, str(tmp_path / "a.*")) == [str(tmp_path / "a.csv"), str(tmp_path / "a.csv.gz")]
     with pytest.raises(InputError, match=r"No file matches .*x\*\.csv; check the pattern and the folder"):
         find_logs(tmp_path, "x*.csv")
     with pytest.raises(InputError, match=r"empty has no logs: no file in it ends in \.csv, \.dat"):
@@ -63,10 +61,8 @@ def test_patterns_and_folders(tmp_path):
     [
         (["logs/a.csv", "logs/b.csv.gz"], ["a", "b"]),
         (["logs/1/drive.csv", "logs/2/drive.csv"], ["1", "2"]),
-        (["a.csv", "a.mat"], ["a.csv", "a.mat"]),
         (["1/a.csv", "1/a.mat", "2/a.csv"], ["1/a.csv", "1/a.mat", "2/a.csv"]),
         (["one/fit.json", "one/other.json", "two/fit.json"], ["one/fit", "one/other", "two/fit"]),
-        (["a/out/estimate.json", "b/out/estimate.json"], ["a", "b"]),
         (["x/a/1/fit.json", "x/b/1/fit.json", "x/b/2/fit.json"], ["a/1", "b/1", "b/2"]),
         (["estimate.json", "out/estimate.json"], [Path.cwd().name, "out"]),
         (["a.json", "a.json"], ["a.json", "a.json"]),
@@ -79,19 +75,23 @@ def test_names(paths, names):
 # --- in problem files -------------------------------------------------------------------------------------------------
 
 
-def test_a_pattern_is_a_run_for_each_log(folder):
+@pytest.fixture
+def pattern(folder):
     (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", "logs/*.csv"))
-    loaded = load_problem(folder / "problem.toml")
+    return folder / "problem.toml"
+
+
+def test_a_pattern_is_a_run_for_each_log(pattern):
+    loaded = load_problem(pattern)
     assert [run.name for run in loaded.problem.experiments] == ["monday", "tuesday"]
     assert loaded.problem.theta_names == ("monday.tau_1", "tuesday.tau_1", "heating")
     np.testing.assert_allclose(sf.estimate(loaded.problem).theta, [3.2, 2.1, 0.5], rtol=1e-5)
     assert loaded.issues == ()
 
 
-def test_a_bad_log_is_left_out_of_a_problem(folder):
+def test_a_bad_log_is_left_out_of_a_problem(folder, pattern):
     spoil(folder)
-    (folder / "problem.toml").write_text(PROBLEM.replace("log.csv", "logs/*.csv"))
-    result = run("check", folder / "problem.toml", "--no-run")
+    result = run("check", pattern, "--no-run")
     assert result.exit_code == 2
     assert result.stderr.startswith("switchfit: Left out: ")
     assert "sunday.csv, line 3, column 'T': 'cold' is not a number; leave the cell empty" in result.stderr
@@ -99,7 +99,7 @@ def test_a_bad_log_is_left_out_of_a_problem(folder):
     for name in ("monday", "tuesday"):
         (folder / "logs" / f"{name}.csv").unlink()
     with pytest.raises(InputError, match=r"sunday\.csv, line 3"):  # not one of the logs can be used
-        load_problem(folder / "problem.toml")
+        load_problem(pattern)
 
 
 def test_logs_of_one_name_go_together(folder):
@@ -132,11 +132,10 @@ def test_logs_one_by_one(folder):
     assert result.exit_code == 0, result.stderr
     rows = read(table)
     assert [row["log"] for row in rows] == [str(logs / "monday.csv"), str(logs / "tuesday.csv")]
-    np.testing.assert_allclose([float(row["tau_1 (s)"]) for row in rows], [3.2, 2.1], rtol=1e-5)
-    np.testing.assert_allclose([float(row["heating"]) for row in rows], 0.5, rtol=1e-5)
+    found = [[float(row[name]) for name in ("tau_1 (s)", "heating")] for row in rows]
+    np.testing.assert_allclose(found, [[3.2, 0.5], [2.1, 0.5]], rtol=1e-5)
     assert {row["status"] for row in rows} == {"CONVERGED"}
     assert all(float(row["tau_1 (s) std. error"]) > 0 for row in rows)
-    assert "monday.csv: " in result.stdout
     assert re.search(r"tau_1 \(s\) = 3\.20 ± 0\.\d{2}, heating = 0\.500 ± 0\.0\d{2}\b", result.stdout)
     assert "2 logs: 2 fitted, 0 not, 0 refused" in result.stderr
     np.testing.assert_allclose(sf.Estimate.load(out / "tuesday" / "estimate.json").theta, [2.1, 0.5], rtol=1e-5)
@@ -146,9 +145,8 @@ def test_logs_one_by_one(folder):
 def test_a_bad_log_does_not_end_the_run(folder):
     """Nor does one of a room that is heated again and again, by a model that heats once: its row says why it is bad."""
     spoil(folder)
-    times = np.arange(0.25, 6.0, 0.5)
-    rows = "".join(f"{t:g};{5 * np.sin(3 * t):.6g}\n" for t in times)
-    (folder / "logs" / "friday.csv").write_text("t;T\n" + rows)
+    waves = "".join(f"{t:g};{5 * np.sin(3 * t):.6g}\n" for t in np.arange(0.25, 6.0, 0.5))
+    (folder / "logs" / "friday.csv").write_text("t;T\n" + waves)
     (folder / "logs" / "short.csv").write_text("t;U\n0;1\n")
     table, problem = folder / "table.csv", ("--problem", folder / "problem.toml")
     result = run("fit", folder / "logs", *problem, "--table", table)
@@ -157,26 +155,23 @@ def test_a_bad_log_does_not_end_the_run(folder):
     assert [row["verdict"] for row in rows.values()] == ["bad", "good", "refused", "refused", "good"]
     assert "short.csv has no column 'T'; its columns are t, U." in rows["short.csv"]["message"]
     assert "sunday.csv, line 3, column 'T': 'cold' is not a number" in rows["sunday.csv"]["message"]
+    assert rows["sunday.csv"]["tau_1 (s)"] == ""
     assert "of the variance" in rows["friday.csv"]["message"]
     assert rows["friday.csv"]["message"] in result.stdout
-    assert float(rows["tuesday.csv"]["tau_1 (s)"]) == pytest.approx(2.1, rel=1e-5)
-    assert rows["sunday.csv"]["tau_1 (s)"] == ""
     assert "5 logs: 2 fitted, 1 not, 2 refused" in result.stderr
-    result = run("fit", *((folder / "logs" / f"{name}.csv") for name in ("monday", "sunday")), "--json", *problem)
-    monday, sunday = json.loads(result.stdout)["logs"]
-    assert (monday["log"], monday["verdict"]) == (str(folder / "logs" / "monday.csv"), "good")
+    logs = [folder / "logs" / name for name in ("monday.csv", "sunday.csv")]
+    monday, sunday = json.loads(run("fit", *logs, "--json", *problem).stdout)["logs"]
+    assert (monday["log"], monday["verdict"]) == (str(logs[0]), "good")
     assert (sunday["verdict"], sunday["message"]) == ("refused", rows["sunday.csv"]["message"])
     assert run("fit", folder / "logs" / "friday.csv", *problem).exit_code == 1
 
 
 def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):
-    real, calls = sf.estimate, []
+    real = sf.estimate
 
     def estimate(problem, **options):
-        calls.append(problem)
-        if len(calls) == 1:
-            raise LookupError("no luck")
-        return real(problem, **options)
+        monkeypatch.setattr(sf, "estimate", real)
+        raise LookupError("no luck")
 
     monkeypatch.setattr(sf, "estimate", estimate)
     result = run("fit", folder / "logs", "--problem", folder / "problem.toml")
@@ -193,37 +188,37 @@ def test_ctrl_c_ends_the_run_and_leaves_the_table(folder, interrupted_fits):
     assert "1 were not begun" in result.stderr
 
 
-def test_where_the_log_goes(folder):
+@pytest.mark.parametrize(
+    ("data", "inputs", "expected"),
+    [
+        ('file = "log.csv"\n', 'file = "log.csv"\n', ("monday", "monday")),
+        ("", 'file = "logs/tuesday.csv"\n', ("monday", "tuesday")),
+        ('file = "log.csv"\n', 'file = "logs/tuesday.csv"\n', ("monday", "tuesday")),
+    ],
+)
+def test_where_the_log_goes(folder, data, inputs, expected):
     """In place of what is left out; otherwise in place of the data's file, wherever it is named."""
-    monday = folder / "logs" / "monday.csv"
-    inputs = '\n[experiments.inputs]\nfile = "log.csv"\ncolumns = ["T"]\n'
-    problem = PROBLEM.replace("t0 = 0.0\ntf = 6.0\n", "")
-    tuesday = inputs.replace("log.csv", "logs/tuesday.csv")
-    driven = ROOM.replace("(t, x, p)", "(t, x, p, u)")
-    (folder / "room.py").write_text(driven)
-    for text, expected in (
-        (problem + inputs, ("monday", "monday")),
-        (problem.replace('file = "log.csv"\n', "") + tuesday, ("monday", "tuesday")),
-        (problem + tuesday, ("monday", "tuesday")),
-    ):
-        (folder / "problem.toml").write_text(text)
-        run_of = load_problem(folder / "problem.toml", monday).problem.experiments[0]
-        peaks = (run_of.data[0].values.max(), run_of.inputs.values.max())
-        assert peaks == tuple(max(sf.read_log(folder / "logs" / f"{name}.csv")["T"]) for name in expected)
+    text = PROBLEM.replace("t0 = 0.0\ntf = 6.0\n", "").replace('file = "log.csv"\n', data)
+    (folder / "problem.toml").write_text(f'{text}\n[experiments.inputs]\n{inputs}columns = ["T"]\n')
+    (folder / "room.py").write_text(ROOM.replace("(t, x, p)", "(t, x, p, u)"))
+    (run_of,) = load_problem(folder / "problem.toml", folder / "logs" / "monday.csv").problem.experiments
+    peaks = (run_of.data[0].values.max(), run_of.inputs.values.max())
+    assert peaks == tuple(max(sf.read_log(folder / "logs" / f"{name}.csv")["T"]) for name in expected)
 
 
 def test_what_is_missing_or_too_much(folder):
-    result = run("fit", folder / "problem.toml", folder / "problem.toml")
-    assert result.exit_code == 2
-    assert "name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml" in result.stderr
-    assert run("fit", folder / "problem.toml", "--table", folder / "a.csv").exit_code == 2
-    result = run("fit", folder / "logs" / "x*.csv", "--problem", folder / "problem.toml")
-    assert result.exit_code == 2
-    assert "No file matches" in result.stderr
-    (folder / "problem.toml").write_text(PROBLEM.replace('file = "log.csv"\n', ""))
+    problem, monday = folder / "problem.toml", folder / "logs" / "monday.csv"
+    for arguments, message in (
+        ((problem, problem), "name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml"),
+        ((problem, "--table", folder / "a.csv"), "name one problem file"),
+        ((folder / "logs" / "x*.csv", "--problem", problem), "No file matches"),
+    ):
+        result = run("fit", *arguments)
+        assert result.exit_code == 2
+        assert message in result.stderr
+    problem.write_text(PROBLEM.replace('file = "log.csv"\n', ""))
     with pytest.raises(InputError, match=r"experiments\[1\]\.data\[1\]: the key 'file' is missing: name the log"):
-        load_problem(folder / "problem.toml")
-    two = PROBLEM + PROBLEM[PROBLEM.index("[[experiments]]") :]
-    (folder / "problem.toml").write_text(two)
+        load_problem(problem)
+    problem.write_text(PROBLEM + PROBLEM[PROBLEM.index("[[experiments]]") :])
     with pytest.raises(InputError, match=r"must have one \[\[experiments\]\], .*; got 2\. Write a problem file"):
-        load_problem(folder / "problem.toml", folder / "logs" / "monday.csv")
+        load_problem(problem, monday)

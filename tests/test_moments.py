@@ -1,6 +1,7 @@
 """Hard moments: transitions at samples, at each other and at the ends; switches that a function hides."""
 
 import re
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.fit.evaluator import Evaluator
 from switchfit.runtime.errors import HiddenSwitchError
 from switchfit.uncertainty.certificate import identifiability
 
@@ -25,32 +27,23 @@ SYSTEM = sf.HybridSystem({"a": decay(A), "b": decay(B), "c": decay(C)}, [1.0])
 VALUES = np.cos(TIMES)
 
 
-def problem():
-    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
-    return sf.Problem(SYSTEM, sf.Experiment(data, ("a", "b", "c"), (1.1, 2.9), 0.0, 4.0), rtol=1e-11, atol=1e-13)
-
-
 @pytest.fixture(scope="module")
 def this():
-    return problem()
+    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
+    return sf.Problem(SYSTEM, sf.Experiment(data, ("a", "b", "c"), (1.1, 2.9), 0.0, 4.0), rtol=1e-12, atol=1e-14)
 
 
-def exponent(tau, side):
-    """Exponent of x at the samples, and which samples feel each transition move to one side."""
+def expected(tau, side):
+    """J, gradient and Hessian: x at the samples is exp(-s), and some samples feel a time move to one side."""
     t1, t2 = tau
     s = np.minimum(TIMES, t1) * A + np.clip(TIMES - t1, 0, max(t2 - t1, 0)) * B + np.clip(TIMES - t2, 0, None) * C
     last = TIMES[-1]  # tf: nothing moves beyond it
     after = [t < TIMES if side > 0 and t < last else t <= TIMES for t in tau]
-    return s, np.array([(A - B) * after[0], (B - C) * after[1]])
-
-
-def expected(tau, side):
-    s, slopes = exponent(tau, side)
+    slopes = np.array([(A - B) * after[0], (B - C) * after[1]])
     x = np.exp(-s)
     r, x_d = x - VALUES, -x * slopes
-    gradient = x_d @ r
     hessian = x_d @ x_d.T + np.einsum("k,ik,jk->ij", r * x, slopes, slopes)
-    return 0.5 * r @ r, gradient, hessian
+    return 0.5 * r @ r, x_d @ r, hessian
 
 
 EPS = np.finfo(float).eps
@@ -86,6 +79,23 @@ def test_derivatives_at_hard_moments_are_those_of_the_closed_form(this, where, m
         assert abs(found.gradient[0] - expected(tau, -1)[1][0]) > 0.01
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_both_one_sided_derivatives_are_those_of_the_closed_form(this, side):
+    """Within rounding of a sample and of other nodes, and at the ends, where there is one whatever the side."""
+    evaluator = Evaluator(replace(this, rtol=1e-13, atol=1e-15))
+    nodes = [node for node in evaluator.breakpoints()[0][1::3] if node < 2.8]
+    ulps = (-(2**30), -1000, -3, -1, 0, 1, 3, 1000, 2**30)
+    places = [(node + many * np.spacing(node), 2.9) for node in (1.5, *nodes) for many in ulps]
+    for tau in (*places, (0.0, 2.9), (1.1, 4.0)):
+        found = evaluator(np.array(tau), side)
+        J, gradient, _ = expected(tau, side)
+        assert found.cost == pytest.approx(J, rel=1e-11)
+        np.testing.assert_allclose(found.gradient, gradient, rtol=1e-9, atol=1e-11)
+    for node in nodes:
+        costs = [evaluator(np.array([np.nextafter(node, to), 2.9]), side).cost for to in (0.0, node, 4.0)]
+        np.testing.assert_allclose(costs, costs[0], rtol=1e-14)
+
+
 @pytest.mark.parametrize("where", MOMENTS)
 def test_a_fit_may_begin_at_a_hard_moment(this, where):
     found = sf.estimate(this, start=MOMENTS[where])
@@ -110,10 +120,10 @@ def hiding(t, x, p):
     return jnp.where(t < p["t_on"], p["k"] * (1.0 - x), -p["k"] * x)
 
 
-def hidden_problem(mode=hiding, observe=None, **more):
-    system = sf.HybridSystem({"m": mode}, [0.1])
-    data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1, observe=observe)
-    return sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 4.0), {"k": 1.0, "t_on": 1.7} | more)
+def hidden_problem(mode=hiding, t_on=1.7):
+    data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
+    run = sf.Experiment(data, ("m",), (), 0.0, 4.0)
+    return sf.Problem(sf.HybridSystem({"m": mode}, [0.1]), run, {"k": 1.0, "t_on": t_on})
 
 
 LINE = hiding.__code__.co_firstlineno + 1
@@ -138,13 +148,11 @@ def idle(t, x, p):
     return -p["k"] * x + 0.0 * p["t_on"]
 
 
-@pytest.mark.parametrize("mode", [smooth, idle])
-def test_a_derivative_that_is_zero_for_another_reason_is_no_hidden_switch(mode):
-    assert sf.estimate(hidden_problem(mode), strategy="local").status is sf.Status.SINGULAR
-
-
-def test_a_hidden_switch_that_is_fixed_is_none_of_ours():
-    assert sf.estimate(hidden_problem(t_on=sf.Parameter(1.7, fixed=True)), strategy="local").status.successful
+@pytest.mark.parametrize(("mode", "t_on"), [(smooth, 1.7), (idle, 1.7), (hiding, sf.Parameter(1.7, fixed=True))])
+def test_a_derivative_that_is_zero_for_another_reason_is_no_hidden_switch(mode, t_on):
+    """Nor is a switch that is fixed any of ours."""
+    found = sf.estimate(hidden_problem(mode, t_on=t_on), strategy="local")
+    assert found.status is sf.Status.SINGULAR or (mode is hiding and found.status.successful)
 
 
 def test_a_hidden_switch_at_zero_is_found_between_its_bounds():
@@ -152,7 +160,7 @@ def test_a_hidden_switch_at_zero_is_found_between_its_bounds():
         return jnp.where(t - 1.7 < p["t_on"], 1.0 - x, -p["k"] * x)
 
     with pytest.raises(HiddenSwitchError, match="the cost changes with t_on, but its derivative is zero"):
-        sf.estimate(hidden_problem(mode, t_on=sf.Parameter(0.0, -1.0, 1.0)))
+        sf.estimate(hidden_problem(mode, sf.Parameter(0.0, -1.0, 1.0)))
 
 
 def test_no_function_is_accused_that_does_not_compare():
@@ -161,10 +169,8 @@ def test_no_function_is_accused_that_does_not_compare():
     def mode(t, x, p):
         return -p["k"] * x + jnp.cos(t) * jax.lax.stop_gradient(p["t_on"])
 
-    with pytest.raises(HiddenSwitchError, match="its derivative is zero at all points tried, so that") as raised:
+    with pytest.raises(HiddenSwitchError, match=r"zero at all points tried, so that ((?!compares|switch).)*$"):
         sf.estimate(hidden_problem(mode))
-    assert "compares" not in str(raised.value)
-    assert "switch" not in str(raised.value)
 
 
 def make_switch_with_slope(guess, size):
@@ -173,13 +179,12 @@ def make_switch_with_slope(guess, size):
     def mode(t, x, p):
         return jnp.where(t < p["t_on"], 0.0, p["heat"]) - 0.5 * x + size * 0.1 * (p["t_on"] - 1.7) * jnp.cos(t)
 
-    system = sf.HybridSystem({"m": mode}, [0.2])
     times = np.linspace(0.1, 4.0, 40)
-    before, after = 0.2 * np.exp(-0.5 * times), 2.0 * (1.0 - np.exp(-0.5 * (times - 1.7)))
-    values = before + np.where(times < 1.7, 0.0, after)
+    heated = np.where(times < 1.7, 0.0, 2.0 * (1.0 - np.exp(-0.5 * (times - 1.7))))
+    data = sf.Measurements(times, 0.2 * np.exp(-0.5 * times) + heated, sigma=0.02)
     parameters = {"t_on": sf.Parameter(guess, 0.2, 3.8), "heat": sf.Parameter(0.8, 0.1, 5.0)}
-    data = sf.Measurements(times, values, sigma=0.02)
-    return sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 4.0), parameters), mode.__code__.co_firstlineno + 1
+    problem = sf.Problem(sf.HybridSystem({"m": mode}, [0.2]), sf.Experiment(data, ("m",), (), 0.0, 4.0), parameters)
+    return problem, mode.__code__.co_firstlineno + 1
 
 
 @pytest.mark.parametrize("size", [0.1, 5.0])
@@ -206,10 +211,9 @@ def test_a_parameter_that_is_a_switch_and_smooth_as_well_is_named_in_the_verdict
     ids=["perfect", "coarse"],
 )
 def test_an_integration_error_that_stays_large_for_another_reason_accuses_no_function(mode, tolerance):
-    data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
-    run = sf.Experiment(data, ("m",), (), 0.0, 4.0)
-    system = sf.HybridSystem({"m": mode}, [1.0])
-    found = sf.estimate(sf.Problem(system, run, {"k": 1.0}, rtol=tolerance, atol=tolerance), start=[1.0])
+    run = sf.Experiment(sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1), ("m",), (), 0.0, 4.0)
+    problem = sf.Problem(sf.HybridSystem({"m": mode}, [1.0]), run, {"k": 1.0}, rtol=tolerance, atol=tolerance)
+    found = sf.estimate(problem, start=[1.0])
     assert found.cost < 1e-15 or found.certificate.integration_error > 1e-4
     assert found.reason is None
 
@@ -232,11 +236,10 @@ def test_dry_friction_is_fitted_and_nobody_is_accused(seed, sigma):
     """
     times = np.linspace(0.05, 4.0, 80)
     values = swing(times) + 1e-3 * np.random.default_rng(seed).normal(size=80)
-    data = sf.Measurements(times, values, sigma=sigma, observe=lambda t, x, p: x[:1])
+    data = sf.Measurements(times, values, sigma=sigma, observe=models.first_state)
     system = sf.HybridSystem({"slide": slide_on_spring}, [1.0, 0.0])
     found = sf.estimate(sf.Problem(system, sf.Experiment(data, ("slide",), (), 0.0, 4.0), {"k": 5.0, "c": 0.2}))
     assert found.success
     assert found.reason is None
-    errors = np.abs(found.theta - [4.0, 0.3]) / np.sqrt(np.diag(found.covariance))
-    assert errors.max() < 4.0
+    assert (np.abs(found.theta - [4.0, 0.3]) < 4.0 * np.sqrt(np.diag(found.covariance))).all()
     assert not any(step.strategy == "many starts" for step in found.steps)
