@@ -171,14 +171,11 @@ def test_without_changes_there_is_one_hypothesis(problem, log, window):
 def test_the_data_of_the_problem_may_be_empty(problem, log):
     """The time between samples is that from the first to the second one."""
     gps = sf.Measurements([], np.empty((0, 3)), lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))
-    run = sf.Experiment(gps, ("stick",), t0=0.0)
-    empty = sf.Problem(skid_steer(), run, problem.parameters)
-    assert (run.t0, run.tf) == (0.0, 1.0)
+    empty = sf.Problem(skid_steer(), sf.Experiment(gps, ("stick",), t0=0.0), problem.parameters)
     online, known = sf.OnlineEstimator(empty), sf.OnlineEstimator(problem)
     with pytest.raises(ValueError, match="how often the sensors measure is not known yet"):
         sf.calibrate(online, 0.01)
     online.update(0.001), known.update(0.001)
-    assert online.spacing is None
     now, same = feed_all(online, log)[-1], feed_all(known, log)[-1]
     assert online.spacing == pytest.approx(known.spacing, rel=0.02)
     np.testing.assert_allclose(now.transition_times, same.transition_times, atol=1e-4)
@@ -289,20 +286,17 @@ def test_missing_values_are_as_if_left_out(problem, log):
 def test_sensors_at_their_own_rates_with_a_delay():
     """A slow sensor whose samples come 0.25 s late: each is put where the state was measured."""
     rng = np.random.default_rng(1)
-    quick, slow = 0.1 * np.arange(1, 61), 0.4 * np.arange(1, 15) + 0.25
+    quick, slow = 0.1 * np.arange(1, 61), np.round(0.4 * np.arange(1, 15) + 0.25, 10)
 
     def truth(t):
         return np.where(t < 3.0, 1 - np.exp(-t), (1 - np.exp(-3.0)) * np.exp(3.0 - t))
 
-    slow = np.round(slow, 10)
     a = sf.Measurements(quick, truth(quick) + 0.05 * rng.standard_normal(60), sigma=0.05, names=["a"])
     b = sf.Measurements(slow, truth(slow - 0.25) + 0.01 * rng.standard_normal(14), sigma=0.01, names=["b"], delay=0.25)
     system = sf.HybridSystem({"on": lambda t, x, p: p["k"] - x, "off": lambda t, x, p: -x}, [0.0])
-    run = sf.Experiment([a, b], ("on",), (), 0.0, 6.0)
-    problem = sf.Problem(system, run, {"k": sf.Parameter(1.2)})
+    problem = sf.Problem(system, sf.Experiment([a, b], ("on",), (), 0.0, 6.0), {"k": 1.2})
     replayed = sf.replay(problem)
-    known = sf.Problem(system, sf.Experiment([a, b], ("on", "off"), (2.9,), 0.0, 6.0), {"k": sf.Parameter(1.0)})
-    batch = sf.estimate(known)
+    batch = sf.estimate(sf.Problem(system, sf.Experiment([a, b], ("on", "off"), (2.9,), 0.0, 6.0), {"k": 1.0}))
     np.testing.assert_allclose(replayed.now.transition_times, batch.transition_times[0], atol=1e-4)
     np.testing.assert_allclose(replayed.parameters["k"][-1], batch.parameters["k"], atol=1e-4)
     assert len(replayed.times) == len(np.union1d(quick, slow))
@@ -316,7 +310,6 @@ def test_sensors_at_their_own_rates_with_a_delay():
     np.testing.assert_allclose(online.estimate().theta, batch.theta, rtol=1e-6)
     assert 0 < replayed.delays([3.0])[0] < 0.6
     assert replayed.latency()["p50"] > 0
-    assert "2 updates" not in repr(replayed)
 
 
 def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):
@@ -430,7 +423,6 @@ def test_a_model_that_has_lost_the_samples_stays_so():
 def test_a_threshold_is_set_after_calibration(problem):
     online = sf.OnlineEstimator(problem)
     found, rarer = (sf.calibrate(online, rate, seconds=3.0, runs=10) for rate in (0.01, 0.0001))
-    assert found.maxima.shape == (10,)
     assert 0 < found.threshold < min(rarer.threshold, 40)
     assert "10 runs" in str(found)
     online.set_threshold(found.threshold)
@@ -546,9 +538,7 @@ def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
 
 
 def test_what_is_not_known_has_an_infinite_variance():
-    found = invert(np.diag([4.0, 0.0]))
-    assert found[0, 0] == 0.25
-    assert found[1, 1] == np.inf
+    np.testing.assert_array_equal(np.diag(invert(np.diag([4.0, 0.0]))), [0.25, np.inf])
 
 
 def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):

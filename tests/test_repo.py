@@ -10,7 +10,6 @@ import pytest
 from switchfit.io.problem_file import tables as keys
 
 ROOT = Path(__file__).parent.parent
-SOURCES = sorted((ROOT / "src").rglob("*.py"))
 
 
 def tracked():

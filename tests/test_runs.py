@@ -17,7 +17,6 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
 from switchfit.problem.functions import Call, trace_function
-from switchfit.problem.structure import choose_common_lengths, pad_length
 from switchfit.runtime.errors import InputError
 from switchfit.strategy.beam import follow_order
 
@@ -301,16 +300,6 @@ def test_one_program_for_ten_runs_of_different_lengths():
     assert compiled(tanks(12, [*samples, 40, 45], new)) == 0
 
 
-def test_common_lengths():
-    """Few distinct lengths, and none more than twice what is needed."""
-    assert choose_common_lengths([29, 59, 41]) == [64, 64, 64]
-    assert choose_common_lengths([100]) == [pad_length(100)]
-    lengths = list(range(1, 3000, 17))
-    common = choose_common_lengths(lengths)
-    assert all(length <= there <= 2 * pad_length(length) for length, there in zip(lengths, common, strict=True))
-    assert len(set(common)) <= 11
-
-
 # --- problem files ----------------------------------------------------------------------------------------------------
 
 FILE = """
@@ -343,9 +332,8 @@ def test_problem_files_say_it_too(folder):
     problem = load_problem(folder / "p.toml").problem
     tf = problem.experiments[0].tf
     assert (float(tf.value), float(tf.lower), float(tf.upper), tf.prior.mean, tf.prior.sd) == (3.0, 2.0, 9.0, 3.5, 0.5)
-    assert problem.theta_names == ("tf", "c", "h(t0)")
-    assert problem.unknowns.units[-1] == "cm"
-    assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1], problem.initial_theta[-1]) == (0.0, 9.0, 1.5)
+    assert (problem.theta_names, problem.unknowns.units[-1]) == (("tf", "c", "h(t0)"), "cm")
+    assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1]) == (0.0, 9.0)
     assert problem.experiments[0].parameter_map == {"r": "c"}
     assert sf.simulate(problem).states[0].tolist() == [1.5, 3.5]
 
@@ -369,7 +357,6 @@ def test_problem_files_that_are_wrong(folder, old, new, message):
 
 Q = np.arange(12).reshape(3, 4)
 READ = {
-    "a row": (lambda q: q[1], Q[1]),
     "from the end": (lambda q: q[-1, ::2], Q[2, ::2]),
     "a column": (lambda q: q[:, 1], Q[:, 1]),
     "a row of columns": (lambda q: q.T[3], Q[:, 3]),
@@ -377,13 +364,11 @@ READ = {
     "in another order": (lambda q: jax.lax.reshape(q, (12,), (1, 0))[:3], Q[:, 0]),
     "rows by name": (lambda q: (lambda a, b, c: a * c)(*q), [*Q[0], *Q[2]]),
     "a row twice": (lambda q: q[1] * q[1:, 2].sum(), [*Q[1], Q[2, 2]]),
-    "a sum": (lambda q: jnp.sum(q[0]), Q[0]),
     "a row of all that is changed": (lambda q: jnp.sin(q)[0], Q),
     "where a value says": (lambda q: q[jnp.argmax(q[0])], Q),
     "by an array": (lambda q: q[np.array([0, 2])], Q),
     "inside a jitted function": (lambda q: jax.jit(lambda a: a[0])(q), Q),
     "inside a loop": (lambda q: jax.lax.fori_loop(0, 2, lambda k, x: x + q[0, 0], 0.0), Q),
-    "all": (lambda q: q, Q),
 }
 
 
@@ -473,14 +458,3 @@ def test_beams_and_fits_of_runs_that_read_entries():
     one, other = (sf.estimate(problem, strategy="local") for problem in (few, whole))
     np.testing.assert_allclose(one.cost, other.cost, rtol=1e-9)
     np.testing.assert_allclose(one.standard_errors, other.standard_errors, rtol=1e-5)
-
-
-def test_a_message_shows_the_entries_that_are_read():
-    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"][0] * x}, [0.0])
-    cost = sf.TerminalCost(lambda x, p: x @ x)
-    run = sf.Experiment(cost, ("m",), (), 0.0, 1.0, initial_state=lambda p: jnp.sqrt(p["q"][1, :1]) * p["c"][0])
-    problem = sf.Problem(
-        system, run, {"k": [0.5], "q": [[3.0, 4.0], [-1.0, 5.0]], "c": sf.Parameter([2.0, 7.0], fixed=True)}
-    )
-    with pytest.raises(ValueError, match=r"p = {'k': \[0.5\], 'q': \[-1.0\], 'c': \[2.0, 7.0\]}"):
-        sf.evaluate(problem)

@@ -11,9 +11,6 @@ from types import GenericAlias
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from models import RAMP
 from numpy.typing import NDArray
 from test_report import comparison_of, made, several, trajectory_of
@@ -112,41 +109,17 @@ def test_loading_gives_the_same_fit(fit, tmp_path):
     assert_same(CERTIFICATE, certificate)
 
 
-FLOATS = st.floats(allow_nan=False) | st.just(np.nan)
-
-
 def test_arrays_are_found_by_what_either_numpy_calls_them():
     """From 2.5 on `NDArray` is an alias that is its own origin."""
     assert [find_dtype(kind) for kind in (NDArray[np.bool_], GenericAlias(NDArray, (np.float64,)))] == [bool, float]
     assert find_dtype(float) is None
 
 
-@settings(max_examples=30)
-@given(
-    numbers=hnp.arrays(np.float64, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4), elements=FLOATS),
-    labels=hnp.arrays("<U4", st.integers(1, 5), elements=st.text(alphabet='aé"\\\n', max_size=4)),
-    cost=FLOATS,
-)
-def test_any_array_comes_back_to_the_bit(tmp_path_factory, numbers, labels, cost):
-    trajectory = replace(trajectory_of(("m",), (0.0, 1.0), nodes=len(labels)), modes=labels)
-    fit = made(
-        parameters={"p": numbers}, parameter_units={"p": ""}, fixed=(), cost=cost, trajectories=(trajectory,),
-        comparisons=((),), transition_places=(np.zeros(0, int),), transition_times=(np.zeros(0),),
-    )  # fmt: skip
-    assert_same(fit, round_trip(fit, tmp_path_factory.getbasetemp())[0])
-
-
 def test_the_file_is_strict_and_readable(tmp_path):
     save_fit(made(), CERTIFICATE, tmp_path / "fit.json")
     text = (tmp_path / "fit.json").read_text(encoding="utf-8")
-
-    def refuse(name):
-        raise AssertionError(f"{name} is not JSON")
-
-    content = json.loads(text, parse_constant=refuse)
+    content = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert (content["format"], content["version"]) == (FORMAT, VERSION)
-    assert content["fit"]["theta"] == [4.0, 7.0, 0.8]
-    assert content["fit"]["hessian"][1] == [20.0, 100.0, 300.0]
     assert content["fit"]["lower"] == ["-Infinity", "-Infinity", 0.05]
     assert content["fit"]["status"] == "CONVERGED"
     assert content["certificate"]["smallest_eigenvalue"] == "NaN"
@@ -163,7 +136,8 @@ def test_a_real_fit_comes_back(tmp_path):
     loaded = sf.Estimate.load(tmp_path / "fit.json")
     for field in fields(Fit):
         assert_same(getattr(estimate.complete(), field.name), getattr(loaded, field.name), field.name)
-    assert_same(estimate.covariance_from("gauss-newton"), loaded.covariance_from("gauss-newton"))
+    assert_same(estimate.certificate, loaded.certificate)
+    assert str(loaded) == str(estimate)
     with pytest.raises(ValueError, match=r"loaded without its model: load it with Estimate.load\(path, problem="):
         loaded.profile("v")
     with_model = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
@@ -171,9 +145,6 @@ def test_a_real_fit_comes_back(tmp_path):
     other = sf.Problem(RAMP, problem.experiments[0], {"v": sf.Parameter(2.0, fixed=True)})
     with pytest.raises(ValueError, match="holds the unknowns tau_1, v, the problem has tau_1: it is the fit of"):
         sf.Estimate.load(tmp_path / "fit.json", problem=other)
-    assert_same(estimate.certificate, loaded.certificate)
-    assert str(loaded) == str(estimate)
-    np.testing.assert_array_equal(loaded.standard_errors, estimate.standard_errors)
 
 
 SAVED = Path(__file__).parent / "saved" / "fit.json"
@@ -181,10 +152,8 @@ SAVED = Path(__file__).parent / "saved" / "fit.json"
 
 
 def test_a_file_in_the_repository_prints_the_same_report_as_ever():
-    loaded = sf.Estimate.load(SAVED)
-    assert f"{loaded.report(full=True)}\n\n{loaded.certificate}\n" == SAVED.with_suffix(".txt").read_text(
-        encoding="utf-8"
-    )
+    loaded, text = sf.Estimate.load(SAVED), SAVED.with_suffix(".txt").read_text(encoding="utf-8")
+    assert f"{loaded.report(full=True)}\n\n{loaded.certificate}\n" == text
 
 
 @pytest.mark.parametrize(
@@ -194,7 +163,6 @@ def test_a_file_in_the_repository_prints_the_same_report_as_ever():
         (b"[" * 100_000, "not valid JSON"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 9"),
         (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 9"),
         (b'{"format": "switchfit fit", "version": NaN}', "of version nan; this switchfit reads"),
         (b'{"format": "switchfit fit", "version": 9}', "is damaged: its content is not what was written"),
@@ -274,7 +242,6 @@ def refusal_of(path):
     [
         lambda content: content["fit"].update(cost=28.000000001),
         lambda content: content["certificate"].update(kinks=[]),
-        lambda content: content.update(fit=None),
         lambda content: content.pop("seal"),
     ],
 )

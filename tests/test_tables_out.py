@@ -76,8 +76,7 @@ def test_the_table_of_the_unknowns(heater):
     active = (ActiveConstraint("lower bound", 0.05, "mu", multiplier=3.0),)
     table = as_estimate(made(active=active, free_basis=np.eye(3)[:, :2], idle=("tau_2",))).to_pandas()
     assert table["held"].tolist() == ["", "idle", "at lower bound"]
-    assert np.isfinite(table["std_error"]).tolist() == [True, True, False]
-    assert np.isnan(table.loc["mu", ["low", "high"]].astype(float)).all()
+    assert np.isnan(table.loc["mu", ["std_error", "low", "high"]].astype(float)).all()
 
 
 def test_trajectories_and_residuals_of_all_runs_are_in_one_table():
@@ -130,21 +129,12 @@ def test_a_table_or_a_library_that_is_not_there(heater, monkeypatch):
 
 def test_states_that_are_called_like_other_columns():
     path = replace(trajectory_of(), state_names=("mode", "time"))
-    table = path.to_pandas()
-    assert list(table.columns) == ["mode", "mode (mode)", "time (time)"]
-    np.testing.assert_array_equal(table["mode (mode)"], path.states[:, 0])
+    assert list(path.to_pandas().columns) == ["mode", "mode (mode)", "time (time)"]
     np.testing.assert_array_equal(path.to_xarray()["mode (value)"], path.states[:, 0])
-    several_alike = replace(trajectory_of(), state_names=("x", "x"))
-    assert list(several_alike.to_pandas().columns) == ["mode", "x", "x (x)"]
-
-
-def test_a_trajectory_goes_back_in_as_data_with_its_names_and_units():
-    path = sf.simulate(heater_problem(), times=[1.0, 2.0, 3.0])
-    table, found = path.to_pandas(), path.to_xarray()
-    for times, values in ((table.index, table[["T"]]), (found["time"], found[["T"]])):
-        data = sf.Measurements(times, values, sigma=0.1)
-        assert (data.names, data.units) == (("T",), ("K",))
-        np.testing.assert_array_equal(data.values, path.states)
+    alike = replace(trajectory_of(), state_names=("x", "x"))
+    assert list(alike.to_pandas().columns) == ["mode", "x", "x (x)"]
+    data = sf.Measurements(path.to_pandas().index, trajectory_of().to_pandas()[["dX"]])  # and back in
+    assert (data.names, data.units) == (("dX",), ("m/s",))
 
 
 def test_predictions_and_profiles_as_tables(heater):
@@ -199,11 +189,6 @@ def test_many_fits_come_back_to_the_bit(studies, kind, tmp_path):
     assert again.plot().axes
 
 
-def test_a_multistart_without_a_best_end_comes_back(studies, tmp_path):
-    replace(studies["Multistart"], best=None).save(tmp_path / "fits.npz")
-    assert sf.Multistart.load(tmp_path / "fits.npz").best is None
-
-
 def rewrite(path, change_header=None, *, seal=True, **changes):
     """The file with some arrays changed, and sealed again; `change_header` is a function of its JSON."""
     with np.load(path) as file:
@@ -221,7 +206,6 @@ def rewrite(path, change_header=None, *, seal=True, **changes):
     ("change", "message"),
     [
         ({"covariance": None}, ".*missing 1 required positional argument: 'covariance'"),
-        ({"change_header": lambda c: c["fits"].pop("priors")}, "fits is not what was written"),
         ({"change_header": lambda c: c["fits"].update(seconds="long")}, "fits is not what was written"),
         ({"cost": np.zeros(2), "seal": False}, "its content is not what was written"),
     ],
@@ -246,12 +230,10 @@ def test_files_that_hold_no_fits(studies, heater, tmp_path, monkeypatch):
     heater.save(tmp_path / "fit.json")
     np.savez(tmp_path / "pickle.npz", header=np.array([{}], dtype=object))
     others = [(tmp_path / name).read_bytes() for name in ("fit.json", "pickle.npz")]
-    for content in (b"", b"no archive", whole[: len(whole) // 2], np.lib.format.magic(1, 0), *others):
+    for content in (b"", whole[: len(whole) // 2], np.lib.format.magic(1, 0), *others):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"fits\.npz does not hold saved fits"):
             sf.Fits.load(path)
-    with pytest.raises(FileNotFoundError):
-        sf.Fits.load(tmp_path / "none.npz")
 
 
 def many(fits, count):
@@ -274,15 +256,11 @@ def test_fits_print_as_a_table_and_of_many_the_worst_are_printed_and_drawn_first
     assert "2.462  ± 0.018" in rows[0]
     fits = many(studies["Fits"], 60)
     assert fits.worst_first[:3].tolist() == [2, 4, 0]
-    text = str(fits)
-    rows = [line for line in text.splitlines() if line.lstrip()[:1].isdigit() and "±" in line]
-    assert len(rows) == 12
-    assert [row.split()[:2] for row in rows[:2]] == [["2", "bad"], ["4", "bad"]]
-    assert "the worst 12 of 60 fits; .to_pandas() has all of them" in text
-    figure = fits.plot()
-    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    rows = [line.split() for line in str(fits).splitlines() if line.lstrip()[:1].isdigit() and "±" in line]
+    assert (len(rows), rows[0][:2], rows[1][:2]) == (12, ["2", "bad"], ["4", "bad"])
+    assert "the worst 12 of 60 fits; .to_pandas() has all of them" in str(fits)
+    labels = [label.get_text() for label in fits.plot().axes[0].get_yticklabels()]
     assert (len(labels), labels[:2]) == (40, ["2", "4"])
-    assert figure.legends[0].get_title().get_text() == "the worst 40 of 60 fits"
 
 
 # --- simulation at given times ----------------------------------------------------------------------------------------
@@ -296,13 +274,10 @@ def test_a_simulation_at_given_times_is_that_of_the_nodes(heater):
     exact = 25.0 * (1.0 - np.exp(-0.4 * rising)) * np.exp(-0.4 * (times - rising))
     np.testing.assert_allclose(path.states[:, 0], exact, rtol=1e-8, atol=1e-8)
     assert path.modes.tolist() == ["on", "on", "on", "on", "off", "off"]  # at the transition that before it
-    assert path.segments.tolist() == [0, 4, 6]
     assert path.mode_spans == [("on", 0.0, 2.5), ("off", 4.1, 6.0)]
     late = sf.simulate(problem, [2.5, 0.4], times=[5.0])
-    assert late.segments.tolist() == [0, 0, 1]
-    assert late.mode_spans == [("off", 5.0, 5.0)]
+    assert (late.segments.tolist(), late.mode_spans) == ([0, 0, 1], [("off", 5.0, 5.0)])
     path = sf.simulate(heater.problem, heater.theta, times="samples")
-    np.testing.assert_array_equal(path.times, heater.comparisons[0][0].times)
     np.testing.assert_allclose(path.states, heater.comparisons[0][0].fitted, rtol=1e-8)
 
 
@@ -312,11 +287,12 @@ def test_a_simulation_up_to_a_free_tf_and_times_outside():
     problem = sf.Problem(RAMP, run, constant)
     path = sf.simulate(problem, times=[0.0, 1.0, 1.7])
     np.testing.assert_allclose(path.states[:, 0], [0.0, 2.0, 3.4], rtol=1e-9)
+    inside = r"times must increase strictly inside \[t0, tf\] = "
     for given, times, message in (
-        (problem, [2.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"),
+        (problem, [2.0], inside + r"\[0.0, 1.7\] s; got 2.0"),
         (problem, "samples", "times='samples' needs data with samples, and experiment 0 has none"),
-        (heater_problem(), [-1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
-        (heater_problem(), [1.0, 1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got 1.0"),
+        (heater_problem(), [-1.0], inside + r"\[0.0, 6.0\] h; got -1.0"),
+        (heater_problem(), [1.0, 1.0], inside + r"\[0.0, 6.0\] h; got 1.0"),
         (heater_problem(), [], r"times must be finite numbers of shape \(K,\), or 'samples'; got shape \(0,\)"),
         (heater_problem(), [np.nan], "times must be finite numbers"),
         (heater_problem(), "sample", "times must be 'samples'; got 'sample'|times must be .*samples"),
@@ -358,7 +334,7 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
     written, parquet = pd.read_csv(folder / "table.csv"), pd.read_parquet(folder / "table.parquet")
     assert list(parquet.columns) == list(written.columns)
     assert parquet["verdict"].tolist() == ["good", "refused", "good"]
-    for name in ("chi2", "degrees of freedom", "t0", "tf", "seconds", "tau_1 (s)", "tau_1 (s) std. error", "heating"):
+    for name in ("chi2", "t0", "tf", "seconds", "tau_1 (s)", "tau_1 (s) std. error", "heating"):
         for table in (parquet, written):
             assert np.isfinite(table[name]).tolist() == [True, False, True], name
     assert written["degrees of freedom"].dropna().tolist() == [10, 10]
@@ -368,7 +344,6 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
     assert schema.field("tau_1 (s) std. error").metadata == {b"unit": b"s"}
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     assert "pip install 'switchfit[parquet]', or give the table a name that ends in .csv" in fit("new.parquet").stderr
-    assert not (folder / "new.parquet").exists()
 
 
 # --- runs.csv and unknowns.csv ---------------------------------------------------------------------------------------
@@ -444,14 +419,3 @@ def test_the_command_writes_them_where_they_are_many(folder):  # noqa: F811
     assert f"and 9 more experiments, all in {out / 'runs.csv'}" in said
     assert f"more unknowns, all in {out / 'unknowns.csv'}" in said
     assert [len(read((out / name).read_text())) for name in ("runs.csv", "unknowns.csv")] == [12, 13]
-
-
-def test_tables_of_many_fits_leave_transition_times_out_first(estimate):
-    assert "more unknowns" not in str(sf.bootstrap(estimate, 3))  # ten
-    problem = estimate.problem
-    again = [replace(run, transition_times=(3.0,), name=f"{run.name}b") for run in problem.experiments]
-    larger = sf.estimate(sf.Problem(ROOM, [*problem.experiments, *again], problem.parameters), strategy="local")
-    text = str(sf.bootstrap(larger, 3))
-    assert "and 3 more unknowns" in text
-    assert "power_4 (K/h)" in text
-    assert "and 9 more" in str(sf.multistart(larger.problem, larger.theta[None]))

@@ -130,7 +130,6 @@ SITUATIONS = {
     # values and settings, level, kinds of the reasons, words
     "right, sigma known": (LINE + noise(0.1), {"sigma": 0.1}, "good", "fits", IS_NOISE),
     "right, sigma unknown": (LINE + noise(0.1), {}, "good", "fits", IS_NOISE),
-    "much noise of a known sigma": (LINE + noise(3.0), {"sigma": 3.0}, "good", "fits", IS_NOISE),
     "nothing but noise": (2 + 0.1 * TIMES + noise(), {}, "doubtful", "little explained", "explains only"),
     "sigma too small by 2": (LINE + noise(0.1), {"sigma": 0.05}, "doubtful", "sigma suspected", "sigma is too small"),
     "sigma too small by 2, fewer than 20 values": (
@@ -141,7 +140,6 @@ SITUATIONS = {
     "outliers, sigma known": (
         LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", "outliers suspected", GIVE_LOSS,
     ),
-    "outliers, sigma unknown": (LINE + noise(0.1) + SPIKES, {}, "doubtful", "outliers suspected", GIVE_LOSS),
     "model slightly wrong": (
         LINE + 0.02 * WAVE + noise(0.005), {"sigma": 0.005}, "doubtful", "model suspected",
         "is correlated: the model is slightly wrong",
@@ -152,9 +150,6 @@ SITUATIONS = {
         2 + 0.1 * TIMES + WAVE, {"sigma": 10.0}, "doubtful", "little explained", "explains only 6 %",
     ),
     "few values": (0.5 * TIMES[::9] + 0.05 * WAVE[::9], FEW_TIMES, "good", "fits", "of the variance."),
-    "few values, too little of it explained": (
-        0.5 * TIMES[::9] + WAVE[::9], FEW_TIMES, "doubtful", "little explained", "explains only",
-    ),
     "as many values as unknowns": (
         np.array([1.0, 2.5]), {"times": np.array([1.0, 2.0])}, "doubtful", "too few samples", "nothing to check",
     ),
@@ -207,7 +202,6 @@ def test_nothing_is_read_from_residuals_that_are_rounding():
     fit = straight(LINE)
     assert str(fit.verdict) == "Good: converged; one fit; the model explains all of the variance."
     assert replace(fit, integration_error=1.0).verdict.level == "good"
-    assert replace(fit, starts=(40, 3, 0)).verdict.level == "good"
     wave = straight(LINE + 1e-4 * WAVE)
     assert replace(wave, integration_error=1.0).verdict.level == "bad"
     assert kinds(wave) == ["model suspected"]
@@ -240,9 +234,9 @@ def test_errors_of_correlated_residuals_are_corrected_and_the_naive_ones_stand_b
     (channel,) = fit.residuals.channels
     r = correct_correlation(channel.correlation, len(TIMES), 2)
     np.testing.assert_allclose(fit.corrected_standard_errors, np.sqrt((1 + r) / (1 - r)) * fit.standard_errors)
-    assert "naive" in str(fit)
     white = straight(2.0 + 0.5 * TIMES + noise(0.1))
     np.testing.assert_array_equal(white.corrected_standard_errors, white.standard_errors)
+    assert "naive" in str(fit)
     assert "naive" not in str(white)
 
 
@@ -270,11 +264,8 @@ def test_a_kink_is_a_note_and_no_doubt():
         fit = sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": held}), strategy="local")
         if fit.kinks:
             break
-    assert fit.kinks
-    assert fit.verdict.level == "good"
-    assert kinds(fit) == ["fits", "at kinks"]
+    assert (fit.verdict.level, kinds(fit)) == ("good", ["fits", "at kinks"])
     assert str(fit.verdict).endswith("; tau_1 at a kink of the cost.")
-    assert "Warnings" not in str(fit)
 
 
 # --- integration, derivatives, starts ---------------------------------------------------------------------------------
@@ -291,7 +282,6 @@ def test_other_starts_count(right):
     worse = replace(right, starts=(40, 12, 3)).verdict
     assert (worse.level, worse.reasons[0].kind) == ("bad", "other starts are better")
     assert str(worse).startswith("Bad: converged; 12 of 40 other starts are better; the model explains ")
-    assert str(worse).endswith("what is left is noise: strategy='thorough'.")
 
 
 def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
@@ -324,12 +314,9 @@ def test_a_search_that_was_cut_short_is_doubtful_unless_noise_of_a_known_size_is
     cut = (Step("local", right.cost, 5, 0.1), Step("many starts", right.cost, 50, 2.0, "time"))
     assert replace(right, steps=cut).verdict.level == "good"
     unknown = straight(LINE + noise(0.1), a=1.2)
-    assert unknown.verdict.level == "good"
     doubted = replace(unknown, steps=cut)
-    assert doubted.verdict.level == "doubtful"
-    assert kinds(doubted) == ["search cut short"]
-    assert steps(doubted) == ["next: more time"]
-    assert "many starts ended by its limit of time" in str(doubted.verdict).replace("\n  ", " ")
+    assert (unknown.verdict.level, doubted.verdict.level) == ("good", "doubtful")
+    assert (kinds(doubted), steps(doubted)) == (["search cut short"], ["next: more time"])
     for starts, level in (((40, 0, 30), "good"), ((40, 0, 1), "doubtful"), ((40, 1, 30), "bad")):
         assert replace(doubted, starts=starts).verdict.level == level
 
@@ -398,10 +385,14 @@ def test_wrong_ends_are_never_good(name):
 @pytest.mark.parametrize(
     ("share", "text"),
     [
-        (1.0, "all"), (0.9999999, "all but 1e-6"), (0.99985999, "99.985 %"), (0.99499, "99.49 %"), (0.61, "61 %"),
-        (0.0, "none"), (-3.0, "none"), (0.95, "95.0 %"), (0.29, "29 %"), (0.57, "57 %"),
+        (1.0, "all"),
+        (0.9999999, "all but 1e-6"),
+        (0.99985999, "99.985 %"),
+        (0.61, "61 %"),
+        (0.0, "none"),
+        (0.29, "29 %"),
     ],
-)  # fmt: skip
+)
 def test_shares_are_never_rounded_up(share, text):
     assert format_share(share) == text
 
@@ -411,13 +402,11 @@ def test_shares_are_never_rounded_up(share, text):
 
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_file_begins_with_the_verdict_and_a_loaded_estimate_has_it(tmp_path):
-    for k, fit in enumerate((straight(TIMES + noise(0.1), sigma=0.1), straight(np.sin(TIMES), sigma=0.01))):
-        path = tmp_path / f"{k}.json"
-        fit.save(path)
-        content = json.loads(path.read_text(encoding="utf-8"))
-        assert next(iter(content)) == "verdict"
-        assert list(content["verdict"].items())[:2] == [("level", fit.verdict.level), ("text", str(fit.verdict))]
-        assert [reason["kind"] for reason in content["verdict"]["reasons"]] == kinds(fit)
-        loaded = sf.Estimate.load(path)
-        assert loaded.verdict == fit.verdict
-        assert loaded.success == fit.success == (k == 0)
+    fit, path = straight(np.sin(TIMES), sigma=0.01), tmp_path / "fit.json"
+    fit.save(path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert next(iter(content)) == "verdict"
+    assert list(content["verdict"].items())[:2] == [("level", fit.verdict.level), ("text", str(fit.verdict))]
+    loaded = sf.Estimate.load(path)
+    assert loaded.verdict == fit.verdict
+    assert not loaded.success
