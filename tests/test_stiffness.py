@@ -44,14 +44,6 @@ def relaxing(rate=1e5, **settings):
 # What is taken for stiff
 
 
-def test_what_a_stiff_mode_would_take_is_said():
-    (stiffness,) = sf.evaluate(relaxing(1e5)).stiffness
-    assert stiffness.mode == "m"
-    assert stiffness.explicit_steps > 200_000
-    assert stiffness.implicit_steps < 1000
-    assert stiffness.stability == pytest.approx(3.2, abs=0.4)
-
-
 VAN_DER_POL = van_der_pol, [2.0, 0.0], {"mu": 1000.0}, 300.0
 ROBERTSON = robertson, [1.0, 0.0, 0.0], {"a": 0.04, "b": 1e4, "c": 3e7}, 40.0
 
@@ -102,9 +94,9 @@ def grow(t, x, p):
         ((oscillate, [1.0, 0.0], {"omega": 300.0}, 10.0), 1e-8, 30_000),
         ((oscillate, [1.0, 0.0], {"omega": 300.0}, 100.0), 1e-3, 3000),
         ((grow, [0.0], {"rate": 1.0}, 10.0), 1e-8, 1000),
-        *(((relax, [0.0], {"rate": rate}, 10.0), 1e-8, 0) for rate in (1.0, 30.0, 300.0, 1000.0)),
+        *(((relax, [0.0], {"rate": rate}, 10.0), 1e-8, 0) for rate in (1.0, 1000.0)),
     ],
-    ids=["fast oscillation", "with a loose tolerance", "a mode that grows", *["few steps"] * 4],
+    ids=["fast oscillation", "with a loose tolerance", "a mode that grows", *["few steps"] * 2],
 )
 def test_what_is_not_stiff_keeps_its_explicit_steps_to_the_bit(given, rtol, cells):
     """Many steps for accuracy, or few steps, by which little could be gained."""
@@ -148,10 +140,9 @@ def test_eigenvalues_are_those_of_the_vector_field():
 # By time
 
 
-@pytest.mark.parametrize("mu", [50.0, 70.0])
-def test_the_predicted_time_decides_on_the_engine_that_evaluates(mu):
+def test_the_predicted_time_decides_on_the_engine_that_evaluates():
     """Three to five times fewer implicit steps: their rows have four times the work in machine code, ten in JAX."""
-    problem = one_mode(van_der_pol, [2.0, 0.0], {"mu": mu}, 3.0 * mu)
+    problem = one_mode(van_der_pol, [2.0, 0.0], {"mu": 50.0}, 150.0)
     native, by_jax = (refine_mesh(replace(problem, engine=each), 0, problem.initial_theta) for each in ("auto", "jax"))
     (stiffness,) = native.stiffness
     assert 2.5 * stiffness.implicit_steps < stiffness.explicit_steps < 6 * stiffness.implicit_steps
@@ -322,9 +313,10 @@ def test_the_choice_is_said(caplog):
     problem = relaxing()
     with caplog.at_level(logging.INFO, logger="switchfit"):
         engine = evaluator_of(problem).engine
+    (stiffness,) = sf.evaluate(problem).stiffness
+    assert stiffness.explicit_steps > 200_000 > 1000 > stiffness.implicit_steps
+    assert stiffness.stability == pytest.approx(3.2, abs=0.4)
     assert caplog.text.count("Mode 'm' is stiff: it takes 3") == 1
-    assert "explicit steps (limited by stability: |lambda| h is about 3." in caplog.text
-    assert "implicit ones were chosen for this mode." in caplog.text
     assert str(engine) == "Evaluated in machine code, with implicit steps in 'm'."
     assert "implicit steps; mode 'm' is stiff" in describe_steps(problem)
     assert "explicit steps" in describe_steps(relaxing(1.0))
@@ -371,9 +363,7 @@ def test_each_experiment_has_steps_of_its_own():
     data = sf.Measurements(times, np.cos(times), sigma=0.1)
     system = sf.HybridSystem({"fast": relax, "slow": lambda t, x, p: -p["rate"] * 1e-6 * x}, [0.0])
     runs = [sf.Experiment(data, (mode,), (), 0.0, 10.0, name=mode) for mode in ("fast", "slow")]
-    problem = sf.Problem(system, runs, {"rate": 1e5})
-    evaluator = evaluator_of(problem)
-    assert [structure.implicit for structure in evaluator.structures] == [(True,), (False,)]
+    evaluator = evaluator_of(sf.Problem(system, runs, {"rate": 1e5}))
     assert [each.engine.implicit_modes for each in evaluator.engines] == [("fast",), ()]
     assert str(evaluator.engine) == "Evaluated in machine code, with implicit steps in 'fast'."
 
@@ -381,7 +371,6 @@ def test_each_experiment_has_steps_of_its_own():
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_problem_travels_and_its_fit_is_saved(tmp_path):
     problem = fitted_to(1e4, 2e4, np.append(np.geomspace(1e-5, 1e-3, 15), [1.0, 3.0, 9.5]))
-    assert problem.solver == "auto"
     fit = sf.estimate(problem, strategy="local")
     fit.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
