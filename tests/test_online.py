@@ -1,7 +1,5 @@
 """Online estimation: against batch fits, closed forms and brute force."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

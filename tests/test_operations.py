@@ -1,7 +1,5 @@
 """The table of operations: value, code and JAX's primitive agree, at random points and where something happens."""
 
-from __future__ import annotations
-
 import ctypes
 from itertools import product
 

@@ -247,7 +247,8 @@ def test_what_is_wrong_with_a_panel_is_said(car, starts):
 
 def test_a_legend_has_room_in_the_width_of_a_column(car):
     """Also after the size is changed, as for a paper."""
-    figure = car.plot(bands=True)
+    with matplotlib.rc_context({"font.size": 8.0}):
+        figure = car.plot(bands=True)
     for size in (8.0, 2.2):
         figure.set_size_inches(size, 4.4)
         figure.draw_without_rendering()

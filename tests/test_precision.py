@@ -1,7 +1,5 @@
 """Numbers that lost digits in single precision are refused with the line that uses them."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

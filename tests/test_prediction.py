@@ -1,7 +1,5 @@
 """Sensitivities and bands: closed forms, finite differences, Monte Carlo."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import models

@@ -1,7 +1,5 @@
 """Profile likelihoods against closed forms, and what they say where there is no ordinary interval."""
 
-from __future__ import annotations
-
 import re
 
 import jax.numpy as jnp

@@ -63,21 +63,20 @@ def test_the_line_says_what_is_done_and_how_far_it_is(monkeypatch):
 
 def test_calls_inside_another_one_and_other_threads_show_nothing(monkeypatch):
     terminal = open_terminal(monkeypatch)
-    with show_line("outer"):
-        assert wait_for("outer", terminal.getvalue)
-        with show_line("inner"):
-            show_detail("deeper")
-            time.sleep(0.3)
 
     def elsewhere():
         with show_line("thread"):
             time.sleep(0.1)
 
+    with show_line("outer"):
+        assert wait_for("outer", terminal.getvalue)
+        with show_line("inner"):
+            show_detail("deeper")
+            time.sleep(0.3)
     thread = threading.Thread(target=elsewhere)
     thread.start()
     thread.join()
-    for text in ("inner", "deeper", "thread"):
-        assert text not in terminal.getvalue()
+    assert not any(text in terminal.getvalue() for text in ("inner", "deeper", "thread"))
 
 
 @pytest.mark.parametrize("where", ["no terminal", "closed", "no stderr", "ends at once"])

@@ -1,7 +1,5 @@
 """Both engines answer alike, whatever is asked; which one runs, and why; one program for many sequences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax.numpy as jnp

@@ -6,8 +6,6 @@ by block, at the first guess and at a theta with a tie (a transition at a sample
 transitions or a mode that lasts no time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The report as text and as figures, of fits made by hand and of one real one."""
 
-from __future__ import annotations
-
 import ast
 import itertools
 from dataclasses import fields, replace

@@ -1,7 +1,5 @@
 """The log posterior: derivatives, the change of variables, and samplers against quadrature on a grid."""
 
-from __future__ import annotations
-
 import sys
 from functools import cache
 

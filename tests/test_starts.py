@@ -98,17 +98,16 @@ def test_outcomes_of_another_problem_or_start_do_not_count(tmp_path):
     moved = replace(case, starts=case.starts + 1e-6)
     assert case.identity == moved.identity
     assert case.digest(0) != moved.digest(0)
-    assert replace(case, near=case.near + 1e-6).digest(0) != case.digest(0)
     outcomes = Outcomes(tmp_path / "starts-x.jsonl")
     base = {"case": case.identity, "method": "exact", "start": 0, "digest": "", "violation": 0.0, "problem": "ball"}
+    others = {"cost": 3.0, "violation": 0.1, "start": 1}, {"cost": 1.0, "problem": "ball-guards"}
     for different in (
         {"cost": 5.0},
-        {"cost": 3.0, "violation": 0.1, "start": 1},
-        {"cost": 1.0, "problem": "ball-guards"},
+        *others,
         {"error": "x", "start": 2},
-        {"cost": 2.0, "case": "the data were others", "digest": "-"},
+        {"cost": 2.0, "case": "others", "digest": "-"},
     ):
-        outcomes.add({**base, **different})
+        outcomes.add(base | different)
     assert table.find_best("ball", case, [outcomes.path]) == 5.0
 
 

@@ -1,7 +1,5 @@
 """One thread for the optimizer's linear algebra, and the user's number of threads for the user's code."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import threading

@@ -1,7 +1,5 @@
 """Both covariances, identifiability in words, tests of the residuals, the certificate; and slowly, coverage."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax.numpy as jnp

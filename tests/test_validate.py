@@ -1,7 +1,5 @@
 """Validation on another run and comparison of models, in closed form of linear regression."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The verdict on fits: every rule with a fit that it is about and one just beside it, and known ends."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -15,7 +13,7 @@ from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
 from switchfit.report.sentences import format_share
-from switchfit.uncertainty.residuals import compare_with_sigma, correct_correlation
+from switchfit.uncertainty.residuals import compare_with_sigma
 from switchfit.uncertainty.verdict import Numbers, find_doubts
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -193,8 +191,7 @@ def test_one_wrong_run_of_many_is_found_and_named():
     assert fit(0.0).verdict.level == "good"
     found = fit(1.5)
     assert found.residual_variance < 1.15
-    assert found.verdict.level == "doubtful"
-    assert found.verdict.reasons[0].subjects == ("room7 T",)
+    assert (found.verdict.level, found.verdict.reasons[0].subjects) == ("doubtful", ("room7 T",))
     assert " of room7 T" in str(found.verdict)
 
 
@@ -216,28 +213,14 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
         run = sf.Experiment(data, ("still",), (), 0.0, 10.0)
         return sf.estimate(sf.Problem(STILL, run, {"a": 1.0, "b": slope}), strategy="local")
 
-    right = fit(sf.Parameter(0.3))
-    assert right.verdict.level == "good"
-    assert right.verdict.reasons[0].figures["explained"] > 0.99
+    assert fit(sf.Parameter(0.3)).verdict.level == "good"
     wrong = fit(sf.Parameter(-0.2, fixed=True))  # nearly all samples are beyond the scale
     assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["unexplained"])
     near = fit(sf.Parameter(0.476, fixed=True))  # half of them is
-    assert near.verdict.level != "good"
-    assert "next: more starts" in steps(near)
+    assert (near.verdict.level != "good", "next: more starts" in steps(near)) == (True, True)
 
 
 # --- corrected standard errors ----------------------------------------------------------------------------------------
-
-
-def test_errors_of_correlated_residuals_are_corrected_and_the_naive_ones_stand_beside_them():
-    fit = straight(2.0 + 0.5 * TIMES + 0.1 * np.sin(2 * TIMES) + noise(0.02))
-    (channel,) = fit.residuals.channels
-    r = correct_correlation(channel.correlation, len(TIMES), 2)
-    np.testing.assert_allclose(fit.corrected_standard_errors, np.sqrt((1 + r) / (1 - r)) * fit.standard_errors)
-    white = straight(2.0 + 0.5 * TIMES + noise(0.1))
-    np.testing.assert_array_equal(white.corrected_standard_errors, white.standard_errors)
-    assert "naive" in str(fit)
-    assert "naive" not in str(white)
 
 
 def test_the_error_of_a_time_is_corrected_by_its_own_run():

@@ -1,11 +1,10 @@
 """Verdicts on many fits: each as that on a single fit as far as J tells, and rules for all of them together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from models import temperature
 from test_batch import ROOM, TIMES, TRUTH
 from test_batch import room as heat
 
@@ -16,20 +15,29 @@ from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
-
-def temperatures(tau=2.1, k=0.8):
-    rising = 1 / k + (0.2 - 1 / k) * np.exp(-k * np.minimum(TIMES, tau))
-    return rising * np.exp(-k * np.maximum(TIMES - tau, 0.0))
+TEMPERATURES = temperature(TIMES, 2.1, 1.0, 0.8)
 
 
-def room(values=None, *, sigma=0.01, seed=0, noise=0.01, **settings):
-    values = temperatures() if values is None else values
+def room(values=TEMPERATURES, *, sigma=0.01, seed=0, noise=0.01, **settings):
     values = values + noise * np.random.default_rng(seed).standard_normal(24)
     return heat(sf.Measurements(TIMES, values, sigma=sigma), **settings)
 
 
 def wave(size):
-    return temperatures() + size * np.sin(4 * TIMES)
+    return TEMPERATURES + size * np.sin(4 * TIMES)
+
+
+def test_the_share_of_a_reference_is_that_of_a_single_fit_and_a_cost_without_data_has_none():
+    signal = sf.ReferenceSignal.from_samples(np.r_[0.0, TIMES], np.r_[0.2, wave(0.1)][:, None])
+    problem = sf.Problem(ROOM, sf.Experiment(signal, ("on", "off"), (1.7,), 0.0, 6.0), {"k": 1.0})
+    single, many = sf.estimate(problem, strategy="local"), sf.estimate_many([problem, problem])
+    assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-3)
+    assert many.verdict.level == single.verdict.level == "doubtful"
+    assert "little of the variance is explained in 2 of 2 fits" in str(many.verdict)
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 0.8) ** 2), ("on", "off"), (1.0,), 0.0, 6.0)
+    many = sf.estimate_many([sf.Problem(ROOM, run, {"k": sf.Parameter(0.8, fixed=True)})])
+    assert np.isnan(many.explained).all()
+    assert str(many.verdict) == "Good: 1 good of 1 fit."
 
 
 def kinds(result):
@@ -57,25 +65,6 @@ def test_level_and_share_that_is_explained_are_those_of_a_single_fit(settings, l
     single, many = sf.estimate(problem, strategy="local"), sf.estimate_many([problem])
     assert single.verdict.level == many.verdict.level == many.levels[0] == level
     assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-9)
-    assert str(many).startswith(str(many.verdict))
-
-
-def test_the_share_of_a_reference_is_that_of_a_single_fit():
-    signal = sf.ReferenceSignal.from_samples(np.r_[0.0, TIMES], np.r_[0.2, wave(0.1)][:, None])
-    problem = sf.Problem(ROOM, sf.Experiment(signal, ("on", "off"), (1.7,), 0.0, 6.0), {"k": 1.0})
-    single = sf.estimate(problem, strategy="local")
-    many = sf.estimate_many([problem, problem])
-    assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-3)
-    assert many.verdict.level == single.verdict.level == "doubtful"
-    assert "little of the variance is explained in 2 of 2 fits" in str(many.verdict)
-
-
-def test_a_cost_without_data_has_no_share():
-    cost = sf.RunningCost(lambda t, x, p: (x[0] - 0.8) ** 2)
-    k = sf.Parameter(0.8, fixed=True)
-    many = sf.estimate_many([sf.Problem(ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": k})])
-    assert np.isnan(many.explained).all()
-    assert str(many.verdict) == "Good: 1 good of 1 fit."
 
 
 def test_one_bad_fit_among_many_is_named_and_all_are_bad_where_half_of_them_are():
@@ -87,8 +76,9 @@ def test_one_bad_fit_among_many_is_named_and_all_are_bad_where_half_of_them_are(
     assert said.startswith("Doubtful: 3 good and 1 bad of 4 fits; the model is far from the data in ")
     assert "(fit 0 explains" in said
     assert said.endswith("fit problem 0 by itself with sf.estimate.")
-    good = str(sf.estimate_many(problems[3:]).verdict)
-    assert good.startswith("Good: 3 good of 3 fits, explaining 99.")
+    good = sf.estimate_many(problems[3:])
+    assert str(good).startswith(str(good.verdict))
+    assert str(good).startswith("Good: 3 good of 3 fits, explaining 99.")
 
 
 def test_chi_square_is_shared_among_the_fits():
