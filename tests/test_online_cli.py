@@ -316,11 +316,9 @@ def test_ctrl_c_while_it_waits_keeps_what_there_is(folder, tmp_path, quick_proce
             assert json.load(answer)["lines"] == said
         time.sleep(0.2)  # it waits for the next line
         process.send_signal(signal.SIGINT)
-        rest = process.stderr.read()
+        assert "Traceback" not in process.stderr.read()
         assert process.wait(timeout=60) == 0
-    assert "Traceback" not in rest
     assert (out / "online.txt").read_text().startswith("rise since 0 s")
-    assert "12 updates" in (out / "online.txt").read_text()
     assert read(feed(folder, LINES[12:14], "--state", state))[0]["t"] == TIMES[12]
 
 

@@ -118,7 +118,6 @@ def test_what_the_papers_equations_do_not_know_is_not_compared_with_them():
         sf.evaluate(given, method="adjoint")
     check = sf.check_derivatives(given)
     assert check.passed
-    assert "gradient not checked" in str(check)
     assert "not checked" in str(sf.estimate(given, strategy="local").certificate)
 
 

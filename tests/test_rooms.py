@@ -10,7 +10,8 @@ PACKAGE = Path(sf.__file__).parent
 
 LAYERS = (
     "runtime", "optimize", "problem", "models", "discretization", "engine", "paper_adjoint", "fit", "uncertainty",
-    "estimation", "strategy", "batch", "modes", "online", "experiment_design", "report", "io", "paper", "cli", "__main__",
+    "estimation", "strategy", "batch", "modes", "online", "experiment_design", "report", "io", "paper", "cli",
+    "__main__",
 )  # fmt: skip
 """From the bottom to the top; the package itself, which collects what is public, is above them all."""
 

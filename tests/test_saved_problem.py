@@ -48,7 +48,6 @@ def saved_project(tmp_path_factory):
     for name in ("problem", "never"):
         result = run("fit", folder / f"{name}.toml", "--out", folder / "out" / name, "--no-figures", "--full")
         assert result.exit_code == 0, result.stderr  # of a doubtful fit too
-        assert "KKT residual" in result.stdout
     assert result.stdout.startswith("Doubtful: ")
     sf.estimate(heater_problem(), strategy="local").save(folder / "heater.json")
     return folder
@@ -254,7 +253,6 @@ def test_a_log_that_was_given_on_the_command_line(project):
     saved = Path("many", "tuesday", "estimate.json")
     content = json.loads(saved.read_text())["provenance"]
     assert (content["log"], content["folder"]) == ("logs/tuesday.csv", "../..")
-    assert "log.csv" not in [digest["name"] for digest in content["files"]]
     assert content["options"] == {"strategy": "local", "hessian": "exact"}
     build_again(saved)
 

@@ -204,7 +204,6 @@ def test_each_experiment_has_its_own_unit(tmp_path):
     whole = sf.Problem(room(), runs, RATES | per_hour)
     assert whole.unknowns.units == ("min", "h", "°C/min", "1/min", "°C/h", "1/h")
     fit = sf.estimate(whole)
-    assert fit.success
     for pattern in (
         r"first +on -> off, 0 to 120 min\n",
         r"later +on -> off, 0 to 2 h\n",

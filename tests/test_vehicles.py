@@ -242,7 +242,6 @@ def test_loads_balance_the_moments_of_the_accelerations():
     found = turn_on_tyres([*x, along, across], treads, height=height)
     ahead, left = np.array([1, 1, -1, -1]) * LENGTH, np.array([-1, 1, 1, -1]) * WIDTH
     loads = 1e-3 * MASS / 4 * (GRAVITY - height * (along * ahead / LENGTH**2 + across * left / WIDTH**2))
-    assert loads.sum() == pytest.approx(1e-3 * MASS * GRAVITY)
     assert 1e3 * (loads @ ahead) == pytest.approx(-MASS * height * along)
     assert 1e3 * (loads @ left) == pytest.approx(-MASS * height * across)
     V_x, V_y = 3.0 - left * 0.2, 0.3 + ahead * 0.2
