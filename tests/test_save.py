@@ -23,22 +23,15 @@ from switchfit.runtime.files import find_dtype, from_json, to_json
 from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(
-    optimality=2e-9,
-    smallest_eigenvalue=np.nan,
-    smallest_scaled_eigenvalue=0.1,
-    condition_number=np.inf,
-    worst_unknowns=("tau_1", "mu"),
-    integration_error=1e-12,
-    gradient_gap=5e-324,
-    hessian_gap=1.7976931348623157e308,
-    taylor_orders=(np.nan, 2.0, 3.0),
+    optimality=2e-9, smallest_eigenvalue=np.nan, smallest_scaled_eigenvalue=0.1, condition_number=np.inf,
+    worst_unknowns=("tau_1", "mu"), integration_error=1e-12, gradient_gap=5e-324, hessian_gap=1.7976931348623157e308,
+    taylor_orders=(np.nan, 2.0, 3.0), kinks=(Kink("tau_1", 4.0, -1.0, np.inf),),
     active=(
         ActiveConstraint("lower bound", 0.05, "mu", multiplier=3.0),
         ActiveConstraint("collapsed", 0.0, mode='ü"\\', position=0, multiplier=np.nan),
     ),
-    kinks=(Kink("tau_1", 4.0, -1.0, np.inf),),
     failures=(Issue("Taylor orders", figures={"orders": (np.nan, 1.0, 2.0)}),),
-)
+)  # fmt: skip
 
 
 def describe(value):
