@@ -96,12 +96,6 @@ def test_starts_end_at_the_truth_or_at_the_bound_of_mu_and_strategies_lead_away_
         assert ends[0]["count"] >= (0.98 if way == "auto" else 0.8) * found["starts"]
 
 
-def test_drawing_shows_all_wheels():
-    found = found_by("vehicle")
-    (ax,) = PARTS["vehicle"].draw(found)["fig2-vehicle"].axes
-    assert {f"$F_{n}$ = {force:g} N" for n, force in enumerate(found["forces"], 1)} <= {t.get_text() for t in ax.texts}
-
-
 @pytest.mark.slow
 def test_error_grows_with_noise_and_is_largest_for_mu(monkeypatch):
     monkeypatch.setattr(studies, "QUICK_LEVELS", (0.0, 0.05, 0.25, 0.5))

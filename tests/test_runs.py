@@ -73,25 +73,17 @@ def mixed(**settings):
 def test_theta_in_its_order():
     """Free times of the first experiment, of the second, parameters as given, entry by entry, states of each run."""
     system = sf.HybridSystem({"a": lambda t, x, p: x, "b": lambda t, x, p: -x}, [1.0, 2.0], state_units=("m", "m/s"))
-    cost = sf.TerminalCost(lambda x, p: x[0])
 
     def start(times, **given):
-        return sf.Experiment(cost, ("a", "b", "a"), times, 0.0, 1.0, **given)
+        return sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("a", "b", "a"), times, 0.0, 1.0, **given)
 
     fixed, bounded = sf.Parameter(0.3, fixed=True), sf.Parameter(0.6, lower=0.5, upper=0.7, unit="ms")
     unknown = [sf.Parameter(0.75, lower=0.0), sf.Parameter(0.85, upper=4.0, unit="mm/s")]
-    problem = sf.Problem(
-        system,
-        [
-            start((fixed, bounded), name="city", time_unit="ms", initial_state=unknown),
-            start((0.2, 0.8), initial_state=[unknown[0], 2.0]),
-        ],
-        {
-            "z": 7.0,
-            "held": sf.Parameter([1.0, 2.0], fixed=True),
-            "A": sf.Parameter([[1.0, 2.0], [3.0, 4.0]], lower=[[0.0], [3.0]], unit="N"),
-        },
-    )
+    first = start((fixed, bounded), name="city", time_unit="ms", initial_state=unknown)
+    second = start((0.2, 0.8), initial_state=[unknown[0], 2.0])
+    matrix = sf.Parameter([[1.0, 2.0], [3.0, 4.0]], lower=[[0.0], [3.0]], unit="N")
+    given = {"z": 7.0, "held": sf.Parameter([1.0, 2.0], fixed=True), "A": matrix}
+    problem = sf.Problem(system, [first, second], given)
     assert problem.theta_names == (
         "city.tau_2", "run2.tau_1", "run2.tau_2", "z", "A[0,0]", "A[0,1]", "A[1,0]", "A[1,1]",
         "city.x1(t0)", "city.x2(t0)", "run2.x1(t0)",
@@ -108,13 +100,12 @@ def test_theta_in_its_order():
     assert found == {"z": 0.0, "held": [1.0, 2.0], "A": [[1.0, 2.0], [3.0, 4.0]]}
     problem.initial_theta[0] = -1.0  # what is handed out is a copy
     assert problem.initial_theta[0] == 0.6
-
-
-def test_one_experiment_needs_no_prefix_and_an_unknown_state_of_the_system_is_each_runs_own():
-    system = sf.HybridSystem({"m": lambda t, x, p: -x}, [1.0, sf.Parameter(2.0), sf.Parameter(3.0, fixed=True)])
+    unknown_in_system = sf.HybridSystem(
+        {"m": lambda t, x, p: -x}, [1.0, sf.Parameter(2.0), sf.Parameter(3.0, fixed=True)]
+    )
     one = sf.Experiment(sf.TerminalCost(lambda x, p: x @ x), ("m",), (), 0.0, 1.0)
-    assert sf.Problem(system, one).theta_names == ("x2(t0)",)
-    assert sf.Problem(system, [one, one]).theta_names == ("run1.x2(t0)", "run2.x2(t0)")
+    assert sf.Problem(unknown_in_system, one).theta_names == ("x2(t0)",)
+    assert sf.Problem(unknown_in_system, [one, one]).theta_names == ("run1.x2(t0)", "run2.x2(t0)")
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------

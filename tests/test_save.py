@@ -170,11 +170,9 @@ BOUND = to_json(ActiveConstraint("lower bound", 0.05, "mu"), ActiveConstraint)
         (("theta",), "abc"),
         (("theta",), {"dtype": "<i8", "shape": [1], "values": [1]}),
         (("status",), "FINE"),
-        (("kinks",), [["tau_1", 1.0]]),
         (("history", 1), {"iteration": 0}),
         (("colour",), "red"),
         (("active",), [BOUND | {"kind": "bound"}]),
-        (("reason",), {"kind": "jump", "subjects": "mu", "figures": {}}),
         (("reason",), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}),
     ],
 )

@@ -586,7 +586,7 @@ def test_in_a_narrow_curved_valley_a_step_that_failed_is_followed_by_one_back_to
 
 def test_iterations_the_callback_and_ctrl_c_end_it():
     """With the lowest point so far, also where Ctrl-C comes during an evaluation."""
-    calls, seen = [], []
+    calls = []
 
     def interrupting(theta, side):
         calls.append(theta)
@@ -594,14 +594,10 @@ def test_iterations_the_callback_and_ctrl_c_end_it():
             raise KeyboardInterrupt
         return evaluation(*rosenbrock(theta))
 
-    def stop(record):
-        seen.append(record)
-        return record.iteration == 2
-
     settings = {"constraints": free(2)}
     few = minimize(smooth(rosenbrock), [-1.2, 1.0], max_iterations=3, **settings)
     interrupted = minimize(interrupting, [-1.2, 1.0], **settings)
-    stopped = minimize(smooth(rosenbrock), [-1.2, 1.0], callback=stop, **settings)
+    stopped = minimize(smooth(rosenbrock), [-1.2, 1.0], callback=lambda record: record.iteration == 2, **settings)
     assert (few.status, few.iterations) == (Status.MAX_ITERATIONS, 3)
     assert (interrupted.status, stopped.status) == (Status.INTERRUPTED,) * 2
     for result in (few, interrupted, stopped):

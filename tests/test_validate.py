@@ -288,20 +288,21 @@ def test_another_log_with_dates():
         days = np.datetime64(f"2024-03-{day:02}T00:00", "ns")
         return sf.Measurements(days + np.round(log.times * 3.6e12).astype("timedelta64[ns]"), log.values, **given)
 
-    settings = {"t0": "2024-03-01T00:00", "tf": "2024-03-01T06:00", "time_unit": "h"}
-    run = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), **settings)
-    fit = sf.estimate(sf.Problem(base.system, run, base.parameters))
-    same = fit.validate(build(1))
-    assert same.chi_square == pytest.approx(fit.validate(sf.Measurements(log.times, log.values)).chi_square, rel=1e-9)
+    def fit(**ends):
+        run = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), time_unit="h", **ends)
+        return sf.estimate(sf.Problem(base.system, run, base.parameters))
+
+    dated = fit(t0="2024-03-01T00:00", tf="2024-03-01T06:00")
+    numbers = dated.validate(sf.Measurements(log.times, log.values))
+    assert dated.validate(build(1)).chi_square == pytest.approx(numbers.chi_square, rel=1e-9)
     with pytest.raises(ValueError, match=r"begins at 2024-03-05T00:15:00, after .* 2024-03-01 06:00.*: give validate"):
-        fit.validate(build(5))
+        dated.validate(build(5))
     with pytest.raises(ValueError, match="the other log has dates, and the times of the fit are numbers: give valid"):
         sf.estimate(base).validate(build(1))
-    held = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), time_unit="h")
-    fit = sf.estimate(sf.Problem(base.system, held, base.parameters))
-    other = fit.validate(build(5))
+    found = fit()
+    other = found.validate(build(5))
     assert other.problem.experiments[0].t0 == pytest.approx(96.0, abs=1e-9)
-    assert other.theta[0] - 96.0 == pytest.approx(fit.theta[0], abs=1e-3)
+    assert other.theta[0] - 96.0 == pytest.approx(found.theta[0], abs=1e-3)
 
 
 # --- comparison of models ---------------------------------------------------------------------------------------------
@@ -397,15 +398,16 @@ def test_what_cannot_be_compared():
     area = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2), ("m",), (), 0.0, 4.0)
     # 1 is the scale if none is given: the tail of Cauchy's loss falls as 1 / |z|, whose integral is infinite.
     heavy = run(TIMES, values(TIMES, 0), loss="cauchy", loss_scale=1.0)
-    for estimates, settings, error, said in (
-        ([one, one.problem], {}, TypeError, r"each of estimates must be a result of sf\.estimate; got Problem"),
-        ([one], {}, ValueError, "compare needs two estimates or more; got 1"),
-        ([one, one], {"names": ("a",)}, ValueError, "names must have one entry for each of the 2 estimates"),
-        ([one, fit(1, runs=area)], {}, ValueError, "model2 has no likelihood: its cost has other terms than Measure"),
-        ([one, fit(2, runs=heavy)], {}, ValueError, r"model2 .*: loss='cauchy' is .* a loss_scale above 1; got 1\."),
+    for estimates, error, said in (
+        ([one, one.problem], TypeError, r"each of estimates must be a result of sf\.estimate; got Problem"),
+        ([one], ValueError, "compare needs two estimates or more; got 1"),
+        ([one, fit(1, runs=area)], ValueError, "model2 has no likelihood: its cost has other terms than Measure"),
+        ([one, fit(2, runs=heavy)], ValueError, r"model2 .*: loss='cauchy' is .* a loss_scale above 1; got 1\."),
     ):
         with pytest.raises(error, match=said):
-            sf.compare(estimates, **settings)
+            sf.compare(estimates)
+    with pytest.raises(ValueError, match="names must have one entry for each of the 2 estimates"):
+        sf.compare([one, one], names=("a",))
 
 
 def test_guards_are_equations_between_unknowns():
