@@ -11,13 +11,11 @@ import scipy.signal
 import scipy.stats
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from models import RAMP
 
 import switchfit as sf
 from switchfit.io.command_line import write_unknowns
 from switchfit.models import heater_problem
-from switchfit.report.style import FIT, MODE_COLOURS, TRANSITION
-from switchfit.uncertainty.residuals import explain_worst
+from switchfit.report.style import FIT, TRANSITION
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -111,16 +109,6 @@ def test_the_unit_of_a_channel_that_is_left_out_is_that_of_the_state_of_the_same
 # --- over time --------------------------------------------------------------------------------------------------------
 
 
-def test_timeline(car):
-    ax = car.plot_timeline(level=0.9).axes[0]
-    bars = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in ax.patches]
-    np.testing.assert_allclose(bars, [(begin, end) for _, begin, end in car.trajectory.mode_spans])
-    assert [to_hex(bar.get_facecolor()) for bar in ax.patches] == [MODE_COLOURS[k] for k in (0, 1, 0)]
-    drawn = [line.get_xdata() for line in ax.lines if to_hex(line.get_color()) == FIT]
-    np.testing.assert_allclose(drawn, car.confidence_intervals(0.9)[:2])
-    assert [text.get_text() for text in ax.texts] == ["straight", "turn", "straight"]
-
-
 def test_figures_shade_the_interval_of_the_table():
     """Of a fit whose residuals are correlated, so that its naive standard errors are several times too small."""
     problem = heater_problem()
@@ -137,19 +125,6 @@ def test_figures_shade_the_interval_of_the_table():
     np.testing.assert_allclose((band.get_x(), band.get_x() + band.get_width()), table)
     line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT)
     np.testing.assert_allclose(line.get_xdata(), table)
-
-
-def test_of_many_runs_those_explained_worst_are_drawn():
-    """Of runs with more and more noise."""
-    rng, times, runs = np.random.default_rng(0), np.linspace(0.1, 4.0, 40), []
-    for k in range(12):
-        data = sf.Measurements(times, np.minimum(times, 2.0) + 0.01 * (k + 1) * rng.standard_normal(40))
-        runs.append(sf.Experiment(data, ("up", "rest"), (1.8,), 0.0, 4.0))
-    fit = sf.estimate(sf.Problem(RAMP, runs, {"v": 0.9}), strategy="local")
-    worst, blocks = np.argsort([explain_worst(fit, e) for e in range(12)])[:10], fit.plot().subfigs
-    assert [block.get_suptitle() for block in blocks] == [fit.run_names[e] for e in worst]
-    for e, block in zip(worst, blocks, strict=True):  # bands are those of the same run
-        np.testing.assert_array_equal(block.axes[0].lines[0].get_ydata(), fit.comparisons[e][0].measured[:, 0])
 
 
 # --- in the plane -----------------------------------------------------------------------------------------------------

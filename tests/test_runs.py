@@ -100,12 +100,10 @@ def test_theta_in_its_order():
     assert found == {"z": 0.0, "held": [1.0, 2.0], "A": [[1.0, 2.0], [3.0, 4.0]]}
     problem.initial_theta[0] = -1.0  # what is handed out is a copy
     assert problem.initial_theta[0] == 0.6
-    unknown_in_system = sf.HybridSystem(
-        {"m": lambda t, x, p: -x}, [1.0, sf.Parameter(2.0), sf.Parameter(3.0, fixed=True)]
-    )
+    system = sf.HybridSystem({"m": lambda t, x, p: -x}, [1.0, sf.Parameter(2.0), sf.Parameter(3.0, fixed=True)])
     one = sf.Experiment(sf.TerminalCost(lambda x, p: x @ x), ("m",), (), 0.0, 1.0)
-    assert sf.Problem(unknown_in_system, one).theta_names == ("x2(t0)",)
-    assert sf.Problem(unknown_in_system, [one, one]).theta_names == ("run1.x2(t0)", "run2.x2(t0)")
+    assert sf.Problem(system, one).theta_names == ("x2(t0)",)
+    assert sf.Problem(system, [one, one]).theta_names == ("run1.x2(t0)", "run2.x2(t0)")
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------

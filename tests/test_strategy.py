@@ -16,7 +16,7 @@ from switchfit.fit.result import Step
 from switchfit.optimize import Status
 from switchfit.strategy import beam, choice, starts
 from switchfit.strategy.beam import Proposal, Quadratic
-from switchfit.strategy.choice import Search, is_enough
+from switchfit.strategy.choice import is_enough
 from switchfit.strategy.hops import can_reinsert, hop_over_samples, reinsert_modes
 from switchfit.strategy.known_order import Beams, _list_settled, explain_no_beam, find_times
 from switchfit.strategy.starts import End, draw_starts, fit_briefly, try_starts
@@ -243,7 +243,8 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
 
 
 @pytest.mark.parametrize(
-    ("build", "start", "budget", "strategy"), [(valve, 1, 5.0, choice.BEAM), (dry, 4, 200.0, choice.STARTS)]
+    ("build", "start", "budget", "strategy"),
+    [(valve, 1, 5.0, choice.BEAM), pytest.param(dry, 4, 200.0, choice.STARTS, marks=pytest.mark.slow)],
 )
 def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
     """Models with corners, on a clock of evaluations: each of J takes a second."""
@@ -329,15 +330,6 @@ def test_runs_are_set_aside_by_name():
         problem.without_runs("room7")
     with pytest.raises(ValueError, match="none is left"):
         problem.without_runs("room0", "room1")
-
-
-def test_a_fit_that_goes_on_is_no_search(monkeypatch):
-    """It ends where it would have ended: that nothing is lower elsewhere, only a search can say."""
-    nothing = lambda theta: End(theta, np.inf, 1)  # noqa: E731
-    strategies = [(choice.MORE, nothing), ("elsewhere", nothing), ("not needed", nothing)]
-    monkeypatch.setattr(Search, "_list_strategies", lambda self: strategies)
-    fit = sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=None))
-    assert [step.strategy for step in fit.steps] == ["local", choice.MORE, "elsewhere"]
 
 
 # The beam along a log whose order of modes is known: all that a problem may have, from a bad guess
