@@ -21,11 +21,9 @@ from switchfit.report import sentences
 from switchfit.report.formats import format_rounded
 from switchfit.report.plot import (
     plot_comparison,
-    plot_convergence,
     plot_fit,
     plot_modes,
     plot_residuals,
-    plot_transitions,
 )  # fmt: skip
 from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.verdict import find_issues
@@ -376,16 +374,6 @@ def test_a_channel_and_its_residuals():
     _, residuals, upper, lower = below.lines
     np.testing.assert_array_equal(residuals.get_ydata(), comparison.residuals[:, 0])
     assert (set(upper.get_ydata()), set(lower.get_ydata())) == ({0.1}, {-0.1})
-
-
-def test_bands_of_transitions_and_convergence():
-    ax = Figure().subplots()
-    plot_transitions([4.0, 7.0, 9.0], [[3.5, 4.75], [np.nan, np.nan], [9.0, 9.0]], ax)
-    assert [line.get_xdata()[0] for line in ax.lines] == [4.0, 7.0, 9.0]
-    assert spans(ax) == [(3.5, 4.75)]
-    history = [IterationRecord(k, 1.0, value, 1.0, np.zeros(1), k) for k, value in enumerate([50.0, 1e-2, 0.0])]
-    ax = plot_convergence(made(history=history, tolerance=1e-7), ax=Figure().subplots())
-    np.testing.assert_array_equal(ax.lines[0].get_ydata(), [50.0, 1e-2, np.nan])
 
 
 def test_modes_are_shaded_and_named_with_one_colour_for_each():

@@ -19,7 +19,7 @@ from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
 from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.runtime.errors import Issue
-from switchfit.runtime.files import find_dtype, from_json, to_json
+from switchfit.runtime.files import find_dtype
 from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(
@@ -158,31 +158,6 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
     path.write_bytes(text)
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{message}"):
         load_saved(path)
-
-
-BOUND = to_json(ActiveConstraint("lower bound", 0.05, "mu"), ActiveConstraint)
-
-
-@pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        (("cost",), True),
-        (("theta",), "abc"),
-        (("theta",), {"dtype": "<i8", "shape": [1], "values": [1]}),
-        (("status",), "FINE"),
-        (("history", 1), {"iteration": 0}),
-        (("colour",), "red"),
-        (("active",), [BOUND | {"kind": "bound"}]),
-        (("reason",), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}),
-    ],
-)
-def test_what_is_no_field(place, value):
-    content = inner = to_json(made(), Fit)
-    for key in place[:-1]:
-        inner = inner[key]
-    inner[place[-1]] = value
-    with pytest.raises(ValueError, match="fit is not what was written"):
-        from_json(Fit, content, "fit")
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(12_000, marks=pytest.mark.fuzz)])

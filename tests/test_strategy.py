@@ -18,7 +18,7 @@ from switchfit.strategy import beam, choice, starts
 from switchfit.strategy.beam import Proposal, Quadratic
 from switchfit.strategy.choice import is_enough
 from switchfit.strategy.hops import can_reinsert, hop_over_samples, reinsert_modes
-from switchfit.strategy.known_order import Beams, _list_settled, explain_no_beam, find_times
+from switchfit.strategy.known_order import Beams, explain_no_beam, find_times
 from switchfit.strategy.starts import End, draw_starts, fit_briefly, try_starts
 
 HEATER = heated_room()
@@ -479,17 +479,9 @@ def many_rooms(count):
     return problem, fit_briefly(problem, theta)
 
 
-def test_runs_share_what_they_say_and_only_those_that_a_fit_has_moved_are_followed_again():
-    """Those whose times or whose parameters are no longer where their beams have proposed them."""
+def test_runs_share_what_they_say():
     problem, right = many_rooms(4)
     assert find_times(problem, problem.initial_theta).cost <= right.cost * (1 + 1e-6)
-    beams = Beams(problem, [beam.prepare(problem, e).own for e in range(4)])
-    found, _ = beams.follow(right.theta[beams.first :], lambda e, q, said: beam.follow_order(problem, e, q, said))
-    late, strong = right.theta.copy(), right.theta.copy()
-    late[problem.unknowns.times[1][2]] += beam.prepare(problem, 1).grid
-    strong[problem.theta_names.index("power_2")] *= 1.2
-    for theta, settled in ((right.theta, {0, 1, 2, 3}), (late, {0, 2, 3}), (strong, {0, 1, 3})):
-        assert _list_settled(problem, beams, found, right._replace(theta=theta)) == settled
 
 
 @pytest.mark.parametrize("precision", [0.0, 2.0])

@@ -12,7 +12,6 @@ import switchfit as sf
 from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
-from switchfit.report.sentences import format_share
 from switchfit.uncertainty.residuals import compare_with_sigma
 from switchfit.uncertainty.verdict import Numbers, find_doubts
 
@@ -355,21 +354,6 @@ def test_wrong_ends_are_never_good(name):
             seen.append(end.verdict.level)
     assert "good" not in seen
     assert "bad" in seen
-
-
-@pytest.mark.parametrize(
-    ("share", "text"),
-    [
-        (1.0, "all"),
-        (0.9999999, "all but 1e-6"),
-        (0.99985999, "99.985 %"),
-        (0.61, "61 %"),
-        (0.0, "none"),
-        (0.29, "29 %"),
-    ],
-)
-def test_shares_are_never_rounded_up(share, text):
-    assert format_share(share) == text
 
 
 # --- files and the command line ---------------------------------------------------------------------------------------
