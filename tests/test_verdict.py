@@ -12,6 +12,7 @@ import switchfit as sf
 from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
+from switchfit.report.sentences import format_share
 from switchfit.uncertainty.residuals import compare_with_sigma
 from switchfit.uncertainty.verdict import Numbers, find_doubts
 
@@ -369,3 +370,9 @@ def test_a_file_begins_with_the_verdict_and_a_loaded_estimate_has_it(tmp_path):
     loaded = sf.Estimate.load(path)
     assert loaded.verdict == fit.verdict
     assert not loaded.success
+
+
+def test_shares_are_never_rounded_up():
+    """0.29 * 100 is below 29."""
+    texts = {1.0: "all", 0.9999999: "all but 1e-6", 0.99985999: "99.985 %", 0.61: "61 %", 0.0: "none", 0.29: "29 %"}
+    assert {share: format_share(share) for share in texts} == texts
