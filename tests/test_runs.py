@@ -17,7 +17,6 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
 from switchfit.problem.functions import Call, trace_function
-from switchfit.runtime.errors import InputError
 from switchfit.strategy.beam import follow_order
 
 TIMES = np.linspace(0.0, 2.0, 12)
@@ -320,21 +319,6 @@ def test_problem_files_say_it_too(folder):
     assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1]) == (0.0, 9.0)
     assert problem.experiments[0].parameter_map == {"r": "c"}
     assert sf.simulate(problem).states[0].tolist() == [1.5, 3.5]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("lower = 0.0, upper", "lowr = 0.0, upper", r"initial_state\[1\]\.lowr'; did you mean 'lower'"),
-        ('{ r = "c" }', "{ r = 1 }", r"'experiments\[1\]\.parameter_map.*' must be a string; got 1"),
-        ("[{ value = 1.5", '["x", { value = 1.5', r"'experiments\[1\]\.initial_state\[1\]\.value' must be a number"),
-    ],
-)
-def test_problem_files_that_are_wrong(folder, old, new, message):
-    assert old in FILE
-    (folder / "p.toml").write_text(FILE.replace(old, new, 1))
-    with pytest.raises(InputError, match=message):
-        load_problem(folder / "p.toml")
 
 
 # --- arrays of which a run reads some entries -------------------------------------------------------------------------

@@ -293,17 +293,6 @@ def test_a_certificate_that_fails_is_the_first_line_of_the_report(changes, words
     assert words[:30] not in report(replace(fit, status=Status.MAX_ITERATIONS)).split("\n\n")[0]
 
 
-def test_a_wrong_hessian_fails_the_certificate_and_the_report_says_so(monkeypatch):
-    fit = sf.estimate(noisy_decay(0.1))
-    shift_derivatives(monkeypatch, "auto", hessian=0.01)
-    certificate = certify(fit, Evaluator(fit.problem))
-    failures = " ".join(map(str, certificate.failures))
-    assert "the paper's equations differ from the derivatives of J" in failures
-    assert "the Taylor orders are" in failures
-    assert "; the paper's equations differ from the derivatives of J" in " ".join(report(fit, certificate).split())
-    assert report(fit, certificate).startswith("Doubtful: ")
-
-
 @pytest.mark.parametrize(
     ("method", "wrong", "said"),
     [
