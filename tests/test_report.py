@@ -317,21 +317,6 @@ def test_sigma_is_wrong_only_where_it_is_given_and_the_fit_has_converged(cost):
 # --- several experiments ----------------------------------------------------------------------------------------------
 
 
-def test_correlations_are_the_largest_first():
-    d = 8
-    factor = np.random.default_rng(0).standard_normal((d, d))
-    names = tuple(f"p{k}" for k in range(d))
-    fit = made(
-        theta_names=names, theta_units=("",) * d, theta=np.arange(d) + 1.0, initial_theta=np.ones(d),
-        lower=np.full(d, -np.inf), upper=np.full(d, np.inf), hessian=factor @ factor.T, free_basis=np.eye(d),
-        parameters={name: np.array(1.0) for name in names}, fixed=(), transition_places=(np.array([-1, -1]),),
-    )  # fmt: skip
-    section = report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
-    expected = np.sort(np.abs(fit.correlation[np.tril_indices(d, -1)]))[::-1]
-    sizes = [abs(float(line.split()[-1])) for line in section]
-    assert sizes == pytest.approx(expected[expected > 0.1], abs=6e-4)
-
-
 # --- figures ----------------------------------------------------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import STILL, VEHICLE_TRUTH, curve, fishing, heated_room, linear, temperature, tracked_drive
+from models import STILL, curve, fishing, heated_room, linear, temperature
 
 import switchfit as sf
 from benchmarks.starts.problems import build_case
@@ -301,15 +301,6 @@ def test_a_search_that_was_cut_short_is_doubtful_unless_noise_of_a_known_size_is
 
 
 # --- costs without noise ----------------------------------------------------------------------------------------------
-
-
-def test_a_reference_that_is_followed_is_good_and_a_wrong_end_is_not():
-    problem = tracked_drive()
-    right = sf.estimate(problem, strategy="local")
-    np.testing.assert_allclose(right.theta, VEHICLE_TRUTH, rtol=1e-4)
-    assert right.verdict.level == "good"
-    wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9], strategy="local")
-    assert kinds(wrong)[0] in ("little explained", "unexplained", "not converged")
 
 
 def test_channels_of_no_weight_and_constant_references_are_not_judged():
