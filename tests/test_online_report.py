@@ -2,13 +2,10 @@
 
 from dataclasses import replace
 
-import matplotlib
 import numpy as np
 import pytest
 
 import switchfit as sf
-
-matplotlib.use("agg")
 
 
 def make_problem(**settings):

