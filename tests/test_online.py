@@ -129,6 +129,7 @@ def test_a_mode_can_begin_with_a_new_value():
     assert abs(float(before.parameters["mu"]) - 0.7) < 4 * float(before.standard_errors["mu"])
     last = renewed[-1]
     assert [now.alarm.mode for now in renewed if now.alarm] == ["slip", "stick", "slip"]
+    assert float(last.standard_errors["mu"]) < 0.02
     assert abs(float(last.parameters["mu"]) - 0.5) < 4 * float(last.standard_errors["mu"])
     constant = feed_all(sf.OnlineEstimator(problem), log)[-1]
     assert abs(float(constant.parameters["mu"]) - 0.5) > 4 * float(constant.standard_errors["mu"])
@@ -300,6 +301,7 @@ def test_sensors_at_their_own_rates_with_a_delay():
     np.testing.assert_allclose(now.parameters["k"], batch.parameters["k"], atol=1e-4)
     np.testing.assert_allclose(online.estimate().theta, batch.theta, rtol=1e-6)
     assert 0 < replayed.delays([3.0])[0] < 0.6
+    assert replayed.latency()["p50"] > 0
 
 
 def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):

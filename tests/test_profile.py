@@ -223,6 +223,11 @@ def test_it_can_be_stopped(noisy_ramp):
     assert np.isnan(found.interval()).any()
     assert "it was stopped before it was done" in str(found)
 
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    assert len(noisy_ramp.profile("v", callback=interrupt).values) == 1
+
 
 def test_what_cannot_be_profiled(noisy_ramp):
     cost = sf.TerminalCost(lambda x, p: (x[0] - 1.0) ** 2)

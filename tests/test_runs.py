@@ -202,6 +202,7 @@ def test_the_truth_is_found(fitted):
     )  # fmt: skip
     truth = [1.93, 2.13, *TRUTH.values(), *GROWTH, 2.0, 3.0]
     assert np.all(np.abs(fitted.theta - truth) < 3.5 * fitted.standard_errors)
+    assert [x.tolist() for x in fitted.initial_state] == [[fitted.theta[6]], [fitted.theta[7]]]
 
 
 def test_by_blocks_a_fit_is_the_same(monkeypatch):

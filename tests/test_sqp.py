@@ -600,6 +600,7 @@ def test_iterations_the_callback_and_ctrl_c_end_it():
     stopped = minimize(smooth(rosenbrock), [-1.2, 1.0], callback=lambda record: record.iteration == 2, **settings)
     assert (few.status, few.iterations) == (Status.MAX_ITERATIONS, 3)
     assert (interrupted.status, stopped.status) == (Status.INTERRUPTED,) * 2
+    assert stopped.iterations == 2
     for result in (few, interrupted, stopped):
         assert [record.iteration for record in result.history] == list(range(result.iterations + 1))
         assert result.cost == min(record.cost for record in result.history) < rosenbrock([-1.2, 1.0])[0]

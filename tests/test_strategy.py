@@ -457,6 +457,7 @@ def test_machine_code_keeps_the_hypotheses_that_the_rules_say(name, monkeypatch)
     by_code = beam.follow_order(problem, 0, problem.initial_theta[3:])
     monkeypatch.setattr(beam.Pass, "order", None)
     by_rules = beam.follow_order(problem, 0, problem.initial_theta[3:])
+    assert by_code
     for one, other in zip(by_code, by_rules, strict=True):
         assert one.cost == other.cost
         np.testing.assert_array_equal(one.transition_times[0], other.transition_times[0])
@@ -587,6 +588,7 @@ def test_a_callback_ends_a_search_within_one_evaluation(strategy):
     alone = sf.estimate(problem, strategy="local")
     found = sf.estimate(problem, strategy=strategy, callback=stop)
     assert found.cost == alone.cost
+    assert len(seen) == alone.iterations + 1
     assert choice.was_interrupted(found)
 
 

@@ -1,13 +1,15 @@
-"""Results as DataFrames, Datasets and CSV, read back by their own readers; many fits saved, printed, drawn."""
+"""Tables of pandas, polars and xarray in the place of arrays; results as tables and CSV; many fits saved."""
 
 import csv
 import io
 import json
+import subprocess
 import sys
 from dataclasses import fields, replace
 
 import numpy as np
 import pandas as pd
+import polars as pl
 import pyarrow.parquet
 import pytest
 import xarray as xr
@@ -89,6 +91,7 @@ def test_tables_of_a_fit_come_back_from_their_files(heater, what, tmp_path):
     table.to_parquet(tmp_path / "table.parquet")
     stored = pd.read_parquet(tmp_path / "table.parquet")
     pd.testing.assert_frame_equal(stored, table)
+    assert stored.attrs == table.attrs
     xr.testing.assert_identical(through_netcdf(found), found)
 
 
@@ -229,30 +232,17 @@ def test_files_that_hold_no_fits(studies, heater, tmp_path, monkeypatch):
             sf.Fits.load(path)
 
 
-def many(fits, count):
-    """`count` copies of the first fit; the fifth costs most, the third has not converged."""
-    arrays = {
-        f.name: np.repeat(getattr(fits, f.name)[:1], count, axis=0)
-        for f in fields(fits)
-        if isinstance(getattr(fits, f.name), np.ndarray) and f.name not in ("piece_places", "log_origins")
-    }
-    arrays |= {"status": arrays["status"].astype("U20"), "runs": np.arange(count)}
-    arrays["cost"][4], arrays["explained"][4], arrays["status"][2] = 1e4, 0.3, "MAX_ITERATIONS"
-    return replace(fits, **arrays)
+# --- simulation at given times ----------------------------------------------------------------------------------------
 
 
-def test_fits_print_as_a_table_and_of_many_the_worst_are_printed_and_drawn_first(studies):
+def test_fits_print_as_a_table_and_the_worst_come_first(studies):
     lines = str(studies["Fits"]).splitlines()
     assert lines[lines.index("") + 1].split() == ["run", "J", "tau_1", "(h)", "k", "(1/h)"]
     assert [row.split()[:3] for row in lines[lines.index("") + 2 :]] == [[run, "good", "6.03062"] for run in "01"]
-    fits = many(studies["Fits"], 60)
-    assert fits.worst_first[:3].tolist() == [2, 4, 0]
-    assert "the worst 12 of 60 fits; .to_pandas() has all of them" in str(fits)
-    labels = [label.get_text() for label in fits.plot().axes[0].get_yticklabels()]
-    assert (len(labels), labels[:2]) == (40, ["2", "4"])
-
-
-# --- simulation at given times ----------------------------------------------------------------------------------------
+    study = studies["MonteCarlo"]
+    cost, explained, status = study.cost.copy(), study.explained.copy(), study.status.astype("U20")
+    cost[4], explained[4], status[2] = 1e4, 0.3, "MAX_ITERATIONS"
+    assert replace(study, cost=cost, explained=explained, status=status).worst_first[:2].tolist() == [2, 4]
 
 
 def test_a_simulation_at_given_times_is_that_of_the_nodes(heater):
@@ -405,3 +395,140 @@ def test_the_command_writes_them_where_they_are_many(folder):  # noqa: F811
     assert f"and 9 more experiments, all in {out / 'runs.csv'}" in said
     assert f"more unknowns, all in {out / 'unknowns.csv'}" in said
     assert [len(read((out / name).read_text())) for name in ("runs.csv", "unknowns.csv")] == [12, 13]
+
+
+# --- tables where arrays are taken: numbers, names and units arrive ---------------------------------------------------
+
+CLOCK = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+X, Y = np.sin(CLOCK), np.cos(CLOCK)
+UNITS = {"x": "m", "y": "rad"}
+
+
+def pandas_table():
+    table = pd.DataFrame({"x": X, "y": Y}, index=pd.Index(CLOCK, name="t"), dtype="Float64")
+    table["x"].attrs["units"] = "ignored: pandas hands out a new column every time"
+    table.attrs["units"] = UNITS
+    return table.index, table
+
+
+def polars_table():
+    table = pl.DataFrame({"t": CLOCK, "x": X, "y": Y})
+    return table["t"], table[["x", "y"]]
+
+
+def xarray_dataset():
+    data = xr.Dataset({"x": ("t", X), "y": ("t", Y)}, coords={"t": CLOCK})
+    for name, unit in UNITS.items():
+        data[name].attrs["units"] = unit
+    return data["t"], data
+
+
+def xarray_array():
+    data = xr.DataArray(
+        np.stack([X, Y], axis=1), coords={"t": CLOCK, "channel": ["x", "y"]}, dims=("t", "channel"), name="pose"
+    )
+    data.attrs["units"] = UNITS
+    return data["t"], data
+
+
+def log(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = [f"{t!r},{x!r},{y!r}\n" for t, x, y in zip(CLOCK.tolist(), X.tolist(), Y.tolist(), strict=True)]
+    path.write_text("t,x [m],y [rad]\n" + "".join(rows))
+    found = sf.read_log(path)
+    return found.times, found[["x", "y"]]
+
+
+TABLES = [pandas_table, polars_table, xarray_dataset, xarray_array, log]
+
+
+@pytest.mark.parametrize("make", TABLES, ids=lambda make: make.__name__)
+def test_numbers_names_and_units_arrive(make, tmp_path):
+    times, values = make(tmp_path) if make is log else make()
+    units, array = (None if make is polars_table else ("m", "rad")), np.stack([X, Y], axis=1)
+    data = sf.Measurements(times, values, sigma=0.1)
+    np.testing.assert_array_equal(data.times, CLOCK)
+    np.testing.assert_array_equal(data.values, array)
+    assert (data.names, data.units) == (("x", "y"), units)
+    renamed = sf.Measurements(times, values, names=("a", "b"), units=("km", "deg"), sigma=0.5 + np.abs(array))
+    assert (renamed.names, renamed.units, renamed.sigma.shape) == (("a", "b"), ("km", "deg"), (5, 2))
+    reference = sf.ReferenceSignal.from_samples(times, values)
+    np.testing.assert_allclose(reference.signal(CLOCK), array, atol=1e-14)
+    assert (reference.names, reference.units) == (("x", "y"), units)
+    inputs = sf.Input(times, values, kind="linear")
+    assert inputs.units == units
+    assert inputs.names in (("x", "y"), ())  # an array of xarray is an array
+    np.testing.assert_array_equal(inputs.signal(0.0, 2.0)(CLOCK)[:, 1], Y)
+
+
+def test_names_and_units_that_are_not_given_for_each():
+    """Units follow their names; what is no name is none."""
+    table = pd.DataFrame({"b": X, "a": Y})
+    table.attrs["units"] = {"a": "m", "b": "rad"}
+    inputs = sf.Input(CLOCK, table)
+    assert dict(zip(inputs.names, inputs.units, strict=True)) == {"a": "m", "b": "rad"}
+    twice = pd.DataFrame(np.stack([X, Y], axis=1), columns=["x", "x"])
+    for values in (pd.DataFrame({0: X, 1: Y}), pd.Series(X), pl.Series(X), twice):
+        assert sf.Measurements(CLOCK, values).names is None
+    with pytest.raises(ValueError, match=r"units must have one entry for each of the 1 channels; got \('m', 's'\)"):
+        sf.Measurements(CLOCK, X, units=("m", "s"))
+    with pytest.raises(TypeError, match="each of units must be a string; got 3"):
+        sf.Input(CLOCK, X, units=[3])
+
+
+@pytest.mark.parametrize(
+    "column",
+    [pd.Series(X, name="x"), pl.Series("x", X), xr.DataArray(X, dims="t", name="x", attrs={"units": "m"})],
+    ids=["pandas", "polars", "xarray"],
+)
+def test_single_columns(column):
+    data = sf.Measurements(CLOCK, column)
+    np.testing.assert_array_equal(data.values[:, 0], X)
+    assert (data.names, data.units) == (("x",), ("m",) if isinstance(column, xr.DataArray) else None)
+    assert sf.Input(CLOCK, column).shape == ()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pd.DataFrame({"x": pd.array([1, None, 3, 4, 5], dtype="Int64")}),
+        pl.DataFrame({"x": [1, None, 3, 4, 5]}),
+        pl.Series("x", [1.0, None, 3, 4, 5]),
+        xr.DataArray([1, np.nan, 3, 4, 5], name="x"),
+    ],
+)
+def test_missing_values(values):
+    data = sf.Measurements(CLOCK, values)
+    np.testing.assert_array_equal(data.values[:, 0], [1, np.nan, 3, 4, 5])
+    with pytest.raises(ValueError, match=r"Input 'x' values must be finite|Input values must be finite"):
+        sf.Input(CLOCK, values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (pl.DataFrame({"x": ["a"] * 5}), "Measurements values must be an array of numbers"),
+        (pl.DataFrame({"x": [True] * 5}), "Measurements values must be an array of numbers"),
+        (xr.DataArray(X.astype(np.float32)), "Measurements values must be in double precision"),
+        (pd.Series(pd.to_datetime(["2024-05-01"] * 5)), "dates and time differences are not supported"),
+    ],
+)
+def test_what_is_no_number(values, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        sf.Measurements(CLOCK, values)
+
+
+def test_a_log_as_a_table(tmp_path):
+    """The same measurements from both; of the libraries none is imported for it."""
+    times, channels = log(tmp_path)
+    table = channels.to_pandas()
+    assert (table.index.name, list(table.columns), table.attrs["units"]) == ("t", ["x", "y"], UNITS)
+    one, other = sf.Measurements(times, channels), sf.Measurements(table.index, table)
+    np.testing.assert_array_equal(one.values, other.values)
+    assert (one.names, one.units) == (other.names, other.units)
+    code = (
+        "import sys, switchfit as sf; log = sf.read_log('a.csv'); sf.Measurements(log.times, log[['x']]);"
+        "print([name for name in ('pandas', 'polars', 'xarray', 'pyarrow', 'h5py', 'rosbags') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

@@ -64,7 +64,7 @@ def test_the_test_of_the_residuals_in_closed_form(known):
     r, X, n = y - design(TEST) @ p, design(TEST), len(TEST)
     expected = r @ np.linalg.solve(variance * (np.eye(n) + X @ C @ X.T), r)
     assert found.chi_square == pytest.approx(expected, rel=1e-6)
-    assert found.freedom == n
+    assert (found.freedom, found.kept) == (n, ("a", "b"))
     probability = scipy.stats.chi2.sf(expected, n) if known else scipy.stats.f.sf(expected / n, n, len(TRAIN) - 2)
     assert found.probability == pytest.approx(probability, rel=1e-5)
     assert r @ r / variance > 1.2 * expected, "otherwise the error of the parameters would not matter in this test"
@@ -229,6 +229,7 @@ def test_without_a_noise_level_there_is_no_chi_square():
     found = fit.validate(pose(run(TEST, values(TEST, 1), None)))
     assert np.isnan(found.chi_square)
     assert found.predictions == ()
+    found.plot().draw_without_rendering()
     r = values(TEST, 1) - design(TEST) @ by_hand()[0]
     assert found.explained == pytest.approx(1 - r @ r / len(r) / values(TEST, 1).var(), rel=1e-6)
     assert "chi²" not in str(found)

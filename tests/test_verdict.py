@@ -161,7 +161,7 @@ def test_situations(name):
     assert (fit.verdict.level, kinds(fit)) == (level, [reason])
     assert words in str(fit.verdict)
     assert str(fit.verdict).startswith(f"{level.capitalize()}: converged; one fit; ")
-    assert (fit.verdict.next_steps == ()) == (level == "good")
+    assert (fit.verdict.next_steps == (), fit.success) == (level == "good", level != "bad")
 
 
 def test_an_estimated_sigma_confirms_no_fit():
@@ -227,6 +227,7 @@ def test_the_error_of_a_time_is_corrected_by_its_own_run():
         runs.append(sf.Experiment(sf.Measurements(times, values), ("on", "off"), (3.0,), 0.0, 6.0))
     fit = sf.estimate(sf.Problem(heated_room(), runs, {"power": 2.0, "k": 0.5}), strategy="local")
     factors = fit.corrected_standard_errors / fit.standard_errors
+    assert factors[0] == 1.0
     assert factors[1] > 1.5
     np.testing.assert_allclose(factors[2:], factors[1], rtol=1e-14)
 
