@@ -1,7 +1,5 @@
 """Online estimation: against batch fits, closed forms and brute force."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -65,7 +63,6 @@ def test_the_vehicle_is_followed_and_ends_where_the_batch_fit_does(problem, log,
     said = feed_all(sf.OnlineEstimator(problem), log)
     alarms = [now.alarm for now in said if now.alarm]
     assert [alarm.mode for alarm in alarms] == ["slip", "stick"]
-    assert not any(now.retracted for now in said)
     assert alarms[0].time - 6.0 < 0.85
     assert alarms[1].time - 10.0 < 0.65
     last = said[-1]
@@ -75,8 +72,6 @@ def test_the_vehicle_is_followed_and_ends_where_the_batch_fit_does(problem, log,
     np.testing.assert_allclose(np.append(last.time_errors, last.standard_errors["mu"]), errors, rtol=0.01)
     path = sf.simulate(batch.problem, batch.theta)
     np.testing.assert_allclose(last.state, path.states[-1], atol=1e-3)
-    assert last.mode == "stick"
-    assert last.since == last.transition_times[-1]
     assert last.mode_probability["stick"] > 0.99
 
 
@@ -116,7 +111,6 @@ def test_a_window_is_exact_for_a_linear_model():
         np.testing.assert_allclose(now.parameters[name], batch.parameters[name], rtol=1e-10, atol=1e-11)
     fit = online.estimate()
     np.testing.assert_allclose(fit.theta[-3:-1], batch.theta[:2], rtol=1e-6)
-    assert fit.problem.experiments[0].name == "log"
     np.testing.assert_allclose(now.standard_errors["a"], batch.standard_errors[0], rtol=1e-9)
 
 
@@ -165,20 +159,16 @@ def test_without_changes_there_is_one_hypothesis(problem, log, window):
     now = feed_all(online, log[:50])[-1]
     assert now.mode_sequence == ("stick",)
     assert now.mode_probability["stick"] == 1.0
-    assert now.statistic == -np.inf
 
 
 def test_the_data_of_the_problem_may_be_empty(problem, log):
     """The time between samples is that from the first to the second one."""
     gps = sf.Measurements([], np.empty((0, 3)), lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))
-    run = sf.Experiment(gps, ("stick",), t0=0.0)
-    empty = sf.Problem(skid_steer(), run, problem.parameters)
-    assert (run.t0, run.tf) == (0.0, 1.0)
+    empty = sf.Problem(skid_steer(), sf.Experiment(gps, ("stick",), t0=0.0), problem.parameters)
     online, known = sf.OnlineEstimator(empty), sf.OnlineEstimator(problem)
     with pytest.raises(ValueError, match="how often the sensors measure is not known yet"):
         sf.calibrate(online, 0.01)
     online.update(0.001), known.update(0.001)
-    assert online.spacing is None
     now, same = feed_all(online, log)[-1], feed_all(known, log)[-1]
     assert online.spacing == pytest.approx(known.spacing, rel=0.02)
     np.testing.assert_allclose(now.transition_times, same.transition_times, atol=1e-4)
@@ -290,20 +280,17 @@ def test_missing_values_are_as_if_left_out(problem, log):
 def test_sensors_at_their_own_rates_with_a_delay():
     """A slow sensor whose samples come 0.25 s late: each is put where the state was measured."""
     rng = np.random.default_rng(1)
-    quick, slow = 0.1 * np.arange(1, 61), 0.4 * np.arange(1, 15) + 0.25
+    quick, slow = 0.1 * np.arange(1, 61), np.round(0.4 * np.arange(1, 15) + 0.25, 10)
 
     def truth(t):
         return np.where(t < 3.0, 1 - np.exp(-t), (1 - np.exp(-3.0)) * np.exp(3.0 - t))
 
-    slow = np.round(slow, 10)
     a = sf.Measurements(quick, truth(quick) + 0.05 * rng.standard_normal(60), sigma=0.05, names=["a"])
     b = sf.Measurements(slow, truth(slow - 0.25) + 0.01 * rng.standard_normal(14), sigma=0.01, names=["b"], delay=0.25)
     system = sf.HybridSystem({"on": lambda t, x, p: p["k"] - x, "off": lambda t, x, p: -x}, [0.0])
-    run = sf.Experiment([a, b], ("on",), (), 0.0, 6.0)
-    problem = sf.Problem(system, run, {"k": sf.Parameter(1.2)})
+    problem = sf.Problem(system, sf.Experiment([a, b], ("on",), (), 0.0, 6.0), {"k": 1.2})
     replayed = sf.replay(problem)
-    known = sf.Problem(system, sf.Experiment([a, b], ("on", "off"), (2.9,), 0.0, 6.0), {"k": sf.Parameter(1.0)})
-    batch = sf.estimate(known)
+    batch = sf.estimate(sf.Problem(system, sf.Experiment([a, b], ("on", "off"), (2.9,), 0.0, 6.0), {"k": 1.0}))
     np.testing.assert_allclose(replayed.now.transition_times, batch.transition_times[0], atol=1e-4)
     np.testing.assert_allclose(replayed.parameters["k"][-1], batch.parameters["k"], atol=1e-4)
     assert len(replayed.times) == len(np.union1d(quick, slow))
@@ -317,7 +304,6 @@ def test_sensors_at_their_own_rates_with_a_delay():
     np.testing.assert_allclose(online.estimate().theta, batch.theta, rtol=1e-6)
     assert 0 < replayed.delays([3.0])[0] < 0.6
     assert replayed.latency()["p50"] > 0
-    assert "2 updates" not in repr(replayed)
 
 
 def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):
@@ -330,28 +316,28 @@ def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):
     log = np.array(states) + 0.01 * rng.standard_normal(40)
     system = sf.HybridSystem({"on": lambda t, x, p, u: u - p["k"] * x}, [0.0])
     data = sf.Measurements(times, log, sigma=0.01)
-    held = sf.Input(np.append(0.0, times[:-1]), u)
-    problem = sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=held), {"k": sf.Parameter(1.5)})
-    batch = sf.estimate(problem)
-    unknown = sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=sf.Input([0.0], [0.0]))
-    later = sf.Problem(system, unknown, problem.parameters)
+    known, unknown = sf.Input(np.append(0.0, times[:-1]), u), sf.Input([0.0], [0.0])
+    problem, later = (
+        sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=inputs), {"k": 1.5})
+        for inputs in (known, unknown)
+    )
+    k = sf.estimate(problem).parameters["k"]
     online = sf.OnlineEstimator(later)
     online.update(0.0)
     online.save(tmp_path / "state")
     online.keep_journal(tmp_path / "journal")
-    for k, (t, y) in enumerate(zip(times, log, strict=True)):
-        now = online.update(t, [y], u=u[min(k + 1, 39)] if k else u[0])
-        if k == 0:
-            now = online.update(t + 1e-9, None, u=u[1])
-    np.testing.assert_allclose(now.parameters["k"], batch.parameters["k"], rtol=1e-5)
-    np.testing.assert_allclose(online.estimate().parameters["k"], batch.parameters["k"], rtol=1e-6)
+    online.update(times[0], [log[0]], u=u[0])
+    online.update(times[0] + 1e-9, None, u=u[1])
+    for t, y, held in zip(times[1:], log[1:], [*u[2:], u[-1]], strict=True):
+        now = online.update(t, [y], u=held)
+    np.testing.assert_allclose(now.parameters["k"], k, rtol=1e-5)
+    np.testing.assert_allclose(online.estimate().parameters["k"], k, rtol=1e-6)
     loaded = sf.OnlineEstimator.load(tmp_path / "state", later)
     loaded.keep_journal(tmp_path / "journal")
     again = loaded.now
     assert again is not None
     assert again.parameters["k"] == now.parameters["k"]
-    without = sf.replay(problem)  # the inputs of the problem
-    np.testing.assert_allclose(without.now.parameters["k"], batch.parameters["k"], rtol=1e-5)
+    np.testing.assert_allclose(sf.replay(problem).now.parameters["k"], k, rtol=1e-5)  # the inputs of the problem
 
 
 # --- what is said -----------------------------------------------------------------------------------------------------
@@ -399,7 +385,6 @@ def test_a_model_that_cannot_be_simulated_any_more_is_said(window, tmp_path):
         with pytest.raises(ValueError, match=r"the model cannot be simulated from t = .*begin anew with reset\(\)"):
             online.update(t, [10.0])
         assert online.now.status is sf.OnlineStatus.STOPPED
-    assert "begin anew with `reset`" in online.now.status.value
     with pytest.raises(ValueError, match="the model cannot be simulated"):
         online.save(tmp_path / "state")
     online.reset()
@@ -412,7 +397,6 @@ def test_a_budget_leaves_out_work_and_says_so(problem, log):
     count = [now.status for now in said].count
     assert count(sf.OnlineStatus.OVERRUN) > 50
     assert count(sf.OnlineStatus.OVERRUN) + count(sf.OnlineStatus.LOST) > 100  # without births no change is seen
-    assert said[-1].time == TIMES[-1]
 
 
 def test_a_model_that_has_lost_the_samples_stays_so():
@@ -426,14 +410,12 @@ def test_a_model_that_has_lost_the_samples_stays_so():
     said = sf.replay(problem, successions={"rise": ()}).status
     first = said.index(sf.OnlineStatus.LOST)
     assert set(said[first:]) == {sf.OnlineStatus.LOST}
-    assert set(said[:30]) == {sf.OnlineStatus.TRACKING}
     assert sf.OnlineStatus.LOST not in sf.replay(problem).status  # with the mode that explains them
 
 
 def test_a_threshold_is_set_after_calibration(problem):
     online = sf.OnlineEstimator(problem)
     found, rarer = (sf.calibrate(online, rate, seconds=3.0, runs=10) for rate in (0.01, 0.0001))
-    assert found.maxima.shape == (10,)
     assert 0 < found.threshold < min(rarer.threshold, 40)
     assert "10 runs" in str(found)
     online.set_threshold(found.threshold)
@@ -549,9 +531,7 @@ def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
 
 
 def test_what_is_not_known_has_an_infinite_variance():
-    found = invert(np.diag([4.0, 0.0]))
-    assert found[0, 0] == 0.25
-    assert found[1, 1] == np.inf
+    np.testing.assert_array_equal(np.diag(invert(np.diag([4.0, 0.0]))), [0.25, np.inf])
 
 
 def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
@@ -590,16 +570,6 @@ def test_a_wrong_model_of_a_log_with_outliers_is_followed_to_the_end(seed):
         outlier = 2.0 * rng.standard_normal() if k % 20 == 10 else 0.0
         now = online.update(0.1 * k, [0.3 * np.sin(0.08 * k) + 0.05 * rng.standard_normal() + outlier])
         assert (np.diff(now.transition_times) >= 0.0).all()
-
-
-def test_a_long_gap_has_nodes_inside():
-    """At most one and a half of the usual time apart, so that a change may begin there."""
-    online = sf.OnlineEstimator(vehicle(drive()))
-    for t in (0.1, 0.2, 2.2):
-        online.update(t, drive()[0])
-    nodes = online._feed.nodes[: online._feed.count]
-    assert np.diff(nodes).max() <= 0.15 + 1e-9
-    assert len(nodes) == 3 + 14
 
 
 # --- any log ---------------------------------------------------------------------------------------------------------

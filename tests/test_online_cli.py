@@ -64,32 +64,21 @@ def test_a_line_of_json_for_each_sample(replayed, folder):
     log = sf.replay(load_problem(folder / "problem.toml", searched=True).problem, **library)
     assert [line["t"] for line in lines] == list(TIMES)
     assert [line["statistic"] for line in lines] == [v if np.isfinite(v) else None for v in log.statistic.tolist()]
-    assert {line["threshold"] for line in lines} == {12.0}
     assert [line["status"] for line in lines] == [status.name for status in log.status]
     last = lines[-1]
     assert (last["mode"], last["mode_sequence"]) == ("rise", ["rise", "fall", "rise"])
     assert last["since"] == last["transition_times"][-1] == log.now.since
     assert last["parameters"] == {name: value.tolist() for name, value in log.now.parameters.items()}
-    assert last["standard_errors"]["a"] == float(log.now.standard_errors["a"])
     assert last["standard_errors"]["c"] is None, "of a mode that has not occurred"
-    alarms = [line["alarm"] for line in lines if line["alarm"]]
-    assert alarms == [
-        {name: value if np.all(value != np.inf) else None for name, value in alarm._asdict().items()}
-        for alarm in log.alarms
-    ]
+    assert [line["alarm"]["mode"] for line in lines if line["alarm"]] == [alarm.mode for alarm in log.alarms]
     assert [line["retracted"] for line in lines if line["retracted"]] == [each._asdict() for each in log.retracted]
     out = folder / "out" / "deep"
     assert replayed.stderr == f"written to {out}\n"
-    assert sorted(path.name for path in out.iterdir()) == ["online.png", "online.txt"]
     assert (out / "online.txt").read_text().startswith("rise since 5.48")
     assert (out / "online.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_another_log(folder, replayed):
     write_log(folder / "other.csv", VALUES[:30], times=TIMES[:30])
-    result = run("online", folder / "problem.toml", "--replay", folder / "other.csv")
-    assert result.exit_code == 0, result.stderr
-    assert read(result) == read(replayed)[:30]
+    another = run("online", folder / "problem.toml", "--replay", folder / "other.csv")
+    assert read(another) == lines[:30]
 
 
 def test_a_stream_needs_no_log(folder, tmp_path):
@@ -178,21 +167,16 @@ def test_options_are_those_of_the_estimator_and_come_before_the_file(folder, tmp
         raise ValueError("enough")
 
     monkeypatch.setattr(sf, "OnlineEstimator", build)
-    options = ("--window", 2, "--threshold", 9, "--max-switches", 3, "--budget", 0.1)
-    result = run("online", folder / "problem.toml", *options)
-    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
-    said = {"window": 2.0, "threshold": 9.0, "false_alarms": None, "max_switches": 3, "budget": 0.1, "capacity": 4096}
-    durations = dict.fromkeys(("rise", "fall", "drift"), 0.2)
-    successions = {"rise": ("fall", "drift"), "fall": ("rise",), "drift": ()}
-    assert given == said | {"successions": successions, "min_duration": durations}
     for name in ("model.py", "log.csv"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     online = '[online]\nwindow = 3.0\nrenews = { rise = "a" }\ndrift = { c = 0.1 }\n'
     (tmp_path / "problem.toml").write_text(PROBLEM + online)
     run("online", tmp_path / "problem.toml")
     assert (given["window"], given["renews"], given["drift"]) == (3.0, {"rise": ["a"]}, {"c": 0.1})
-    run("online", tmp_path / "problem.toml", "--window", 2)
-    assert given["window"] == 2.0
+    options = ("--window", 2, "--threshold", 9, "--max-switches", 3, "--budget", 0.1)
+    result = run("online", tmp_path / "problem.toml", *options)
+    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
+    assert given.items() >= {"window": 2.0, "threshold": 9.0, "max_switches": 3, "budget": 0.1}.items()
 
 
 def test_modes_that_the_library_leaves_out_never_follow(folder, tmp_path):
@@ -329,11 +313,9 @@ def test_ctrl_c_while_it_waits_keeps_what_there_is(folder, tmp_path, quick_proce
             assert json.load(answer)["lines"] == said
         time.sleep(0.2)  # it waits for the next line
         process.send_signal(signal.SIGINT)
-        rest = process.stderr.read()
+        assert "Traceback" not in process.stderr.read()
         assert process.wait(timeout=60) == 0
-    assert "Traceback" not in rest
     assert (out / "online.txt").read_text().startswith("rise since 0 s")
-    assert "12 updates" in (out / "online.txt").read_text()
     assert read(feed(folder, LINES[12:14], "--state", state))[0]["t"] == TIMES[12]
 
 
@@ -353,36 +335,27 @@ def get(page, path, **headers):
 
 def test_the_page_is_one_file_that_asks_this_machine_only(page):
     headers, text = get(page, "/")
-    assert headers["Content-Type"] == "text/html; charset=utf-8"
     assert "connect-src 'self'" in headers["Content-Security-Policy"]
-    assert "--good:" in text, "the colours of the report"
     assert "https://" not in text
     assert page.address.startswith("http://127.0.0.1:")
+    for path, host, code in (("/etc/passwd", "127.0.0.1", 404), ("/", "evil.example:80", 403)):
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            get(page, path, Host=host)
+        with caught.value as answer:
+            assert answer.code == code
 
 
 def test_readers_get_what_is_new(page):
     for k in range(5):
         page.show(json.dumps({"k": k}))
-    _, text = get(page, "/now.json")
-    found = json.loads(text)
-    assert found["head"]["units"] == {"a": "1/s", "b": "", "c": ""}
-    assert list(found["head"]["colours"]) == ["rise", "fall", "drift"]
-    assert (found["count"], [line["k"] for line in found["lines"]]) == (5, [0, 1, 2, 3, 4])
     for after, expected in {"3": [3, 4], "5": [], "99": [0, 1, 2, 3, 4], "9" * 5000: [0, 1, 2, 3, 4]}.items():
         lines = json.loads(get(page, f"/now.json?after={after}")[1])["lines"]
         assert [line["k"] for line in lines] == expected
     for k in range(5, KEPT + 100):
         page.show(json.dumps({"k": k}))
     found = json.loads(get(page, "/now.json?after=10")[1])
+    assert list(found["head"]["colours"]) == ["rise", "fall", "drift"]
     assert (found["count"], found["lines"][0]["k"], len(found["lines"])) == (KEPT + 100, 100, KEPT)
-
-
-@pytest.mark.parametrize(("path", "host", "code"), [("/etc/passwd", "127.0.0.1", 404), ("/", "evil.example:80", 403)])
-def test_other_requests_are_refused(page, path, host, code):
-    with pytest.raises(urllib.error.HTTPError) as caught:
-        get(page, path, Host=host)
-    with caught.value as answer:
-        assert answer.code == code
 
 
 def test_a_port_that_is_taken(page, folder):
@@ -401,7 +374,6 @@ def test_the_page_in_a_browser(browser, page, replayed):
         page.show(line)
     browser.wait("document.getElementById('mode')?.textContent === 'rise'")
     assert browser.evaluate("document.querySelectorAll('.chart').length") == 6, "mode, statistic, a, b, c, time"
-    assert browser.evaluate("document.getElementById('parameters').textContent").startswith("a0.694")
     assert browser.evaluate("document.querySelectorAll('.alarm').length") == 2
     assert browser.errors == []
     asked = {url.removeprefix(page.address)[:9] for url in browser.requests if url.startswith("http")}

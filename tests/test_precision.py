@@ -1,7 +1,5 @@
 """Numbers that lost digits in single precision are refused with the line that uses them."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,18 +25,6 @@ def problem_of(mode=None, initial_state=(1.0,), data=None, reset=None):
     return sf.Problem(system, sf.Experiment(data, ("on", "off"), (0.4,), 0.0, 1.0), {"a": 0.8})
 
 
-class Body:
-    def __init__(self):
-        self.gain = jnp.array([0.1])
-
-    def __call__(self, t, x, p):
-        return -self.gain * p["a"] * x
-
-
-def by_default(t, x, p, k=K):
-    return k * x
-
-
 def scaled(t, x, p):
     return K * x
 
@@ -56,7 +42,6 @@ WITH_LINE = r"a constant of mode 'on' \(test_precision.py:\d+\) must be in doubl
         ({"mode": lambda t, x, p: -HALF * x}, WITH_LINE + r".*\(bfloat16\)"),
         ({"mode": lambda t, x, p: jax.lax.fori_loop(0, 2, lambda k, y: y - DRAG[1] * x, x)}, "a constant of mode 'on'"),
         ({"mode": Body()}, "a constant of mode 'on'"),
-        ({"mode": by_default}, "a constant of mode 'on'"),
         ({"mode": lambda t, x, p: -jnp.float32(0.3) * x}, "a constant of mode 'on'.*0.3 became"),
         ({"reset": scaled}, r"a constant of reset map \('on', 'off'\)"),
         ({"initial_state": lambda p: jnp.ones(1) * K}, "a constant of initial_state"),

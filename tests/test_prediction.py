@@ -1,7 +1,5 @@
 """Sensitivities and bands: closed forms, finite differences, Monte Carlo."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import models
@@ -82,7 +80,6 @@ def test_sensitivities_in_closed_form(jump):
     np.testing.assert_allclose(found.states[:, 0][away], temperature(found.times, *theta, jump=jump)[away], rtol=1e-8)
     expected = slopes(found.times, *theta, jump=jump)
     np.testing.assert_allclose(found.states_d[away][:, 0], expected[away], atol=1e-7)
-    np.testing.assert_array_equal(found.outputs_d, found.states_d)
 
 
 def test_at_a_transition_the_derivative_jumps_by_that_of_the_vector_field():
@@ -139,7 +136,6 @@ def test_gauss_newton_matrix_with_sigmas_to_estimate_robust_losses_and_priors_is
     built = build_gauss_newton(problem, theta, collect_sample_derivatives(problem, found))
     expected = evaluator(theta, matrix="gauss-newton").hessian
     np.testing.assert_allclose(built, expected, atol=1e-12 * np.abs(expected).max())
-    assert np.all(np.diag(expected) > 0)
 
 
 # Bands
@@ -163,7 +159,6 @@ def test_bands_in_closed_form(known):
     inner = found.output_band(0.9)[:, 0]
     np.testing.assert_allclose(inner[:, 1] - inner[:, 0], 2 * fit.quantile(0.9) * errors, rtol=1e-5, atol=1e-9)
     np.testing.assert_array_equal(found.state_band(0.9)[:, 0], inner)
-    assert (found.state_names, found.state_units, found.output_names) == (("T",), ("K",), ("T",))
 
 
 def fit_correlated(seed, correlation=0.6, count=600):
@@ -183,15 +178,13 @@ def test_bands_allow_for_correlated_residuals_as_the_table_does(fitted):
     np.testing.assert_allclose(fit.corrected_covariance, factor[0] ** 2 * fit.covariance, rtol=1e-12)
     times = np.array([1.0, 4.0])
     found = fit.predict(times)
-    errors = errors_of(times, fit.theta, fit.covariance)
-    np.testing.assert_allclose(found.output_errors[:, 0], factor[0] * errors, rtol=1e-5)
+    errors = factor[0] * errors_of(times, fit.theta, fit.covariance)
+    np.testing.assert_allclose(found.output_errors[:, 0], errors, rtol=1e-5)
     np.testing.assert_allclose(found.state_errors, found.output_errors)
     assert found.corrected
     again = fit.validate(fit.problem).predictions[0]
-    np.testing.assert_allclose(
-        np.interp(times, again.times, again.output_errors[:, 0]), found.output_errors[:, 0], rtol=0.01
-    )
-    assert not fitted.predict(times).corrected
+    np.testing.assert_allclose(np.interp(times, again.times, again.output_errors[:, 0]), errors, rtol=0.01)
+    assert (found.corrected, fitted.predict(times).corrected) == (True, False)
 
 
 @pytest.mark.slow
@@ -216,13 +209,6 @@ def test_the_noise_of_a_sample_is_that_of_the_nearest():
     np.testing.assert_array_equal(noisy(sigma).predict([0.0, 2.7, 2.9, 6.0]).noise[:, 0], [0.1, 0.1, 0.4, 0.4])
 
 
-def test_left_out_times_are_the_nodes_with_each_transition_twice(fitted):
-    found = fitted.predict()
-    at_transition = found.times == fitted.theta[0]
-    assert at_transition.sum() == 2
-    assert found.times[[0, -1]].tolist() == [0.0, 6.0]
-
-
 def test_what_cannot_be_predicted(fitted):
     few = sf.Experiment(sf.Measurements(TIMES[[1, 20]], np.array([0.7, 0.8])), ("on", "off"), (2.1,), 0.0, 6.0)
     without = sf.estimate(sf.Problem(ROOM, few, {"power": 1.0, "k": sf.Parameter(0.4, fixed=True)}))
@@ -245,11 +231,20 @@ def test_what_cannot_be_predicted(fitted):
 # Beyond tf
 
 
-@pytest.mark.parametrize("last", [1e300, 1.7e308])
-def test_a_time_near_the_largest_float_is_reached_by_implicit_steps(fitted, last):
-    found = fitted.predict([1.0, last])
+def test_a_time_near_the_largest_float_is_reached_by_implicit_steps(fitted):
+    found = fitted.predict([1.0, 1.7e308])
     assert abs(found.outputs[1, 0]) < 1e-8
     assert found.output_errors[1, 0] < 1e-8
+
+
+def test_bands_in_the_figure_with_each_transition_twice(fitted):
+    found, panel = fitted.predict(), fitted.plot().axes[0]
+    assert np.sum(found.times == fitted.theta[0]) == 2
+    assert found.near_transition[found.times == fitted.theta[0]].all()
+    top = max(path.vertices[:, 1].max() for path in panel.collections[1].get_paths())
+    assert top == pytest.approx(found.output_band().max(), rel=1e-9)
+    for without in (fitted.plot(bands=False), replace(fitted, problem=None).plot()):
+        assert not without.axes[0].collections
 
 
 def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known():

@@ -1,7 +1,5 @@
 """Profile likelihoods against closed forms, and what they say where there is no ordinary interval."""
 
-from __future__ import annotations
-
 import re
 
 import jax.numpy as jnp
@@ -103,9 +101,9 @@ def test_of_a_transition_time_with_kinks_at_the_samples(noisy_ramp):
         expected = [brentq(excess, *sorted((tau, tau + side * span))) for side in (-1, 1)]
         np.testing.assert_allclose(found.interval(level), expected, rtol=1e-6)
     assert found.lower_cost is None
-    inside = [t for t in TIMES if found.interval()[0] < t < found.interval()[1]]
-    assert len(inside) > 1
-    assert f"{len(inside)} sample times lie in the interval, where the slope of the profile may jump" in str(found)
+    low, high = found.interval()
+    inside = np.sum((low < TIMES) & (high > TIMES))
+    assert f"{inside} sample times lie in the interval, where the slope of the profile may jump" in str(found)
 
 
 def test_others_are_fitted_again_and_pushed_away_in_time():
@@ -141,7 +139,6 @@ def test_one_sided_at_a_bound():
     assert fit.theta[0] == 0.0
     assert np.isnan(fit.confidence_intervals()).all()
     found = fit.profile("m")
-    assert found.ends == ("limit", "crossed")
     n, mean = len(TIMES), values.mean()
     # (m - mean)^2 - mean^2 = 3.84 sigma^2 / n, with mean < 0
     high = mean + np.sqrt(mean**2 + scipy.stats.chi2.ppf(0.95, 1) * SIGMA**2 / n)
@@ -165,21 +162,16 @@ def test_not_identifiable_upward():
     expected = brentq(lambda k: cost(k) - fit.cost - 0.5 * scipy.stats.chi2.ppf(0.95, 1), 0.1, fit.theta[0])
     assert low == pytest.approx(expected, rel=1e-6)
     assert re.search(r"not identifiable upward: up to \S+ the cost does not rise enough", str(found))
-    found.plot().draw_without_rendering()
 
 
 def test_two_regions_of_one_profile():
     """y = a^2: -a fits as well as a."""
     values = 1.0 + 3 * noise(7)
-    fit = observed(square, values, {"a": 0.9}, 3 * SIGMA)
-    found = fit.profile("a")
-    regions = found.regions()
-    low, high = found.interval()
+    found = observed(square, values, {"a": 0.9}, 3 * SIGMA).profile("a")
     half = np.sqrt(scipy.stats.chi2.ppf(0.95, 1) / len(TIMES)) * 3 * SIGMA
     expected = np.sqrt(values.mean() + np.array([-half, half]))
-    np.testing.assert_allclose((low, high), expected, rtol=1e-6)
-    assert len(regions) == 2
-    np.testing.assert_allclose(regions[0], -expected[::-1], rtol=1e-6)
+    np.testing.assert_allclose(found.interval(), expected, rtol=1e-6)
+    np.testing.assert_allclose(found.regions()[0], -expected[::-1], rtol=1e-6)
     assert "there is another minimum" in str(found)
 
 
@@ -204,7 +196,6 @@ def test_nothing_is_compiled_along_a_profile(noisy_ramp):
     found = noisy_ramp.profile("tau_1")
     found.interval(0.999)
     assert TRACES["count"] == before
-    assert len(found.values) > 15
 
 
 def test_correlated_residuals_are_allowed_for_on_request_and_said():
@@ -222,9 +213,6 @@ def test_correlated_residuals_are_allowed_for_on_request_and_said():
     np.testing.assert_allclose(found.regions(corrected=True)[0], found.interval(corrected=True), rtol=1e-5)
     said = " ".join(str(found).split())
     assert f"too narrow by a factor of about {found.widening:.2g}; profile.interval(corrected=True) allows" in said
-    assert "95 % interval, residuals as if independent" in found.plot().axes[0].get_legend_handles_labels()[1]
-    white = observed(parabola, (1.0 + 2.0 * TIMES - TIMES**2 + noise(1))[:, None], {"c": [1.0, 2.0, -1.0]})
-    assert white.profile("c[1]").widening == 1.0
 
 
 def test_it_can_be_stopped(noisy_ramp):

@@ -6,8 +6,6 @@ by block, at the first guess and at a theta with a tie (a transition at a sample
 transitions or a mode that lasts no time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -631,18 +629,10 @@ def test_derivatives_of_random_systems_with_both_kinds_of_steps(seed):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("used_once")
-@pytest.mark.parametrize("seed", range(0, SYSTEMS, 10))
-def test_derivatives_of_random_systems_in_jax(seed):
-    """JAX where machine code could do it; 20 s of compiling each."""
-    assert not differences(System(seed), (), "jax")
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("used_once")
 @pytest.mark.parametrize("seed", range(SYSTEMS))
 def test_derivatives_of_random_systems_by_the_other_methods(seed):
-    """Each of them in turn: JAX takes 20 s to compile most."""
-    assert not differences(System(seed), (METHODS[seed % len(METHODS)],))
+    """Each of them in turn, which JAX takes 20 s to compile; in each tenth JAX does what machine code could do."""
+    assert not differences(System(seed), (METHODS[seed % len(METHODS)],), "jax" if seed % 10 == 0 else "auto")
 
 
 def test_the_reference_knows_a_closed_form():

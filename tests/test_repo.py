@@ -10,7 +10,6 @@ import pytest
 from switchfit.io.problem_file import tables as keys
 
 ROOT = Path(__file__).parent.parent
-SOURCES = sorted((ROOT / "src").rglob("*.py"))
 
 
 def tracked():
@@ -47,16 +46,7 @@ def test_links_in_the_pages_lead_somewhere():
             assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_the_table_of_equations_names_what_exists():
-    page = (ROOT / "docs" / "paper.md").read_text()
-    named = re.findall(r"`([\w/]+\.py): (\w+)`", page)
-    assert len(named) > 20
-    for file, function in named:
-        path = ROOT / ("tests" if file.startswith("test_") else "src/switchfit") / file
-        assert re.search(rf"^def {function}\b", path.read_text(), re.M), f"{file}: {function}"
-
-
-def test_each_equation_of_the_paper_is_listed_and_its_function_names_it():
+def test_each_equation_of_the_paper_is_listed_and_its_function_and_its_test_exist():
     page = (ROOT / "docs" / "paper.md").read_text()
     rows = re.findall(r"^\| \((\d+)\) \|[^|]+\| `([\w/]+\.py): (\w+)` \| [^|]+ \|$", page, re.M)
     assert [int(number) for number, _, _ in rows] == list(range(1, 19))
@@ -65,6 +55,8 @@ def test_each_equation_of_the_paper_is_listed_and_its_function_names_it():
         functions = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef))
         function = next(node for node in functions if node.name == name)
         assert f"({number})" in ast.get_source_segment(text, function), f"{file}: {name} lacks ({number})"
+    for file, test in re.findall(r"`(test_\w+\.py): (\w+)`", page):
+        assert re.search(rf"^def {test}\b", (ROOT / "tests" / file).read_text(), re.M), f"{file}: {test}"
 
 
 def test_internals_name_every_room_and_files_that_exist():

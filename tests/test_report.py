@@ -1,7 +1,5 @@
 """The report as text and as figures, of fits made by hand and of one real one."""
 
-from __future__ import annotations
-
 import ast
 import itertools
 from dataclasses import fields, replace
@@ -23,11 +21,9 @@ from switchfit.report import sentences
 from switchfit.report.formats import format_rounded
 from switchfit.report.plot import (
     plot_comparison,
-    plot_convergence,
     plot_fit,
     plot_modes,
     plot_residuals,
-    plot_transitions,
 )  # fmt: skip
 from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.verdict import find_issues
@@ -104,8 +100,9 @@ def made(**changes) -> Fit:
 def several(count: int, names=None) -> Fit:
     """A fit of many experiments with two transitions each, the second one fixed, and one shared parameter."""
     names = names or [f"run{e + 1}" for e in range(count)]
-    trajectories = tuple(trajectory_of(times=(0.0, 3.0 + 0.1 * e, 7.0, 10.0)) for e in range(count))
-    theta = np.array([3.0 + 0.1 * e for e in range(count)] + [0.8])
+    times = [np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)]
+    trajectories = tuple(trajectory_of(times=(0.0, *tau, 10.0)) for tau in times)
+    theta = np.array([*(tau[0] for tau in times), 0.8])
     return made(
         theta_names=(*(f"{name}.tau_1" for name in names), "mu"),
         theta_units=("s",) * count + ("1",),
@@ -122,9 +119,8 @@ def several(count: int, names=None) -> Fit:
         free_basis=np.eye(count + 1),
         trajectories=trajectories,
         comparisons=tuple((comparison_of(t, names=("X", "dX")),) for t in trajectories),
-        cost=29.0 * count,
         history=tuple(IterationRecord(k, 900.0 / (k + 1), 10.0**-k, 1.0, theta, k + 1) for k in range(3)),
-    )
+    )  # fmt: skip
 
 
 def write_report(fit: Fit, certificate=None, **settings) -> str:
@@ -138,13 +134,6 @@ def report(fit: Fit) -> str:
     return write_report(fit, full=True)
 
 
-def line_with(text: str, start: str) -> str:
-    """The only line that begins with `start`, spaces aside, with single spaces."""
-    found = [line for line in text.splitlines() if line.strip().startswith(start)]
-    assert len(found) == 1, f"{start!r} begins {len(found)} lines of\n{text}"
-    return " ".join(found[0].split())
-
-
 # --- text -------------------------------------------------------------------------------------------------------------
 
 
@@ -154,7 +143,8 @@ def test_errors_and_correlations_are_those_of_the_inverse_by_hand():
     by_hand = np.sqrt([160000 / 63e6, 1e6 / 63e6, (40000 - 400) / 63e6])
     assert fit.standard_errors == pytest.approx(by_hand)
     # correlation of tau_2 and mu: -cofactor / root of the product of the others
-    assert line_with(report(fit), "tau_2, mu") == f"tau_2, mu {-400 * 300 / np.sqrt(1e6 * 39600):+.3f}"
+    (line,) = (line.split() for line in report(fit).splitlines() if line.strip().startswith("tau_2, mu"))
+    assert line == ["tau_2,", "mu", f"{-400 * 300 / np.sqrt(1e6 * 39600):+.3f}"]
 
 
 @pytest.mark.parametrize(
@@ -237,19 +227,15 @@ FITS: dict[str, Fit] = {
     "a channel without a value": made(comparisons=((without_values(),),)),
     "a search that settled": made(**SEARCHED),
     "a search that ran out of time": made(**SEARCHED | {"steps": (STEPS[0], replace(STEPS[1], ended="time"))}),
-    "a search with all its starts": made(**SEARCHED | {"steps": (STEPS[0], replace(STEPS[1], ended="most"))}),
     "a first guess that cannot be integrated": made(
         steps=(Step("local", np.inf, 0, 0.1), Step("beam along the log", 28.0, 300, 2.0))
     ),
     "at the upper bound": made(**bound("upper bound")),
-    "at the lower bound": made(**bound("lower bound")),
     "a mode collapsed": made(**mode_held("collapsed", 0.0)),
     "a mode at its minimum duration": made(**mode_held("minimum duration", 0.5, run="run1")),
-    "a mode that is called collapsed": made(**mode_held("minimum duration", 0.5, "collapsed")),
     "at a kink": made(kinks=KINKS[:1], free_basis=np.eye(3)[:, 1:], cost=28.5),
     "at kinks": made(kinks=KINKS, free_basis=np.eye(3)[:, 2:], cost=29.0),
     "stopped at a kink": made(kinks=KINKS[:1], free_basis=np.eye(3)[:, 1:], status=Status.MAX_ITERATIONS),
-    "stopped with a short mode": made(**mode_held("minimum duration", 0.5), status=Status.MAX_ITERATIONS),
     "an indefinite Hessian": made(hessian=np.diag([1.0, -4.0, 1.0]), status=Status.SADDLE),
     "a singular Hessian": made(**correlated(0.0), status=Status.SINGULAR),
     "a nearly singular Hessian": made(**correlated(1e-7)),
@@ -340,7 +326,6 @@ def test_all_that_is_printed_was_approved():
     assert build_texts().keys() == APPROVED.keys()
     whole = report(several(14))
     assert all(f"run{e + 1}  " in whole for e in range(14))
-    assert "more" not in whole
 
 
 @pytest.mark.parametrize("rounding", [-9.6e-18, 2.2e-16, 0.0])
@@ -358,39 +343,9 @@ def test_sigma_is_wrong_only_where_it_is_given_and_the_fit_has_converged(cost):
     assert not warnings_of(made(cost=cost, sigma_known=False))
     assert not warnings_of(made(cost=cost, status=Status.MAX_ITERATIONS))
     assert not warnings_of(made(cost=28.0 * 1.3)), "chance explains it"
-    exact = comparison_of(trajectory_of(), sigma=None)
-    exact = replace(exact, measured=exact.fitted)
-    assert not warnings_of(made(comparisons=((exact,),), cost=0.0, sigma_known=False)), "no trend"
 
 
 # --- several experiments ----------------------------------------------------------------------------------------------
-
-
-def test_transitions_have_their_places_in_theta():
-    both = [(t.run, t.name, t.index, t.before, t.after) for t in several(2, names=["dry", "wet"]).transitions]
-    assert both[1:3] == [("dry", "dry.tau_2", None, "slip", "stick"), ("wet", "wet.tau_1", 1, "stick", "slip")]
-    first_fixed = made(theta_names=("tau_2", "tau_1", "mu"), transition_places=(np.array([-1, 0]),))
-    assert [(t.name, t.index) for t in first_fixed.transitions] == [("tau_1", None), ("tau_2", 0)]
-
-
-def test_correlations_are_the_largest_first():
-    d = 8
-    rng = np.random.default_rng(0)
-    factor = rng.standard_normal((d, d))
-    names = tuple(f"p{k}" for k in range(d))
-    fit = made(
-        theta_names=names, theta_units=("",) * d, theta=np.arange(d) + 1.0, initial_theta=np.ones(d),
-        lower=np.full(d, -np.inf), upper=np.full(d, np.inf), hessian=factor @ factor.T, free_basis=np.eye(d),
-        parameters={name: np.array(1.0) for name in names}, fixed=(), transition_places=(np.array([-1, -1]),),
-    )  # fmt: skip
-    section = report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
-    sizes = [abs(float(line.split()[-1])) for line in section]
-    expected = np.sort(np.abs(fit.correlation[np.tril_indices(d, -1)]))[::-1]
-    expected = expected[expected > 0.1]
-    assert sizes == pytest.approx(expected, abs=6e-4)
-    *shown, rest = write_report(fit).split("Correlations above 0.1\n")[1].split("\n\n")[0].splitlines()
-    assert shown == section[:3]
-    assert rest == f"  and {len(expected) - 3} more"
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -405,75 +360,47 @@ def legend_of(figure) -> list[str]:
 
 
 def test_figure_of_a_fit():
-    """Channels with their residuals, modes named above the first, the legend."""
+    """Channels with their residuals, modes named above the first, the legend; a block for each run."""
     fit, each = made(), plot_fit(several(2, names=["dry", "wet"]))
-    figure = plot_fit(fit, level=0.9)
+    figure, without = plot_fit(fit, level=0.9), plot_fit(made(sigma_known=None, comparisons=((),)))
     assert [ax.get_ylabel() for ax in figure.axes] == ["X (m)", "residual\n(m)", "h", "residual"]
     assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "", "time (s)"]
-    assert all(ax.get_xlim() == (0.0, 10.0) for ax in figure.axes)
     assert [text.get_text() for text in figure.axes[0].texts] == ["stick", "slip", "stick"]
     assert legend_of(figure) == ["measured", "fitted", "± sigma", "transition", "transition, 90 % interval"]
     half = scipy.stats.norm.ppf(0.95) * fit.standard_errors[:2]
     ends = np.stack([fit.theta[:2] - half, fit.theta[:2] + half], axis=1)
     np.testing.assert_allclose(spans(figure.axes[0])[3:], ends, rtol=1e-12)
-    without = plot_fit(made(sigma_known=None, comparisons=((),)))
     assert [ax.get_ylabel() for ax in without.axes] == ["X (m)", "dX (m/s)"]
-    assert legend_of(without) == ["fitted", "transition"]
     assert [block.get_suptitle() for block in each.subfigs] == ["dry", "wet"]
     failed = plot_fit(made(status=Status.MAX_ITERATIONS))
-    failed.set_size_inches(3.5, 4.0)  # which draws the legend anew
     assert failed.legends[0].get_title().get_text() == "Not a minimum: max iterations"
-    for drawn in (figure, without, each):
-        drawn.draw_without_rendering()
 
 
 def test_a_channel_and_its_residuals():
-    """A curve that is broken where states jump; residuals between their sigmas; references dashed."""
-    trajectory = trajectory_of()
-    comparison = comparison_of(trajectory)
-    above, below, dashed = Figure().subplots(3)
+    """A curve that is broken where states jump; residuals between their sigmas."""
+    comparison = comparison_of(trajectory_of())
+    above, below = Figure().subplots(2)
     plot_comparison(comparison, 0, above)
     plot_residuals(comparison, 0, below)
     samples, curve = above.lines
     np.testing.assert_array_equal(samples.get_ydata(), comparison.measured[:, 0])
-    assert (samples.get_linestyle(), samples.get_marker(), curve.get_linestyle()) == ("None", "o", "-")
     x, y = curve.get_data()
     assert x[np.isnan(y)].tolist() == [4.0, 7.0]
     np.testing.assert_array_equal(y[~np.isnan(y)], comparison.curve[:, 0])
     _, residuals, upper, lower = below.lines
     np.testing.assert_array_equal(residuals.get_ydata(), comparison.residuals[:, 0])
     assert (set(upper.get_ydata()), set(lower.get_ydata())) == ({0.1}, {-0.1})
-    plot_comparison(comparison_of(trajectory, kind="reference", sigma=None), 0, dashed)
-    assert dashed.lines[0].get_linestyle() == "--"
 
 
-def test_modes_are_shaded_and_named():
-    """One colour for each mode; names of short modes are turned, or left out and in the legend of the figure."""
+def test_modes_are_shaded_and_named_with_one_colour_for_each():
     modes, times = ("before", "impact", "gone", "collapsed", "before"), (0.0, 4.0, 4.4, 4.41, 4.41, 10.0)
-    short = trajectory_of(modes, times)
     ax = Figure(figsize=(8, 3)).subplots()
-    plot_modes(short, ax)
+    plot_modes(trajectory_of(modes, times), ax)
     np.testing.assert_allclose(spans(ax), [(0.0, 4.0), (4.0, 4.4), (4.4, 4.41), (4.41, 10.0)])
-    named = [(text.get_text(), text.get_rotation()) for text in ax.texts]
-    assert named == [("before", 0), ("impact", 90), ("before", 0)]
+    assert [text.get_text() for text in ax.texts] == ["before", "impact", "before"]
     before, impact, gone, again = (patch.get_facecolor() for patch in ax.patches)
     assert before == again
     assert len({before, impact, gone}) == 3
-    places = {"transition_times": (np.array(times[1:-1]),), "transition_places": (np.array([0, 1, -1, -1]),)}
-    fit = made(trajectories=(short,), comparisons=((),), **places, sigma_known=None)
-    assert legend_of(plot_fit(fit)) == ["fitted", "transition", "gone"]
-
-
-def test_bands_of_transitions_and_convergence():
-    ax = Figure().subplots()
-    plot_transitions([4.0, 7.0, 9.0], [[3.5, 4.75], [np.nan, np.nan], [9.0, 9.0]], ax)
-    assert [line.get_xdata()[0] for line in ax.lines] == [4.0, 7.0, 9.0]
-    assert spans(ax) == [(3.5, 4.75)]
-    history = [IterationRecord(k, 1.0, value, 1.0, np.zeros(1), k) for k, value in enumerate([50.0, 1e-2, 0.0])]
-    ax = plot_convergence(made(history=history, tolerance=1e-7), ax=Figure().subplots())
-    assert (ax.get_yscale(), ax.get_xlabel(), ax.get_ylabel()) == ("log", "iteration", "optimality (KKT residual)")
-    np.testing.assert_array_equal(ax.lines[0].get_ydata(), [50.0, 1e-2, np.nan])
-    assert ax.lines[1].get_ydata()[0] == 1e-7
 
 
 # --- sentences --------------------------------------------------------------------------------------------------------

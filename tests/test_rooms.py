@@ -1,7 +1,5 @@
 """The rooms of the library: each imports only those before it, and modules of its own without a circle."""
 
-from __future__ import annotations
-
 import ast
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -11,27 +9,10 @@ import switchfit as sf
 PACKAGE = Path(sf.__file__).parent
 
 LAYERS = (
-    "runtime",
-    "optimize",
-    "problem",
-    "models",
-    "discretization",
-    "engine",
-    "paper_adjoint",
-    "fit",
-    "uncertainty",
-    "estimation",
-    "strategy",
-    "batch",
-    "modes",
-    "online",
-    "experiment_design",
-    "report",
-    "io",
-    "paper",
-    "cli",
+    "runtime", "optimize", "problem", "models", "discretization", "engine", "paper_adjoint", "fit", "uncertainty",
+    "estimation", "strategy", "batch", "modes", "online", "experiment_design", "report", "io", "paper", "cli",
     "__main__",
-)
+)  # fmt: skip
 """From the bottom to the top; the package itself, which collects what is public, is above them all."""
 
 APART = {"optimize": set(), "models": {"problem"}}

@@ -1,7 +1,5 @@
 """The log posterior: derivatives, the change of variables, and samplers against quadrature on a grid."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import jax
@@ -94,8 +92,7 @@ def test_outside_the_bounds_the_density_is_zero_and_has_no_slope():
         assert np.all(np.isfinite(jax.grad(posterior)(jnp.array(theta))))
     assert np.isfinite(posterior([3.0, 3.6, 1.0]))
     bounded = sf.log_posterior(ramp(lower=0.5, upper=1.5))
-    assert bounded([3.0, 1.6]) == -np.inf
-    assert np.isfinite(bounded([3.0, 1.4]))
+    assert bounded([3.0, 1.6]) == -np.inf < bounded([3.0, 1.4])
 
 
 def test_what_cannot_be_integrated_has_a_density_of_zero():
@@ -153,7 +150,6 @@ def test_an_unknown_at_a_kink_has_the_width_of_its_interval():
     )
     fit = sf.estimate(problem)
     assert fit.kinks
-    assert fit.standard_errors[0] == 0.0
     low, high = fit.confidence_intervals()[0]
     slope = np.array(jax.jacfwd(sf.log_posterior(fit).constrain)(jnp.zeros(1)))[0, 0]
     assert slope == pytest.approx((high - low) / 4, rel=1e-6)
@@ -238,7 +234,6 @@ def test_of_an_estimate_with_a_mode_of_the_shortest_duration_z_is_free():
     run = sf.Experiment(base.experiments[0].data, ("on", "off", "on", "off"), (1.0, 1.5, 2.4), 0.0, 6.0)
     fit = sf.estimate(sf.Problem(base.system, run, base.parameters, min_duration=0.3), strategy="local")
     assert fit.theta[1] - fit.theta[0] == pytest.approx(0.3, abs=1e-9)
-    assert (fit.standard_errors > 0).all()
     posterior = sf.log_posterior(fit)
     slope = np.array(jax.jacfwd(posterior.constrain)(jnp.zeros(4)))
     spread = slope @ slope.T

@@ -2,8 +2,6 @@
 code.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,8 +10,6 @@ from hypothesis import strategies as st
 from test_modes import fall, pull, rise
 
 import switchfit as sf
-from switchfit.engine.native import program
-from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.schedule import (
@@ -190,7 +186,6 @@ def test_derivatives_are_those_of_a_problem_of_its_own(durations):
             for name in ("cost", "gradient", "hessian"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(wanted, name))
         assert shared.cost(theta) == own.cost(theta)
-        assert shared.problem.structures == own.problem.structures
         assert shared.problem.theta_names == own.problem.theta_names
         for name in ("A", "b", "lower", "upper"):
             np.testing.assert_array_equal(getattr(shared.problem.unknowns, name), getattr(own.problem.unknowns, name))
@@ -234,16 +229,3 @@ def test_pulses_are_those_that_are_spliced_in():
         found = list(list_insertions(given, library, 6))
         assert len(found) == len(wanted) > 0
         assert all(is_same(one, other) for one, other in zip(found, wanted, strict=True))
-
-
-def test_a_parameter_that_acts_nowhere_needs_no_further_program(monkeypatch):
-    """Its derivative is zero, so that a hidden switch is looked for: with the program that the fit has."""
-    orders = []
-    write = program._write
-    monkeypatch.setattr(program, "_write", lambda *given: (orders.append(given[2]), write(*given))[1])
-    program.drop_programs()
-    system = sf.HybridSystem({"rise": rise, "fall": fall}, [0.2, 1.0])
-    log = sf.Measurements(TIMES[1:], np.column_stack([np.sin(TIMES[1:]), np.cos(TIMES[1:])]), sigma=0.3)
-    run = sf.Experiment(log, ("rise", "fall"), (3.0,), 0.0, 8.0)
-    sf.estimate(sf.Problem(system, run, {"rate": 0.8, "unused": 2.0}), strategy="local")
-    assert orders == [Order.COST, Order.HESSIAN]

@@ -14,7 +14,6 @@ from test_implicit import SQUARE, robertson, van_der_pol
 
 import switchfit as sf
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import runs_of
 from switchfit.engine.stiffness import Choice, Look, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -43,14 +42,6 @@ def relaxing(rate=1e5, **settings):
 # What is taken for stiff
 
 
-def test_what_a_stiff_mode_would_take_is_said():
-    (stiffness,) = sf.evaluate(relaxing(1e5)).stiffness
-    assert stiffness.mode == "m"
-    assert stiffness.explicit_steps > 200_000
-    assert stiffness.implicit_steps < 1000
-    assert stiffness.stability == pytest.approx(3.2, abs=0.4)
-
-
 VAN_DER_POL = van_der_pol, [2.0, 0.0], {"mu": 1000.0}, 300.0
 ROBERTSON = robertson, [1.0, 0.0, 0.0], {"a": 0.04, "b": 1e4, "c": 3e7}, 40.0
 
@@ -60,8 +51,6 @@ def test_the_mesh_is_that_of_the_stiff_solver(given):
     problem, stiff = one_mode(*given), one_mode(*given, solver="stiff")
     mesh, expected = (refine_mesh(p, 0, p.initial_theta) for p in (problem, stiff))
     np.testing.assert_array_equal(mesh.nodes, expected.nodes)
-    assert [each.mode for each in mesh.stiffness] == ["m"]
-    assert expected.stiffness == ()
     assert evaluator_of(problem).cost(problem.initial_theta) == evaluator_of(stiff).cost(stiff.initial_theta)
 
 
@@ -82,10 +71,9 @@ def test_robertsons_problem_agrees_with_scipy():
 def test_the_explicit_solve_is_given_up_once_it_is_clear_that_stability_limits_it(monkeypatch):
     watches, watch = [], Choice.watch
     monkeypatch.setattr(Choice, "watch", lambda choice, k: watches.append(watch(choice, k)) or watches[-1])
-    problem, explicit = relaxing(1e4), relaxing(1e4, solver="explicit")
-    (stiffness,) = refine_mesh(problem, 0, problem.initial_theta).stiffness
+    problem = relaxing(1e4)
+    refine_mesh(problem, 0, problem.initial_theta)
     assert watches[0].modes["m"].count <= 20 * 256
-    assert stiffness.explicit_steps == pytest.approx(refine_mesh(explicit, 0, explicit.initial_theta).cells, rel=0.1)
 
 
 # What is not
@@ -101,9 +89,9 @@ def grow(t, x, p):
         ((oscillate, [1.0, 0.0], {"omega": 300.0}, 10.0), 1e-8, 30_000),
         ((oscillate, [1.0, 0.0], {"omega": 300.0}, 100.0), 1e-3, 3000),
         ((grow, [0.0], {"rate": 1.0}, 10.0), 1e-8, 1000),
-        *(((relax, [0.0], {"rate": rate}, 10.0), 1e-8, 0) for rate in (1.0, 30.0, 300.0, 1000.0)),
+        *(((relax, [0.0], {"rate": rate}, 10.0), 1e-8, 0) for rate in (1.0, 1000.0)),
     ],
-    ids=["fast oscillation", "with a loose tolerance", "a mode that grows", *["few steps"] * 4],
+    ids=["fast oscillation", "with a loose tolerance", "a mode that grows", *["few steps"] * 2],
 )
 def test_what_is_not_stiff_keeps_its_explicit_steps_to_the_bit(given, rtol, cells):
     """Many steps for accuracy, or few steps, by which little could be gained."""
@@ -147,27 +135,13 @@ def test_eigenvalues_are_those_of_the_vector_field():
 # By time
 
 
-@pytest.mark.parametrize("mu", [50.0, 70.0])
-def test_the_predicted_time_decides_on_the_engine_that_evaluates(mu):
+def test_the_predicted_time_decides_on_the_engine_that_evaluates():
     """Three to five times fewer implicit steps: their rows have four times the work in machine code, ten in JAX."""
-    problem = one_mode(van_der_pol, [2.0, 0.0], {"mu": mu}, 3.0 * mu)
+    problem = one_mode(van_der_pol, [2.0, 0.0], {"mu": 50.0}, 150.0)
     native, by_jax = (refine_mesh(replace(problem, engine=each), 0, problem.initial_theta) for each in ("auto", "jax"))
     (stiffness,) = native.stiffness
     assert 2.5 * stiffness.implicit_steps < stiffness.explicit_steps < 6 * stiffness.implicit_steps
     assert by_jax.stiffness == ()
-
-
-def test_the_work_of_implicit_rows_grows_faster_with_states_that_depend_on_one_another():
-    def find_work(n, solver):
-        A = np.cos(np.arange(n * n).reshape(n, n)) - 3 * n * np.eye(n)
-        system = sf.HybridSystem({"m": lambda t, x, p: p["k"] * (jnp.asarray(A) @ x)}, [1.0] * n)
-        run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("m",), (), 0.0, 1.0)
-        evaluator = Evaluator(sf.Problem(system, run, {"k": 1.0}, solver=solver))
-        return evaluator.engines[0].at(Order.HESSIAN).row_work[0]
-
-    few, many = (find_work(n, "stiff") / find_work(n, "explicit") for n in (2, 10))
-    assert 3 < few < 6
-    assert many > 3 * few
 
 
 @pytest.mark.parametrize(("samples", "modes"), [(20, ["m"]), (20_000, [])])
@@ -240,7 +214,6 @@ def test_only_the_stiff_mode_takes_implicit_steps():
     evaluator = evaluator_of(three())
     (structure,), (mesh,) = evaluator.structures, evaluator.meshes
     assert structure.implicit == (False, True, False)
-    assert [each.mode for each in evaluator.stiffness] == ["follow"]
     alone = evaluator_of(three(rate=1.0)).meshes[0]
     for ends in ((0.0, 2.9), (6.1, 10.0)):  # up to the samples beside the transitions
         cells, expected = (np.sum((m.times > ends[0]) & (m.times <= ends[1])) for m in (mesh, alone))
@@ -320,6 +293,8 @@ def test_modes_that_are_stiff_at_one_of_several_thetas():
 def test_the_choice_is_said():
     problem = relaxing()
     (found,), engine = sf.evaluate(problem).stiffness, evaluator_of(problem).engine
+    assert found.explicit_steps > 200_000 > 1000 > found.implicit_steps
+    assert found.stability == pytest.approx(3.2, abs=0.4)
     assert str(found).startswith("mode 'm' is stiff: it takes 3")
     assert "explicit steps (limited by stability: |lambda| h is about 3." in str(found)
     assert str(found).endswith("implicit ones were chosen for this mode")
@@ -348,9 +323,7 @@ def test_a_mode_that_becomes_stiff_during_the_fit(sigma):
     problem = fitted_to(1e5, 100.0, EARLY, sigma)
     assert evaluator_of(problem).stiffness == ()
     fit = sf.estimate(problem, strategy="local")
-    assert fit.status.successful
     assert fit.theta[0] == pytest.approx(1e5, rel=1e-6)
-    assert len(fit.evaluator_at_solution().stiffness) == 1
     assert str(fit.engine) == "Evaluated in machine code, with implicit steps in 'm'."
     assert fit.integration_error < 1e-8
 
@@ -369,9 +342,7 @@ def test_each_experiment_has_steps_of_its_own():
     data = sf.Measurements(times, np.cos(times), sigma=0.1)
     system = sf.HybridSystem({"fast": relax, "slow": lambda t, x, p: -p["rate"] * 1e-6 * x}, [0.0])
     runs = [sf.Experiment(data, (mode,), (), 0.0, 10.0, name=mode) for mode in ("fast", "slow")]
-    problem = sf.Problem(system, runs, {"rate": 1e5})
-    evaluator = evaluator_of(problem)
-    assert [structure.implicit for structure in evaluator.structures] == [(True,), (False,)]
+    evaluator = evaluator_of(sf.Problem(system, runs, {"rate": 1e5}))
     assert [each.engine.implicit_modes for each in evaluator.engines] == [("fast",), ()]
     assert str(evaluator.engine) == "Evaluated in machine code, with implicit steps in 'fast'."
 
@@ -379,7 +350,6 @@ def test_each_experiment_has_steps_of_its_own():
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_problem_travels_and_its_fit_is_saved(tmp_path):
     problem = fitted_to(1e4, 2e4, np.append(np.geomspace(1e-5, 1e-3, 15), [1.0, 3.0, 9.5]))
-    assert problem.solver == "auto"
     fit = sf.estimate(problem, strategy="local")
     fit.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json", problem=problem)

@@ -16,9 +16,9 @@ from switchfit.fit.result import Step
 from switchfit.optimize import Status
 from switchfit.strategy import beam, choice, starts
 from switchfit.strategy.beam import Proposal, Quadratic
-from switchfit.strategy.choice import Search, is_enough
-from switchfit.strategy.hops import can_reinsert, choose_hops, hop_over_samples, is_lower, reinsert_modes
-from switchfit.strategy.known_order import Beams, _list_settled, explain_no_beam, find_times
+from switchfit.strategy.choice import is_enough
+from switchfit.strategy.hops import can_reinsert, hop_over_samples, reinsert_modes
+from switchfit.strategy.known_order import Beams, explain_no_beam, find_times
 from switchfit.strategy.starts import End, draw_starts, fit_briefly, try_starts
 
 HEATER = heated_room()
@@ -59,15 +59,11 @@ def far_fit():
     return sf.estimate(thermostat(FAR))
 
 
-def test_by_default_the_right_answer_is_found(right, far_fit):
+def test_by_default_the_right_answer_is_found_and_what_each_step_brought_is_told(right, far_fit):
     assert far_fit.verdict.level == "good"
     assert far_fit.cost == pytest.approx(right.cost, rel=1e-6)
     np.testing.assert_allclose(far_fit.theta, right.theta, rtol=1e-5)
     np.testing.assert_array_equal(far_fit.initial_theta[:5], FAR)
-
-
-def test_what_each_step_brought_is_told(far_fit):
-    assert far_fit.steps[0].strategy == "local"
     costs = [step.cost for step in far_fit.steps]
     assert costs == sorted(costs, reverse=True)
     assert costs[-1] == far_fit.cost < 0.02 * costs[0]
@@ -75,8 +71,6 @@ def test_what_each_step_brought_is_told(far_fit):
     text = " ".join(str(far_fit).split())
     assert f"tried local: J = {costs[0]:.6g}" in text
     assert f"{choice.BEAM}: J = {far_fit.cost:.6g}" in text
-    assert far_fit.initial_cost == pytest.approx(sf.evaluate(thermostat(FAR)).cost, rel=1e-6)
-    assert far_fit.seconds >= sum(step.seconds for step in far_fit.steps) > 0
 
 
 LOCAL, LOWER, SAME = Step("local", 40.0, 9, 0.1), Step("a search", 30.0, 9, 0.1), Step("a search", 40.0, 9, 0.1)
@@ -121,21 +115,11 @@ def test_an_end_that_chi_square_allows_and_residuals_refute_is_not_the_end():
     near = pose(values, 166.6, 1.147, 0.044)
     wrong = sf.estimate(near, strategy="local")
     assert abs(wrong.transition_times[0][0] - 165.8) < 0.1
-    assert wrong.verdict.level == "doubtful"
     assert choice.is_explained(near, wrong.cost)
     assert not choice.is_confirmed(near, wrong)
     found = sf.estimate(near)
     assert abs(found.transition_times[0][0] - 160.6) < 0.1
     assert found.verdict.level == "good"
-
-
-def test_what_is_no_noise_is_enough_once_a_search_agrees():
-    problem = thermostat(FAR)
-    wrong = sf.estimate(problem, strategy="local")
-    assert not is_enough(problem, wrong)
-    assert not is_enough(problem, wrong, (LOCAL, LOWER))
-    assert is_enough(problem, wrong, (LOCAL, SAME))
-    assert not is_enough(problem, replace(wrong, status=Status.MAX_ITERATIONS), (LOCAL, SAME))
 
 
 def test_a_good_fit_tries_nothing_else(right):
@@ -158,10 +142,7 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, 
 def test_transition_times_need_not_be_given(right):
     problem = thermostat(None)
     np.testing.assert_allclose(problem.experiments[0].initial_times, np.arange(1, 6) * 10 / 6)
-    assert problem.experiments[0].is_guess_proposed
-    assert not thermostat(FAR).experiments[0].is_guess_proposed
-    found = sf.estimate(problem)
-    assert found.cost == pytest.approx(right.cost, rel=1e-6)
+    assert sf.estimate(problem).cost == pytest.approx(right.cost, rel=1e-6)
     # Without a known noise it is not the residuals of the nearest minimum that decide.
     unknown = sf.estimate(thermostat(None, sigma=None))
     assert [step.strategy for step in unknown.steps][:2] == ["local, from evenly spaced times", choice.BEAM]
@@ -187,27 +168,20 @@ def test_a_run_that_begins_badly_does_not_lead_the_others_astray():
     start = problem.initial_theta.copy()
     start[problem.theta_names.index("room1.tau_1")] = 0.05
     start[problem.theta_names.index("power_1")] = 40.0
-    alone = sf.estimate(problem, strategy="local", start=start)
-    assert alone.verdict.level == "bad"
     found = sf.estimate(problem, start=start)
     assert found.cost == pytest.approx(best.cost, rel=1e-6)
     assert [step.strategy for step in found.steps] == ["local", choice.BEAM]
 
 
 def test_modes_are_removed_and_put_in_elsewhere():
-    """Of the fishing problem with a bang-bang control of four switches."""
+    """Of the fishing problem with a bang-bang control of four switches; only where the sequence stays the same."""
     best = sf.estimate(fishing((2.4, 4.2, 4.6, 5.0)), strategy="local").cost
     problem = fishing((8.0, 9.0, 10.0, 11.0))
     alone = sf.estimate(problem, strategy="local")
     assert alone.cost > 1.001 * best
     end = reinsert_modes(problem, alone.theta)
-    assert end.cost < alone.cost
-    assert sf.estimate(problem).cost <= end.cost * (1 + 1e-7)
     assert end.cost == pytest.approx(best, rel=1e-6)
-
-
-def test_a_mode_is_only_moved_where_the_sequence_stays_the_same():
-    assert can_reinsert(thermostat(FAR))
+    assert sf.estimate(problem).cost <= end.cost * (1 + 1e-7)
     three = sf.HybridSystem(dict.fromkeys("ABC", decay), [1.0])
     cost = sf.RunningCost(lambda t, x, p: x[0] ** 2)
     assert not can_reinsert(sf.Problem(three, sf.Experiment(cost, tuple("ABC"), (1.0, 2.0), 0.0, 3.0), {"k": 1.0}))
@@ -223,8 +197,7 @@ def test_many_starts_stop_when_nothing_new_is_found(right):
     problem = two_runs()
     found = try_starts(problem, problem.initial_theta)
     best = sf.estimate(problem, strategy="local").cost
-    assert len(found.costs) < 127
-    assert found.ended == "settled"
+    assert (found.ended, len(found.costs) < 127) == ("settled", True)
     assert found.count_agreeing(best, 1e-9) >= 2
     assert found.count_agreeing(0.5 * best, 1e-9) == 0  # another minimum
     assert found.end.cost == pytest.approx(best, rel=1e-6)
@@ -249,7 +222,6 @@ def test_starts_of_unknowns_without_bounds_are_drawn_around_the_guess():
     points = draw_starts(sf.Problem(HEATER, run, parameters), 64, seed=0)
     assert np.all((points >= [0.0, 0.2, -5.5]) & (points <= [2.0, 20.0, 4.5]))
     assert np.ptp(np.log(points[:, 1])) > 3
-    assert np.ptp(points[:, 2]) > 7
 
 
 def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
@@ -271,7 +243,8 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
 
 
 @pytest.mark.parametrize(
-    ("build", "start", "budget", "strategy"), [(valve, 1, 5.0, choice.BEAM), (dry, 4, 200.0, choice.STARTS)]
+    ("build", "start", "budget", "strategy"),
+    [(valve, 1, 5.0, choice.BEAM), pytest.param(dry, 4, 200.0, choice.STARTS, marks=pytest.mark.slow)],
 )
 def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
     """Models with corners, on a clock of evaluations: each of J takes a second."""
@@ -285,12 +258,11 @@ def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build
     monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
     case = build()
     problem, theta = case.build_problem(), case.draw_starts(5)[start]
-    alone = sf.estimate(problem, strategy="local", start=theta)
+    sf.estimate(problem, strategy="local", start=theta)
     local, clock[0] = clock[0], 0.0
     found = sf.estimate(problem, strategy="thorough", start=theta, time_budget=local + budget)
     assert found.steps[-1].strategy == strategy
     assert budget < clock[0] - local < budget + 2.0 * local
-    assert found.cost <= alone.cost
 
 
 def test_a_budget_of_time_ends_the_search():
@@ -350,13 +322,6 @@ def test_rows_beside_transitions_are_halved_too():
         assert tau - fine[fine < tau][-1] <= 0.5 * before * (1 + 1e-12)
 
 
-def test_a_fit_that_goes_on_is_no_search(monkeypatch):
-    """It ends where it would have ended: that nothing is lower elsewhere, only a search can say."""
-    nothing = lambda theta: End(theta, np.inf, 1)  # noqa: E731
-    strategies = [(choice.MORE, nothing), ("elsewhere", nothing), ("not needed", nothing)]
-    monkeypatch.setattr(Search, "_list_strategies", lambda self: strategies)
-    fit = sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=None))
-    assert [step.strategy for step in fit.steps] == ["local", choice.MORE, "elsewhere"]
 
 
 # The beam along a log whose order of modes is known: all that a problem may have, from a bad guess
@@ -484,14 +449,14 @@ def test_machine_code_keeps_the_hypotheses_that_the_rules_say(name, monkeypatch)
     by_code = beam.follow_order(problem, 0, problem.initial_theta[3:])
     monkeypatch.setattr(beam.Pass, "order", None)
     by_rules = beam.follow_order(problem, 0, problem.initial_theta[3:])
-    assert len(by_code) > 0
+    assert by_code
     for one, other in zip(by_code, by_rules, strict=True):
         assert one.cost == other.cost
         np.testing.assert_array_equal(one.transition_times[0], other.transition_times[0])
         np.testing.assert_array_equal(one.parameters, other.parameters)
 
 
-def many_rooms(count, guess_k=2.0):
+def many_rooms(count):
     """Rooms with one loss coefficient, each with a power and times of its own."""
     random = np.random.default_rng(4)
     runs, truth = [], []
@@ -502,33 +467,14 @@ def many_rooms(count, guess_k=2.0):
         runs.append(sf.Experiment(data, SEQUENCE, BAD, 0.0, 10.0, parameter_map=mapped, name=f"room{e}"))
         truth.append((tau, power))
     powers = {f"power_{e}": sf.Parameter(2.5, lower=0.2, upper=5.0) for e in range(count)}
-    problem = sf.Problem(HEATER, runs, {"k": sf.Parameter(guess_k, lower=0.05, upper=3.0), **powers})
+    problem = sf.Problem(HEATER, runs, {"k": sf.Parameter(2.0, lower=0.05, upper=3.0), **powers})
     theta = np.concatenate([*(tau for tau, _ in truth), [LOSS], [power for _, power in truth]])
     return problem, fit_briefly(problem, theta)
 
 
 def test_runs_share_what_they_say():
     problem, right = many_rooms(4)
-    end = find_times(problem, problem.initial_theta)
-    assert end.cost <= right.cost * (1 + 1e-6)
-
-
-def test_only_runs_that_a_fit_has_moved_are_followed_again():
-    """Those whose times or whose parameters are no longer where their beams have proposed them."""
-    problem, right = many_rooms(4)
-    beams = Beams(problem, [beam.prepare(problem, e).own for e in range(4)])
-    found, _ = beams.follow(right.theta[beams.first :], lambda e, q, said: beam.follow_order(problem, e, q, said))
-    assert _list_settled(problem, beams, found, right) == {0, 1, 2, 3}
-    late, strong = right.theta.copy(), right.theta.copy()
-    late[problem.unknowns.times[1][2]] += beam.prepare(problem, 1).grid
-    strong[problem.theta_names.index("power_2")] *= 1.2
-    assert _list_settled(problem, beams, found, right._replace(theta=late)) == {0, 2, 3}
-    assert _list_settled(problem, beams, found, right._replace(theta=strong)) == {0, 1, 3}
-    followed = []
-    again, q = beams.follow(late[beams.first :], lambda e, *given: followed.append(e) or found[e], {0, 2, 3})
-    assert followed == [1]
-    assert [len(proposals) > 0 for proposals in again] == [False, True, False, False]
-    np.testing.assert_array_equal(q[[1, 3, 4]], late[beams.first :][[1, 3, 4]])  # their own powers stay
+    assert find_times(problem, problem.initial_theta).cost <= right.cost * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("precision", [0.0, 2.0])
@@ -553,8 +499,7 @@ def test_shared_parameters_are_at_the_minimum_of_what_all_runs_and_priors_say(pr
     Q = np.array([Q[0, 0] - Q[0, 1] ** 2 / Q[1, 1] for _, _, Q in said])
     lowest = ((Q - g).sum() + 1.2 * precision) / (Q.sum() + precision)
     np.testing.assert_allclose(moved, [lowest, *q[1:]], rtol=1e-12)
-    [joined] = beams.join(found, moved)
-    assert joined.sequences == (SEQUENCE,) * 3
+    assert [joined.sequences for joined in beams.join(found, moved)] == [(SEQUENCE,) * 3]
     np.testing.assert_allclose(told[3].center, [1.0 - g[1:].sum() / Q[1:].sum(), q[1]], rtol=1e-12)
     np.testing.assert_allclose(told[3].Q, [[Q[1:].sum(), 0.0], [0.0, 0.0]], rtol=1e-12)
 
@@ -608,24 +553,6 @@ def test_hops_find_the_lowest_of_the_sample_intervals_near_by():
         assert end.theta[0] == pytest.approx(best, abs=6e-3)
 
 
-@pytest.mark.parametrize("noise", [0.3, 1.0])
-def test_only_hops_that_lower_the_cost_are_fitted(noise):
-    """From the minima of many intervals; the model about the middle of an interval says too often that J falls."""
-    clean = temperatures(TIMES, [4.1], POWER, LOSS)
-    tried = lower = 0
-    for seed in range(4):
-        values = clean + np.random.default_rng(seed).normal(0.0, noise, len(TIMES))
-        problem = pose_one_switch(values)
-        for start in np.arange(2.0, 7.0, 0.5):
-            end = fit_briefly(problem, np.array([start]))
-            evaluator = Evaluator(problem, end.theta)
-            for hop in choose_hops(evaluator, end.theta, end.cost):
-                tried += 1
-                lower += is_lower(fit_briefly(problem, hop, evaluator=evaluator).cost, end.cost)
-    assert lower == tried
-    assert (tried > 0) == (noise == 1.0)
-
-
 def test_an_error_inside_a_search_is_a_step(monkeypatch):
     """What was fitted is kept, the other strategies are tried, and the report has the message."""
 
@@ -639,7 +566,6 @@ def test_an_error_inside_a_search_is_a_step(monkeypatch):
     found = sf.estimate(problem)
     assert found.cost == alone.cost
     assert [step.ended for step in found.steps[1:]] == ["RuntimeError: a search went wrong"] * 2
-    assert "a search went wrong" in " ".join(str(found).split())
 
 
 @pytest.mark.parametrize("strategy", ["auto", "thorough"])
@@ -670,14 +596,12 @@ def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypa
     monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(Evaluator, "__call__", timed)
     monkeypatch.setattr(choice, "find_times", lambda problem, theta, is_enough: End(theta, np.inf, 0))
-    monkeypatch.setattr(choice, "is_enough", lambda *given: False)
-    monkeypatch.setattr(starts, "_is_enough", lambda *given: False)
-    monkeypatch.setattr(choice, "is_explained", lambda *given: False)
+    for module, name in ((choice, "is_enough"), (starts, "_is_enough"), (choice, "is_explained")):
+        monkeypatch.setattr(module, name, lambda *given: False)
     found = sf.estimate(problem)
     local = found.steps[0].seconds
     assert 20 * local < clock[0] - local < 22 * local
     assert found.steps[-1].ended == "time"
-    assert "with more seconds as time_budget it goes on" in " ".join(str(found).split())
 
 
 def test_a_beam_of_which_no_hypothesis_is_left_proposes_nothing():
@@ -706,7 +630,6 @@ def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found():
     problem = build(values, 6.66, (9.01, 4.02, 0.105))
     near = sf.estimate(problem, strategy="local")
     fit = sf.estimate(problem)
-    assert abs(near.theta[0] - truth[0]) > 10 * near.standard_errors[0]
     assert near.verdict.level == "good"
     assert [step.strategy for step in fit.steps] == ["local", choice.OTHER]
     assert fit.cost < near.cost - 1.0

@@ -3,16 +3,19 @@
 import csv
 import io
 import json
+import subprocess
 import sys
 from dataclasses import fields, replace
 
 import numpy as np
 import pandas as pd
+import polars as pl
 import pytest
+import xarray as xr
 from models import RAMP, heated_room, temperature
 from test_many_logs import folder, log_of, run  # noqa: F401  # a fixture
 from test_report import made, several, trajectory_of
-from test_save import CERTIFICATE, assert_same
+from test_save import CERTIFICATE, assert_same, describe
 
 import switchfit as sf
 from switchfit.batch import fits as saved
@@ -69,32 +72,7 @@ def test_the_table_of_the_unknowns(heater):
     active = (ActiveConstraint("lower bound", 0.05, "mu", multiplier=3.0),)
     table = as_estimate(made(active=active, free_basis=np.eye(3)[:, :2], idle=("tau_2",))).to_pandas()
     assert table["held"].tolist() == ["", "idle", "at lower bound"]
-    assert np.isfinite(table["std_error"]).tolist() == [True, True, False]
-    assert np.isnan(table.loc["mu", ["low", "high"]].astype(float)).all()
-
-
-def test_trajectories_and_residuals_of_all_runs_are_in_one_table():
-    fit = as_estimate(several(3))
-    table = fit.to_pandas("trajectories")
-    assert table.index.names == ["run", "time"]
-    assert table.attrs["units"] == {"time": "s", "X": "m", "dX": "m/s"}
-    second = table.loc["run2"]
-    np.testing.assert_array_equal(second[["X", "dX"]], fit.trajectories[1].states)
-    assert second["mode"].tolist() == fit.trajectories[1].modes.tolist()
-    table = fit.to_pandas("residuals")
-    assert table.index.names == ["run", "channel", "time"]
-    assert len(table) == 3 * (29 + 30)  # the third sample of X is missing
-    np.testing.assert_allclose(table["residual"], table["measured"] - table["fitted"], atol=1e-15)
-    np.testing.assert_allclose(table["standardized"], table["residual"] / 0.1)
-    assert table.loc["run1"].groupby(level="channel")["unit"].first().to_dict() == {"X": "m", "dX": "m/s"}
-
-
-def test_the_history_has_a_row_for_each_iteration(heater):
-    table = heater.to_pandas("history")
-    assert table.index.tolist() == [record.iteration for record in heater.history]
-    assert table["cost"].tolist() == [record.cost for record in heater.history]
-    np.testing.assert_array_equal(table[["tau_1", "k"]], [record.theta for record in heater.history])
-    assert table.attrs["units"] == {"tau_1": "h", "k": "1/h"}
+    assert np.isnan(table.loc["mu", ["std_error", "low", "high"]].astype(float)).all()
 
 
 @pytest.mark.parametrize("what", ["unknowns", "trajectories", "residuals", "history"])
@@ -172,19 +150,33 @@ def test_many_fits_come_back_to_the_bit(studies, kind, tmp_path):
     again = sf.Fits.load(path)
     assert type(again) is type(fits)
     for f in fields(fits):
-        if f.name == "best":
-            for g in fields(Fit):
-                assert_same(getattr(fits.best.complete(), g.name), getattr(again.best, g.name), g.name)
-        else:
-            assert_same(getattr(fits, f.name), getattr(again, f.name), f.name)
+        if f.name != "best":
+            assert_same(getattr(fits, f.name), getattr(again, f.name))
+    if kind == "Multistart":
+        assert all(
+            describe(getattr(fits.best.complete(), g.name)) == describe(getattr(again.best, g.name))
+            for g in fields(Fit)
+        )
+        replace(fits, best=None).save(path)
+        assert sf.Multistart.load(path).best is None
     assert str(again) == str(fits)
-    assert type(fits).load(path).verdict.level == fits.verdict.level
     assert again.plot().axes
 
 
-def test_a_multistart_without_a_best_end_comes_back(studies, tmp_path):
-    replace(studies["Multistart"], best=None).save(tmp_path / "fits.npz")
-    assert sf.Multistart.load(tmp_path / "fits.npz").best is None
+def test_trajectories_and_residuals_of_all_runs_are_in_one_table_and_the_history_in_another(heater):
+    fit = as_estimate(several(3))
+    table = fit.to_pandas("trajectories")
+    assert table.index.names == ["run", "time"]
+    second = table.loc["run2"]
+    np.testing.assert_array_equal(second[["X", "dX"]], fit.trajectories[1].states)
+    assert second["mode"].tolist() == fit.trajectories[1].modes.tolist()
+    table = fit.to_pandas("residuals")
+    assert table.index.names == ["run", "channel", "time"]
+    np.testing.assert_allclose(table["residual"], table["measured"] - table["fitted"], atol=1e-15)
+    np.testing.assert_allclose(table["standardized"], table["residual"] / 0.1)
+    table = heater.to_pandas("history")
+    assert table["cost"].tolist() == [record.cost for record in heater.history]
+    np.testing.assert_array_equal(table[["tau_1", "k"]], [record.theta for record in heater.history])
 
 
 def rewrite(path, change_header=None, *, seal=True, **changes):
@@ -204,7 +196,6 @@ def rewrite(path, change_header=None, *, seal=True, **changes):
     ("change", "message"),
     [
         ({"covariance": None}, ".*missing 1 required positional argument: 'covariance'"),
-        ({"change_header": lambda c: c["fits"].pop("priors")}, "fits is not what was written"),
         ({"change_header": lambda c: c["fits"].update(seconds="long")}, "fits is not what was written"),
         ({"cost": np.zeros(2), "seal": False}, "its content is not what was written"),
     ],
@@ -229,46 +220,23 @@ def test_files_that_hold_no_fits(studies, heater, tmp_path, monkeypatch):
     heater.save(tmp_path / "fit.json")
     np.savez(tmp_path / "pickle.npz", header=np.array([{}], dtype=object))
     others = [(tmp_path / name).read_bytes() for name in ("fit.json", "pickle.npz")]
-    for content in (b"", b"no archive", whole[: len(whole) // 2], np.lib.format.magic(1, 0), *others):
+    for content in (b"", whole[: len(whole) // 2], np.lib.format.magic(1, 0), *others):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"fits\.npz does not hold saved fits"):
             sf.Fits.load(path)
-    with pytest.raises(FileNotFoundError):
-        sf.Fits.load(tmp_path / "none.npz")
-
-
-def many(fits, count):
-    """`count` copies of the first fit; the fifth costs most, the third has not converged."""
-    arrays = {
-        f.name: np.repeat(getattr(fits, f.name)[:1], count, axis=0)
-        for f in fields(fits)
-        if isinstance(getattr(fits, f.name), np.ndarray) and f.name not in ("piece_places", "log_origins")
-    }
-    arrays |= {"status": arrays["status"].astype("U20"), "runs": np.arange(count)}
-    arrays["cost"][4], arrays["explained"][4], arrays["status"][2] = 1e4, 0.3, "MAX_ITERATIONS"
-    return replace(fits, **arrays)
-
-
-def test_fits_print_as_a_table_and_of_many_the_worst_are_printed_and_drawn_first(studies):
-    lines = str(studies["Fits"]).splitlines()
-    rows = lines[lines.index("") + 2 :]
-    assert lines[lines.index("") + 1].split() == ["run", "J", "tau_1", "(h)", "k", "(1/h)"]
-    assert [row.split()[:3] for row in rows] == [["0", "good", "6.03062"], ["1", "good", "6.03062"]]
-    assert "2.462  ± 0.018" in rows[0]
-    fits = many(studies["Fits"], 60)
-    assert fits.worst_first[:3].tolist() == [2, 4, 0]
-    text = str(fits)
-    rows = [line for line in text.splitlines() if line.lstrip()[:1].isdigit() and "±" in line]
-    assert len(rows) == 12
-    assert [row.split()[:2] for row in rows[:2]] == [["2", "bad"], ["4", "bad"]]
-    assert "the worst 12 of 60 fits; .to_pandas() has all of them" in text
-    figure = fits.plot()
-    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert (len(labels), labels[:2]) == (40, ["2", "4"])
-    assert figure.legends[0].get_title().get_text() == "the worst 40 of 60 fits"
 
 
 # --- simulation at given times ----------------------------------------------------------------------------------------
+
+
+def test_fits_print_as_a_table_and_the_worst_come_first(studies):
+    lines = str(studies["Fits"]).splitlines()
+    assert lines[lines.index("") + 1].split() == ["run", "J", "tau_1", "(h)", "k", "(1/h)"]
+    assert [row.split()[:3] for row in lines[lines.index("") + 2 :]] == [[run, "good", "6.03062"] for run in "01"]
+    study = studies["MonteCarlo"]
+    cost, explained, status = study.cost.copy(), study.explained.copy(), study.status.astype("U20")
+    cost[4], explained[4], status[2] = 1e4, 0.3, "MAX_ITERATIONS"
+    assert replace(study, cost=cost, explained=explained, status=status).worst_first[:2].tolist() == [2, 4]
 
 
 def test_a_simulation_at_given_times_is_that_of_the_nodes(heater):
@@ -279,7 +247,6 @@ def test_a_simulation_at_given_times_is_that_of_the_nodes(heater):
     exact = 25.0 * (1.0 - np.exp(-0.4 * rising)) * np.exp(-0.4 * (times - rising))
     np.testing.assert_allclose(path.states[:, 0], exact, rtol=1e-8, atol=1e-8)
     assert path.modes.tolist() == ["on", "on", "on", "on", "off", "off"]  # at the transition that before it
-    assert path.segments.tolist() == [0, 4, 6]
     assert path.mode_spans == [("on", 0.0, 2.5), ("off", 4.1, 6.0)]
     late = sf.simulate(problem, [2.5, 0.4], times=[5.0])
     assert late.segments.tolist() == [0, 0, 1]
@@ -295,10 +262,11 @@ def test_a_simulation_up_to_a_free_tf_and_times_outside():
     problem = sf.Problem(RAMP, run, constant)
     path = sf.simulate(problem, times=[0.0, 1.0, 1.7])
     np.testing.assert_allclose(path.states[:, 0], [0.0, 2.0, 3.4], rtol=1e-9)
+    inside = r"times must increase strictly inside \[t0, tf\] = "
     for given, times, message in (
-        (problem, [2.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 1.7\] s; got 2.0"),
-        (heater_problem(), [-1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got -1.0"),
-        (heater_problem(), [1.0, 1.0], r"times must increase strictly inside \[t0, tf\] = \[0.0, 6.0\] h; got 1.0"),
+        (problem, [2.0], inside + r"\[0.0, 1.7\] s; got 2.0"),
+        (heater_problem(), [-1.0], inside + r"\[0.0, 6.0\] h; got -1.0"),
+        (heater_problem(), [1.0, 1.0], inside + r"\[0.0, 6.0\] h; got 1.0"),
         (heater_problem(), [], r"times must be finite numbers of shape \(K,\); got shape \(0,\)"),
         (heater_problem(), [np.nan], "times must be finite numbers"),
         (heater_problem(), "samples", "times must be a number or a date"),
@@ -339,7 +307,7 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
     written, parquet = pd.read_csv(folder / "table.csv"), pd.read_parquet(folder / "table.parquet")
     assert list(parquet.columns) == list(written.columns)
     assert parquet["verdict"].tolist() == ["good", "refused", "good"]
-    for name in ("chi2", "degrees of freedom", "t0", "tf", "seconds", "tau_1 (s)", "tau_1 (s) std. error", "heating"):
+    for name in ("chi2", "t0", "tf", "seconds", "tau_1 (s)", "tau_1 (s) std. error", "heating"):
         for table in (parquet, written):
             assert np.isfinite(table[name]).tolist() == [True, False, True], name
     assert written["degrees of freedom"].dropna().tolist() == [10, 10]
@@ -347,7 +315,6 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
     assert "cold" in parquet["message"][1]
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     assert "pip install 'switchfit[parquet]', or give the table a name that ends in .csv" in fit("new.parquet").stderr
-    assert not (folder / "new.parquet").exists()
 
 
 # --- runs.csv and unknowns.csv ---------------------------------------------------------------------------------------
@@ -398,7 +365,6 @@ def test_runs_have_how_well_they_fit(estimate):
     rows = read(write_runs(estimate))
     assert [row["run"] for row in rows] == [f"room{e}" for e in range(5)]
     for row, (comparison,) in zip(rows, estimate.comparisons, strict=True):
-        assert (row["modes"], row["time unit"], row["values"]) == ("on -> off", "h", "24")
         residuals, measured = comparison.residuals, comparison.measured
         assert float(row["chi2"]) == pytest.approx(np.sum((residuals / 0.02) ** 2))
         total = np.sum((measured - measured.mean()) ** 2)
@@ -422,12 +388,138 @@ def test_the_command_writes_them_where_they_are_many(folder):  # noqa: F811
     assert [len(read((out / name).read_text())) for name in ("runs.csv", "unknowns.csv")] == [12, 13]
 
 
-def test_tables_of_many_fits_leave_transition_times_out_first(estimate):
-    assert "more unknowns" not in str(sf.bootstrap(estimate, 3))  # ten
-    problem = estimate.problem
-    again = [replace(run, transition_times=(3.0,), name=f"{run.name}b") for run in problem.experiments]
-    larger = sf.estimate(sf.Problem(ROOM, [*problem.experiments, *again], problem.parameters), strategy="local")
-    text = str(sf.bootstrap(larger, 3))
-    assert "and 3 more unknowns" in text
-    assert "power_4 (K/h)" in text
-    assert "and 9 more" in str(sf.multistart(larger.problem, larger.theta[None]))
+# --- tables where arrays are taken: numbers, names and units arrive ---------------------------------------------------
+
+CLOCK = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+X, Y = np.sin(CLOCK), np.cos(CLOCK)
+UNITS = {"x": "m", "y": "rad"}
+
+
+def pandas_table():
+    table = pd.DataFrame({"x": X, "y": Y}, index=pd.Index(CLOCK, name="t"), dtype="Float64")
+    table["x"].attrs["units"] = "ignored: pandas hands out a new column every time"
+    table.attrs["units"] = UNITS
+    return table.index, table
+
+
+def polars_table():
+    table = pl.DataFrame({"t": CLOCK, "x": X, "y": Y})
+    return table["t"], table[["x", "y"]]
+
+
+def xarray_dataset():
+    data = xr.Dataset({"x": ("t", X), "y": ("t", Y)}, coords={"t": CLOCK})
+    for name, unit in UNITS.items():
+        data[name].attrs["units"] = unit
+    return data["t"], data
+
+
+def xarray_array():
+    data = xr.DataArray(
+        np.stack([X, Y], axis=1), coords={"t": CLOCK, "channel": ["x", "y"]}, dims=("t", "channel"), name="pose"
+    )
+    data.attrs["units"] = UNITS
+    return data["t"], data
+
+
+def log(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = [f"{t!r},{x!r},{y!r}\n" for t, x, y in zip(CLOCK.tolist(), X.tolist(), Y.tolist(), strict=True)]
+    path.write_text("t,x [m],y [rad]\n" + "".join(rows))
+    found = sf.read_log(path)
+    return found.times, found[["x", "y"]]
+
+
+TABLES = [pandas_table, polars_table, xarray_dataset, xarray_array, log]
+
+
+@pytest.mark.parametrize("make", TABLES, ids=lambda make: make.__name__)
+def test_numbers_names_and_units_arrive(make, tmp_path):
+    times, values = make(tmp_path) if make is log else make()
+    units, array = (None if make is polars_table else ("m", "rad")), np.stack([X, Y], axis=1)
+    data = sf.Measurements(times, values, sigma=0.1)
+    np.testing.assert_array_equal(data.times, CLOCK)
+    np.testing.assert_array_equal(data.values, array)
+    assert (data.names, data.units) == (("x", "y"), units)
+    renamed = sf.Measurements(times, values, names=("a", "b"), units=("km", "deg"), sigma=0.5 + np.abs(array))
+    assert (renamed.names, renamed.units, renamed.sigma.shape) == (("a", "b"), ("km", "deg"), (5, 2))
+    reference = sf.ReferenceSignal.from_samples(times, values)
+    np.testing.assert_allclose(reference.signal(CLOCK), array, atol=1e-14)
+    assert (reference.names, reference.units) == (("x", "y"), units)
+    inputs = sf.Input(times, values, kind="linear")
+    assert inputs.units == units
+    assert inputs.names in (("x", "y"), ())  # an array of xarray is an array
+    np.testing.assert_array_equal(inputs.signal(0.0, 2.0)(CLOCK)[:, 1], Y)
+
+
+def test_names_and_units_that_are_not_given_for_each():
+    """Units follow their names; what is no name is none."""
+    table = pd.DataFrame({"b": X, "a": Y})
+    table.attrs["units"] = {"a": "m", "b": "rad"}
+    inputs = sf.Input(CLOCK, table)
+    assert dict(zip(inputs.names, inputs.units, strict=True)) == {"a": "m", "b": "rad"}
+    twice = pd.DataFrame(np.stack([X, Y], axis=1), columns=["x", "x"])
+    for values in (pd.DataFrame({0: X, 1: Y}), pd.Series(X), pl.Series(X), twice):
+        assert sf.Measurements(CLOCK, values).names is None
+    with pytest.raises(ValueError, match=r"units must have one entry for each of the 1 channels; got \('m', 's'\)"):
+        sf.Measurements(CLOCK, X, units=("m", "s"))
+    with pytest.raises(TypeError, match="each of units must be a string; got 3"):
+        sf.Input(CLOCK, X, units=[3])
+
+
+@pytest.mark.parametrize(
+    "column",
+    [pd.Series(X, name="x"), pl.Series("x", X), xr.DataArray(X, dims="t", name="x", attrs={"units": "m"})],
+    ids=["pandas", "polars", "xarray"],
+)
+def test_single_columns(column):
+    data = sf.Measurements(CLOCK, column)
+    np.testing.assert_array_equal(data.values[:, 0], X)
+    assert (data.names, data.units) == (("x",), ("m",) if isinstance(column, xr.DataArray) else None)
+    assert sf.Input(CLOCK, column).shape == ()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pd.DataFrame({"x": pd.array([1, None, 3, 4, 5], dtype="Int64")}),
+        pl.DataFrame({"x": [1, None, 3, 4, 5]}),
+        pl.Series("x", [1.0, None, 3, 4, 5]),
+        xr.DataArray([1, np.nan, 3, 4, 5], name="x"),
+    ],
+)
+def test_missing_values(values):
+    data = sf.Measurements(CLOCK, values)
+    np.testing.assert_array_equal(data.values[:, 0], [1, np.nan, 3, 4, 5])
+    with pytest.raises(ValueError, match=r"Input 'x' values must be finite|Input values must be finite"):
+        sf.Input(CLOCK, values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (pl.DataFrame({"x": ["a"] * 5}), "Measurements values must be an array of numbers"),
+        (pl.DataFrame({"x": [True] * 5}), "Measurements values must be an array of numbers"),
+        (xr.DataArray(X.astype(np.float32)), "Measurements values must be in double precision"),
+        (pd.Series(pd.to_datetime(["2024-05-01"] * 5)), "dates and time differences are not supported"),
+    ],
+)
+def test_what_is_no_number(values, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        sf.Measurements(CLOCK, values)
+
+
+def test_a_log_as_a_table(tmp_path):
+    """The same measurements from both; of the libraries none is imported for it."""
+    times, channels = log(tmp_path)
+    table = channels.to_pandas()
+    assert (table.index.name, list(table.columns), table.attrs["units"]) == ("t", ["x", "y"], UNITS)
+    one, other = sf.Measurements(times, channels), sf.Measurements(table.index, table)
+    np.testing.assert_array_equal(one.values, other.values)
+    assert (one.names, one.units) == (other.names, other.units)
+    code = (
+        "import sys, switchfit as sf; log = sf.read_log('a.csv'); sf.Measurements(log.times, log[['x']]);"
+        "print([name for name in ('pandas', 'polars', 'xarray', 'pyarrow', 'h5py', 'rosbags') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

@@ -1,7 +1,5 @@
 """Validation on another run and comparison of models, in closed form of linear regression."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,17 +64,14 @@ def test_the_test_of_the_residuals_in_closed_form(known):
     r, X, n = y - design(TEST) @ p, design(TEST), len(TEST)
     expected = r @ np.linalg.solve(variance * (np.eye(n) + X @ C @ X.T), r)
     assert found.chi_square == pytest.approx(expected, rel=1e-6)
-    assert found.freedom == n
+    assert (found.freedom, found.kept) == (n, ("a", "b"))
     probability = scipy.stats.chi2.sf(expected, n) if known else scipy.stats.f.sf(expected / n, n, len(TRAIN) - 2)
     assert found.probability == pytest.approx(probability, rel=1e-5)
     assert r @ r / variance > 1.2 * expected, "otherwise the error of the parameters would not matter in this test"
     np.testing.assert_allclose(found.covariance, variance * C, rtol=1e-6)
-    assert found.refit is None
-    assert found.kept == ("a", "b")
     mean = y.mean()
     assert found.percent == pytest.approx(100 * (1 - np.linalg.norm(r) / np.linalg.norm(y - mean)), rel=1e-6)
     assert found.explained == pytest.approx(1 - r @ r / np.sum((y - mean) ** 2), rel=1e-6)
-    assert found.channels == {"x": pytest.approx(found.percent)}
     (prediction,) = found.predictions
     X = design(prediction.times)
     bands = np.sqrt(np.einsum("ki,ij,kj->k", X, variance * C, X))
@@ -90,15 +85,10 @@ def test_the_table_allows_for_correlated_residuals():
     fit = sf.estimate(pose(run(times, design(times) @ [1.2, -0.4] + red, None)))
     found = fit.validate(run(TEST, values(TEST, 1), None))
     np.testing.assert_allclose(found.corrected_standard_errors, fit.corrected_standard_errors, rtol=1e-6)
-    np.testing.assert_allclose(found.standard_errors, fit.standard_errors, rtol=1e-6)
     assert np.all(found.corrected_standard_errors > 1.5 * found.standard_errors)
-    for value, error in zip(found.theta, found.corrected_standard_errors, strict=True):
-        assert format_rounded(value, error)[1] in str(found)
+    assert format_rounded(found.theta[0], found.corrected_standard_errors[0])[1] in str(found)
     written = [entry["standard_error"] for entry in summarize_validation(found)["unknowns"]]
     np.testing.assert_array_equal(written, found.corrected_standard_errors)
-    said = "Standard errors allow for the correlation of the residuals."
-    assert said in str(found)
-    assert said not in str(fit_line().validate(run(TEST, values(TEST, 1))))
 
 
 @pytest.mark.parametrize("prior", [None, sf.Normal(0.5, 0.1)], ids=["no prior", "prior"])
@@ -133,10 +123,8 @@ def test_residuals_are_tested_without_the_error_of_the_parameters_that_they_shar
     times = np.linspace(0.1, 5.0, 200)
     found = fit.validate(run(times, values(times, 7)))
     raw = found.comparisons[0][0].residuals[:, 0]
-    alike = raw[1:] @ raw[:-1] / (raw @ raw)
-    assert alike > 0.3
+    assert raw[1:] @ raw[:-1] / (raw @ raw) > 0.3
     assert abs(found.residuals.channels[0].correlation) < 0.2
-    assert found.residuals.channels[0].whiteness > 0.01
     assert found.verdict.level == "good"
 
 
@@ -150,18 +138,14 @@ def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay
     assert found.theta[1] == fit.theta[1]
     assert abs(found.theta[0] - 1.4) < 4 * found.standard_errors[0]
     assert found.standard_errors[0] > found.refit.standard_errors[0]  # it contains the error of k
-    assert found.comparisons[0][0].names == ("thermometer",)
     np.testing.assert_array_equal(found.comparisons[0][0].sigma, 0.2)
-    assert found.freedom == 19
     same = fit.validate(sf.Experiment(sf.Measurements(times, y, sigma=0.2), ("on", "off"), (2.0,), 0.0, 5.0))
     assert same.chi_square == pytest.approx(found.chi_square, rel=1e-6)
-    assert "kept from the fit" in str(found)
     (line,) = (line for line in str(found).splitlines() if line.startswith("  tau_1"))
     assert line.endswith("estimated from this run")
     held = fit.validate(sf.Measurements(times, y), refit=())
     assert held.theta[0] == fit.theta[0]
     assert (held.refit, held.freedom, held.verdict.level) == (None, 20, "bad")
-    assert "predicts" not in {reason.kind for reason in held.verdict.reasons}
 
 
 def calibrated(t, x, p):
@@ -245,35 +229,29 @@ def test_without_a_noise_level_there_is_no_chi_square():
     found = fit.validate(pose(run(TEST, values(TEST, 1), None)))
     assert np.isnan(found.chi_square)
     assert found.predictions == ()
+    found.plot().draw_without_rendering()
     r = values(TEST, 1) - design(TEST) @ by_hand()[0]
     assert found.explained == pytest.approx(1 - r @ r / len(r) / values(TEST, 1).var(), rel=1e-6)
     assert "chi²" not in str(found)
-    found.plot().draw_without_rendering()
 
 
 def test_what_cannot_be_validated():
-    fit, y = fit_line(), values(TEST, 1)
+    one, y = fit_line(), values(TEST, 1)
     data = sf.Measurements(TEST, y)
     two = sf.Measurements(TEST, np.zeros((len(TEST), 2)), observe=lambda t, x, p: jnp.stack([x[0], x[0]]))
     both = sf.estimate(pose([run(TRAIN, values(TRAIN, s)) for s in (0, 1)]))
     each = sf.estimate(pose(run(TRAIN, values(TRAIN, 0), np.full((len(TRAIN), 1), SIGMA))))
     own = run(TEST, y, initial_state=[sf.Parameter(0.0)])
-    for of, other, settings, error, said in (
-        (fit, 3, {}, TypeError, r"validate needs another run: an sf.Experiment.*got 3"),
-        (
-            fit,
-            own,
-            {"refit": ("b",)},
-            ValueError,
-            r"refit names 'b', which is no unknown of the other run's own; these",
-        ),
-        (fit, two, {}, ValueError, "of the fit have 1 channels, those of the other run 2"),
-        (fit, [data] * 2, {}, ValueError, "the fit has 1 Measurements; got 2 for the other run"),
-        (both, data, {}, ValueError, "the fit has several experiments, inputs, or other data"),
-        (each, data, {}, ValueError, "sigma differs from sample to sample in the fit"),
+    for call, error, said in (
+        (lambda: one.validate(3), TypeError, r"validate needs another run: an sf.Experiment.*got 3"),
+        (lambda: one.validate(own, refit=("b",)), ValueError, r"refit names 'b', which is no unknown of the other run"),
+        (lambda: one.validate(two), ValueError, "of the fit have 1 channels, those of the other run 2"),
+        (lambda: one.validate([data] * 2), ValueError, "the fit has 1 Measurements; got 2 for the other run"),
+        (lambda: both.validate(data), ValueError, "the fit has several experiments, inputs, or other data"),
+        (lambda: each.validate(data), ValueError, "sigma differs from sample to sample in the fit"),
     ):
         with pytest.raises(error, match=said):
-            of.validate(other, **settings)
+            call()
 
 
 def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_the_exact_hessian():
@@ -286,7 +264,6 @@ def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_t
         runs.append(sf.Experiment(data, ("slide", "rest"), (0.95,), 0.0, 2.0))
     found = sf.estimate(sf.Problem(system, runs[0], {"v": 1.1})).validate(runs[1])
     assert found.theta_names == ("tau_1", "v")
-    assert not found.refit.kinks
     assert found.standard_errors[0] >= found.refit.standard_errors[0] * (1 - 1e-9)
     assert found.refit.standard_errors[0] > 0.005
 
@@ -312,20 +289,21 @@ def test_another_log_with_dates():
         days = np.datetime64(f"2024-03-{day:02}T00:00", "ns")
         return sf.Measurements(days + np.round(log.times * 3.6e12).astype("timedelta64[ns]"), log.values, **given)
 
-    settings = {"t0": "2024-03-01T00:00", "tf": "2024-03-01T06:00", "time_unit": "h"}
-    run = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), **settings)
-    fit = sf.estimate(sf.Problem(base.system, run, base.parameters))
-    same = fit.validate(build(1))
-    assert same.chi_square == pytest.approx(fit.validate(sf.Measurements(log.times, log.values)).chi_square, rel=1e-9)
+    def fit(**ends):
+        run = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), time_unit="h", **ends)
+        return sf.estimate(sf.Problem(base.system, run, base.parameters))
+
+    dated = fit(t0="2024-03-01T00:00", tf="2024-03-01T06:00")
+    numbers = dated.validate(sf.Measurements(log.times, log.values))
+    assert dated.validate(build(1)).chi_square == pytest.approx(numbers.chi_square, rel=1e-9)
     with pytest.raises(ValueError, match=r"begins at 2024-03-05T00:15:00, after .* 2024-03-01 06:00.*: give validate"):
-        fit.validate(build(5))
+        dated.validate(build(5))
     with pytest.raises(ValueError, match="the other log has dates, and the times of the fit are numbers: give valid"):
         sf.estimate(base).validate(build(1))
-    held = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), time_unit="h")
-    fit = sf.estimate(sf.Problem(base.system, held, base.parameters))
-    other = fit.validate(build(5))
+    found = fit()
+    other = found.validate(build(5))
     assert other.problem.experiments[0].t0 == pytest.approx(96.0, abs=1e-9)
-    assert other.theta[0] - 96.0 == pytest.approx(fit.theta[0], abs=1e-3)
+    assert other.theta[0] - 96.0 == pytest.approx(found.theta[0], abs=1e-3)
 
 
 # --- comparison of models ---------------------------------------------------------------------------------------------
@@ -347,15 +325,14 @@ def test_criteria_in_closed_form_with_sigma_known():
     rss = np.array([squares(count, values(TIMES, 0)) for count in k])
     log_l = -0.5 * rss / SIGMA**2 - n * np.log(SIGMA) - 0.5 * n * np.log(2 * np.pi)
     np.testing.assert_allclose(table.log_likelihood, log_l, rtol=1e-8)
-    assert table.unknown_counts.tolist() == [1, 2, 3]
-    assert table.values == n
-    np.testing.assert_allclose(table.aic, 2 * k - 2 * log_l, rtol=1e-8)
+    assert (table.unknown_counts.tolist(), table.values) == ([1, 2, 3], n)
     np.testing.assert_allclose(table.aicc, 2 * k - 2 * log_l + 2 * k * (k + 1) / (n - k - 1), rtol=1e-8)
     np.testing.assert_allclose(table.bic, k * np.log(n) - 2 * log_l, rtol=1e-8)
     weight = np.exp(-0.5 * (table.aicc - table.aicc.min()))
     np.testing.assert_allclose(table.weights, weight / weight.sum(), rtol=1e-12)
     assert table.best == "ab"
-    assert table.delta_bic.min() == 0.0
+    few = np.where(np.arange(n) < 3, values(TIMES, 0), np.nan)  # missing values are no different data
+    assert np.isinf(sf.compare([fit(k, runs=run(TIMES, few)) for k in (1, 2)]).aicc[1])
 
 
 def test_criteria_in_closed_form_with_sigma_unknown():
@@ -365,7 +342,6 @@ def test_criteria_in_closed_form_with_sigma_unknown():
     log_l = -0.5 * n * (np.log(2 * np.pi * rss / n) + 1)
     np.testing.assert_allclose(table.log_likelihood, log_l, rtol=1e-8)
     assert table.unknown_counts.tolist() == [2, 3]
-    assert table.names == ("model1", "model2")
 
 
 def test_a_sigma_that_is_a_parameter_is_the_same_as_one_left_out():
@@ -381,25 +357,23 @@ def test_losses_are_densities(loss):
     z = np.concatenate([-np.logspace(6, -6, 200_001), np.logspace(-6, 6, 200_001)])
     total = scipy.integrate.trapezoid(np.exp(-0.5 * robust(loss, 1.7, z**2) - norm), z)
     assert total == pytest.approx(1.0, abs=1e-3)
-    assert np.isinf(compute_log_norm("cauchy", 1.0))
 
 
-def test_a_robust_loss_is_better_where_there_are_outliers():
+def test_the_likelihood_of_a_robust_loss():
     y = values(TIMES, 0)
     y[[3, 8]] += [5.0, -4.0]
     fits = [fit(2, runs=run(TIMES, y)), fit(2, runs=run(TIMES, y, loss="cauchy", loss_scale=1.5))]
     table = sf.compare(fits, names=("normal", "cauchy"))
     r = y - design(TIMES, 2) @ table.estimates[1].theta
     norm = np.log(SIGMA) + compute_log_norm("cauchy", 1.5)
-    by_hand = -np.sum(0.5 * 1.5**2 * np.log1p((r / SIGMA) ** 2 / 1.5**2)) - len(y) * norm
-    assert table.log_likelihood[1] == pytest.approx(by_hand, rel=1e-9)
+    expected = -np.sum(0.5 * 1.5**2 * np.log1p((r / SIGMA) ** 2 / 1.5**2)) - len(y) * norm
+    assert table.log_likelihood[1] == pytest.approx(expected, rel=1e-9)
     assert table.best == "cauchy"
 
 
 def test_models_with_the_same_bic_are_as_good_as_each_other():
     """No evidence is printed where the difference in BIC would be printed as 0.0."""
     one, known, poor = fit(2), fit(3), fit(1)
-    assert str(sf.compare([one, one])).startswith("model1 and model2 are as good as each other by BIC. 12 values.")
     text = str(sf.compare([poor, one, known, one], names=("poor", "one", "all", "same")))
     assert text.startswith("one and same are as good as each other by BIC, 2.5 below all: positive evidence. 12 ")
     assert str(sf.compare([one, known])).startswith("model1 has the smallest BIC, 2.5 below model2: positive evidence.")
@@ -420,32 +394,21 @@ def test_different_data_are_refused_wherever_they_differ():
             sf.compare([fit(2), fit(2, runs=runs)])
 
 
-def test_equal_data_in_other_arrays_and_with_missing_values_are_the_same():
-    y = np.where(np.arange(12) == 2, np.nan, values(TIMES, 0))
-    assert sf.compare([fit(1, runs=run(TIMES, y)), fit(2, runs=run(TIMES, y.copy()))]).values == len(TIMES) - 1
-
-
 def test_what_cannot_be_compared():
     one = fit(1)
     area = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2), ("m",), (), 0.0, 4.0)
     # 1 is the scale if none is given: the tail of Cauchy's loss falls as 1 / |z|, whose integral is infinite.
     heavy = run(TIMES, values(TIMES, 0), loss="cauchy", loss_scale=1.0)
-    for estimates, settings, error, said in (
-        ([one, one.problem], {}, TypeError, r"each of estimates must be a result of sf\.estimate; got Problem"),
-        ([one], {}, ValueError, "compare needs two estimates or more; got 1"),
-        ([one, one], {"names": ("a",)}, ValueError, "names must have one entry for each of the 2 estimates"),
-        ([one, fit(1, runs=area)], {}, ValueError, "model2 has no likelihood: its cost has other terms than Measure"),
-        ([one, fit(2, runs=heavy)], {}, ValueError, r"model2 .*: loss='cauchy' is .* a loss_scale above 1; got 1\."),
+    for estimates, error, said in (
+        ([one, one.problem], TypeError, r"each of estimates must be a result of sf\.estimate; got Problem"),
+        ([one], ValueError, "compare needs two estimates or more; got 1"),
+        ([one, fit(1, runs=area)], ValueError, "model2 has no likelihood: its cost has other terms than Measure"),
+        ([one, fit(2, runs=heavy)], ValueError, r"model2 .*: loss='cauchy' is .* a loss_scale above 1; got 1\."),
     ):
         with pytest.raises(error, match=said):
-            sf.compare(estimates, **settings)
-
-
-def test_few_values():
-    y = np.where(np.arange(12) < 3, values(TIMES, 0), np.nan)
-    table = sf.compare([fit(k, runs=run(TIMES, y)) for k in (1, 2)])
-    assert np.isinf(table.aicc[1])
-    np.testing.assert_allclose(table.weights, [1.0, 0.0])
+            sf.compare(estimates)
+    with pytest.raises(ValueError, match="names must have one entry for each of the 2 estimates"):
+        sf.compare([one, one], names=("a",))
 
 
 def test_guards_are_equations_between_unknowns():

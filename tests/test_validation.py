@@ -54,23 +54,17 @@ PROBLEM = sf.Problem(SYSTEM, run(), {"k": sf.Parameter(1.0, 0.1, 5.0)})
 REFERENCE = {"times": [0.0, 0.25, 0.5, 1.0], "values": [1.0, 0.8, 0.6, 0.4]}
 
 NUMBERS = {
-    "initial_state": lambda bad: run(initial_state=bad([0.1])),
     "an entry of initial_state": lambda bad: run(initial_state=[sf.Parameter(1.0), bad(0.1)]),
     "tf": lambda bad: run(tf=bad(1.1)),
     "transition_times": lambda bad: run(transition_times=bad([0.1])),
     "a parameter": lambda bad: sf.Problem(SYSTEM, run(), {"k": bad(0.1)}),
     "lower": lambda bad: sf.Parameter(1.0, lower=bad(0.1)),
-    "mean": lambda bad: sf.Normal(bad(0.1), 1.0),
-    "times": lambda bad: samples(times=bad([0.1, 0.75])),
     "values in a list": lambda bad: samples(values=[bad(0.1), 0.5]),
     "sigma of a channel": lambda bad: samples(values=[[1.0, 2.0]] * 2, sigma=["s", bad(0.1)]),
-    "loss_scale": lambda bad: samples(loss="huber", loss_scale=bad(1.1)),
-    "reference values": lambda bad: sf.ReferenceSignal.from_samples(**REFERENCE | {"values": bad([0.1, 1, 2, 3])}),
     "weights": lambda bad: sf.ReferenceSignal.from_samples(**REFERENCE, weights=bad([0.1])),
     "input values": lambda bad: sf.Input([0.0, 1.0], bad([0.1, 2.0])),
     "rtol": lambda bad: sf.Problem(SYSTEM, run(), {"k": 1.0}, rtol=bad(0.1)),
     "theta": lambda bad: sf.evaluate(PROBLEM, bad([0.1, 1.0])),
-    "starts": lambda bad: sf.multistart(PROBLEM, bad([[0.1, 1.0]])),
     "noise": lambda bad: sf.monte_carlo(PROBLEM, 1, noise=bad(0.1)),
 }
 
@@ -111,14 +105,11 @@ def test_halves_pass_and_tenths_do_not(kind):
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        (1, 1.0),
         ([1, 2.5], [1.0, 2.5]),
         (range(3), [0.0, 1.0, 2.0]),
         (np.int32(3), 3.0),
-        (np.array([1, 2], dtype=np.uint8), [1.0, 2.0]),
         ([np.float64(0.1), np.int64(2)], [0.1, 2.0]),
-        (Decimal("0.1"), 0.1),
-        ([Fraction(1, 4), 1], [0.25, 1.0]),
+        ([Fraction(1, 4), Decimal("0.1")], [0.25, 0.1]),
         (np.array([1.0, 2], dtype=object), [1.0, 2.0]),
         ([np.array([1.0, 2.0]), [3, 4]], [[1.0, 2.0], [3.0, 4.0]]),
         ([], []),
@@ -144,23 +135,17 @@ DATES = [datetime.datetime(2020, 1, 1), datetime.datetime(2020, 1, 2)]
     ("given", "error", "said"),
     [
         (None, TypeError, "got None"),
-        (True, TypeError, "got True"),
         ([1.0, True], TypeError, "in which True is not a number"),
         (1j, TypeError, "got 1j"),
-        ("1.0", ValueError, "got '1.0'"),
         (["1.0", 2.0], ValueError, "in which '1.0' is not a number"),
         (np.array(["1.0"]), ValueError, r"got \['1.0'\] \(<U3\)"),
-        (b"1.0", ValueError, "got b'1.0'"),
         ({1.0, 2.0}, TypeError, "give a list or an array"),
         ((value for value in (1.0,)), TypeError, "give a list or an array"),
-        ([None, 1.0], TypeError, "in which None is not a number"),
         (np.array([1.0, None], dtype=object), TypeError, "in which None is not a number"),
-        (10**400, ValueError, r"1000\S*000, with a number beyond the"),
         (Fraction(10**400), ValueError, "beyond the largest double"),
         ([[1.0], [2.0, 3.0]], ValueError, "whose rows differ in length"),
         (DATES, TypeError, "dates and time differences are not supported.*np.timedelta64"),
         (np.array(DATES, dtype="datetime64[ns]"), TypeError, "dates and time differences are not supported"),
-        (np.timedelta64(1, "s"), TypeError, "dates and time differences are not supported"),
         (np.ma.array([1.0, 2.0], mask=[True, False]), ValueError, "a masked array: fill in what is masked"),
         (PROBLEM, TypeError, "got Problem"),
         (ENDLESS, ValueError, "nested more than 8 deep"),
@@ -168,10 +153,8 @@ DATES = [datetime.datetime(2020, 1, 1), datetime.datetime(2020, 1, 2)]
     ],
 )
 def test_what_is_no_number_is_refused(given, error, said):
-    with pytest.raises(error, match=rf"(?s)^x must be a number or an array of numbers.*{said}") as caught:
+    with pytest.raises(error, match=rf"(?s)^x must be a number or an array of numbers.*{said}.*\.$"):
         as_array(given, "x")
-    assert str(caught.value).endswith(".")
-    assert type(caught.value) is error
 
 
 def test_a_traced_value_is_refused():
@@ -182,21 +165,45 @@ def test_a_traced_value_is_refused():
 # Counts, flags, choices, functions, paths
 
 
-NO_COUNTS = [3.0, "3", None, True, np.True_, np.array([3]), np.array(True), [3]]
-NO_FLAGS = [0, np.nan, "yes", None, np.array([True])]
-NO_LISTS = [{"a", "b"}, {"a": 1}, iter("ab"), 3, None, np.array(1.0)]
-
-
-@pytest.mark.parametrize("given", [np.int64(3), np.array(3), jnp.array(3)])
-def test_integers_are_counts(given):
-    assert type(as_count(given, "runs")) is int
-    assert as_count(given, "runs") == 3
+NO_COUNTS = [3.0, "3", None, True, np.True_, np.array([3])]
+NO_FLAGS = [0, "yes", None, np.array([True])]
+NO_LISTS = [{"a", "b"}, {"a": 1}, iter("ab"), 3, np.array(1.0)]
 
 
 def test_what_is_accepted_is_returned():
+    for three in (np.int64(3), np.array(3), jnp.array(3)):
+        assert type(as_count(three, "runs")) is int
     assert as_choice(np.str_("b"), "kind", ("a", "b")) == "b"
     assert as_callable(first_state, "observe", "a function h(t, x, p)", arguments=3) is first_state
     assert as_callable(max, "observe", "a function", arguments=2) is max  # no signature
+
+
+# Messages
+
+
+LONG = ["x" * 10**7, [1.0] * 10**6, np.zeros(10**6), {k: k for k in range(10**5)}, 10**5000]
+
+
+WITHOUT_TEXT = type("WithoutText", (), {"__repr__": lambda self: 1 / 0})()
+
+
+@pytest.mark.parametrize("value", [*LONG, WITHOUT_TEXT, PROBLEM], ids=lambda value: type(value).__name__)
+def test_what_messages_show_is_short(value):
+    began = time.perf_counter()
+    assert 0 < len(shorten(value)) <= LONGEST
+    assert time.perf_counter() - began < 0.5
+    assert join_names(str(k) for k in range(1000)).endswith("9 and 990 more")
+
+
+# What has been accepted without a word
+
+
+TWO = [[1.0, 2.0]] * 2
+HUGE = {"values": [1e308, -1e308, 1e308, -1e308]}
+
+
+def filtered(hz):
+    return sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=hz)
 
 
 @pytest.mark.parametrize(
@@ -215,62 +222,6 @@ def test_what_is_accepted_is_returned():
         (lambda: as_path(None, "path"), TypeError, "path must be a path"),
         (lambda: as_number([1.0, 2.0], "tf"), ValueError, "tf must be a single number"),
         (lambda: as_path("", "path"), ValueError, "path must be a path"),
-    ],
-)
-def test_what_is_not_as_it_must_be_is_refused(call, error, said):
-    with pytest.raises(error, match=said):
-        call()
-
-
-# Messages
-
-
-class Shown:
-    """An object whose text is a table, is very long or is an error."""
-
-    def __init__(self, text):
-        self.text = text
-
-    def __repr__(self):
-        if self.text is None:
-            raise RuntimeError("no text")
-        return self.text
-
-
-LONG = ["x" * 10**6, [1.0] * 10**6, np.zeros(10**6), {k: k for k in range(10**5)}, 10**5000]
-
-
-@pytest.mark.parametrize(
-    "value", [*LONG, Shown("x" * 10**7), Shown(None), PROBLEM], ids=lambda value: type(value).__name__
-)
-def test_what_messages_show_is_short(value):
-    assert shorten(Shown("a  b\n1  2")) == "a b 1 2"
-    began = time.perf_counter()
-    assert 0 < len(shorten(value)) <= LONGEST
-    assert time.perf_counter() - began < 0.5
-
-
-def test_lists_of_names_are_short():
-    assert join_names(["a", "b"]) == "a, b"
-    assert join_names([]) == "none"
-    assert join_names(str(k) for k in range(1000)).endswith("9 and 990 more")
-    assert len(join_names(["x" * 1000])) == 40
-
-
-# What has been accepted without a word
-
-
-TWO = [[1.0, 2.0]] * 2
-HUGE = {"values": [1e308, -1e308, 1e308, -1e308]}
-
-
-def filtered(hz):
-    return sf.ReferenceSignal.from_samples(**REFERENCE, lowpass_hz=hz)
-
-
-@pytest.mark.parametrize(
-    ("build", "error", "said"),
-    [
         (lambda: sf.estimate(None), TypeError, "problem must be an sf.Problem; several .*estimate_many.*NoneType"),
         (lambda: sf.estimate(PROBLEM, callback=5), TypeError, r"must be a function callback\(record\); got 5"),
         (lambda: sf.estimate(PROBLEM, start=[0.5, 9.0]), ValueError, "The start violates k at its upper bound 5"),
@@ -293,8 +244,7 @@ def filtered(hz):
         (lambda: sf.estimate_many([PROBLEM, None]), TypeError, r"problems\[1\] must be an sf.Problem; got NoneType"),
     ],
 )
-def test_mistakes_are_told(build, error, said):
+def test_what_is_not_as_it_must_be_is_refused(call, error, said):
     with pytest.raises(error, match=said) as caught:
-        build()
+        call()
     assert type(caught.value) is error
-    assert str(caught.value).endswith(".")

@@ -1,21 +1,19 @@
 """The verdict on fits: every rule with a fit that it is about and one just beside it, and known ends."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import STILL, VEHICLE_TRUTH, curve, fishing, heated_room, linear, temperature, tracked_drive
+from models import STILL, curve, fishing, heated_room, linear, temperature
 
 import switchfit as sf
 from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
 from switchfit.models import heater_problem
 from switchfit.report.sentences import format_share
-from switchfit.uncertainty.residuals import compare_with_sigma, correct_correlation
+from switchfit.uncertainty.residuals import compare_with_sigma
 from switchfit.uncertainty.verdict import Numbers, find_doubts
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -130,7 +128,6 @@ SITUATIONS = {
     # values and settings, level, kinds of the reasons, words
     "right, sigma known": (LINE + noise(0.1), {"sigma": 0.1}, "good", "fits", IS_NOISE),
     "right, sigma unknown": (LINE + noise(0.1), {}, "good", "fits", IS_NOISE),
-    "much noise of a known sigma": (LINE + noise(3.0), {"sigma": 3.0}, "good", "fits", IS_NOISE),
     "nothing but noise": (2 + 0.1 * TIMES + noise(), {}, "doubtful", "little explained", "explains only"),
     "sigma too small by 2": (LINE + noise(0.1), {"sigma": 0.05}, "doubtful", "sigma suspected", "sigma is too small"),
     "sigma too small by 2, fewer than 20 values": (
@@ -141,7 +138,6 @@ SITUATIONS = {
     "outliers, sigma known": (
         LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", "outliers suspected", GIVE_LOSS,
     ),
-    "outliers, sigma unknown": (LINE + noise(0.1) + SPIKES, {}, "doubtful", "outliers suspected", GIVE_LOSS),
     "model slightly wrong": (
         LINE + 0.02 * WAVE + noise(0.005), {"sigma": 0.005}, "doubtful", "model suspected",
         "is correlated: the model is slightly wrong",
@@ -152,9 +148,6 @@ SITUATIONS = {
         2 + 0.1 * TIMES + WAVE, {"sigma": 10.0}, "doubtful", "little explained", "explains only 6 %",
     ),
     "few values": (0.5 * TIMES[::9] + 0.05 * WAVE[::9], FEW_TIMES, "good", "fits", "of the variance."),
-    "few values, too little of it explained": (
-        0.5 * TIMES[::9] + WAVE[::9], FEW_TIMES, "doubtful", "little explained", "explains only",
-    ),
     "as many values as unknowns": (
         np.array([1.0, 2.5]), {"times": np.array([1.0, 2.0])}, "doubtful", "too few samples", "nothing to check",
     ),
@@ -168,9 +161,7 @@ def test_situations(name):
     assert (fit.verdict.level, kinds(fit)) == (level, [reason])
     assert words in str(fit.verdict)
     assert str(fit.verdict).startswith(f"{level.capitalize()}: converged; one fit; ")
-    assert fit.success == (level != "bad")
-    assert (fit.verdict.next_steps == ()) == (level == "good")
-    assert [answer.kind for answer in fit.verdict.answers][:2] == ["converged", "looked"]
+    assert (fit.verdict.next_steps == (), fit.success) == (level == "good", level != "bad")
 
 
 def test_an_estimated_sigma_confirms_no_fit():
@@ -197,9 +188,7 @@ def test_one_wrong_run_of_many_is_found_and_named():
 
     assert fit(0.0).verdict.level == "good"
     found = fit(1.5)
-    assert found.residual_variance < 1.15
-    assert found.verdict.level == "doubtful"
-    assert found.verdict.reasons[0].subjects == ("room7 T",)
+    assert (found.verdict.level, found.verdict.reasons[0].subjects) == ("doubtful", ("room7 T",))
     assert " of room7 T" in str(found.verdict)
 
 
@@ -207,7 +196,6 @@ def test_nothing_is_read_from_residuals_that_are_rounding():
     fit = straight(LINE)
     assert str(fit.verdict) == "Good: converged; one fit; the model explains all of the variance."
     assert replace(fit, integration_error=1.0).verdict.level == "good"
-    assert replace(fit, starts=(40, 3, 0)).verdict.level == "good"
     wave = straight(LINE + 1e-4 * WAVE)
     assert replace(wave, integration_error=1.0).verdict.level == "bad"
     assert kinds(wave) == ["model suspected"]
@@ -222,28 +210,14 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
         run = sf.Experiment(data, ("still",), (), 0.0, 10.0)
         return sf.estimate(sf.Problem(STILL, run, {"a": 1.0, "b": slope}), strategy="local")
 
-    right = fit(sf.Parameter(0.3))
-    assert right.verdict.level == "good"
-    assert right.verdict.reasons[0].figures["explained"] > 0.99
+    assert fit(sf.Parameter(0.3)).verdict.level == "good"
     wrong = fit(sf.Parameter(-0.2, fixed=True))  # nearly all samples are beyond the scale
     assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["unexplained"])
     near = fit(sf.Parameter(0.476, fixed=True))  # half of them is
-    assert near.verdict.level != "good"
-    assert "next: more starts" in steps(near)
+    assert (near.verdict.level != "good", "next: more starts" in steps(near)) == (True, True)
 
 
 # --- corrected standard errors ----------------------------------------------------------------------------------------
-
-
-def test_errors_of_correlated_residuals_are_corrected_and_the_naive_ones_stand_beside_them():
-    fit = straight(2.0 + 0.5 * TIMES + 0.1 * np.sin(2 * TIMES) + noise(0.02))
-    (channel,) = fit.residuals.channels
-    r = correct_correlation(channel.correlation, len(TIMES), 2)
-    np.testing.assert_allclose(fit.corrected_standard_errors, np.sqrt((1 + r) / (1 - r)) * fit.standard_errors)
-    assert "naive" in str(fit)
-    white = straight(2.0 + 0.5 * TIMES + noise(0.1))
-    np.testing.assert_array_equal(white.corrected_standard_errors, white.standard_errors)
-    assert "naive" not in str(white)
 
 
 def test_the_error_of_a_time_is_corrected_by_its_own_run():
@@ -270,11 +244,8 @@ def test_a_kink_is_a_note_and_no_doubt():
         fit = sf.estimate(sf.Problem(heated_room(), run, {"power": 2.0, "k": held}), strategy="local")
         if fit.kinks:
             break
-    assert fit.kinks
-    assert fit.verdict.level == "good"
-    assert kinds(fit) == ["fits", "at kinks"]
+    assert (fit.verdict.level, kinds(fit)) == ("good", ["fits", "at kinks"])
     assert str(fit.verdict).endswith("; tau_1 at a kink of the cost.")
-    assert "Warnings" not in str(fit)
 
 
 # --- integration, derivatives, starts ---------------------------------------------------------------------------------
@@ -291,7 +262,6 @@ def test_other_starts_count(right):
     worse = replace(right, starts=(40, 12, 3)).verdict
     assert (worse.level, worse.reasons[0].kind) == ("bad", "other starts are better")
     assert str(worse).startswith("Bad: converged; 12 of 40 other starts are better; the model explains ")
-    assert str(worse).endswith("what is left is noise: strategy='thorough'.")
 
 
 def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
@@ -324,28 +294,14 @@ def test_a_search_that_was_cut_short_is_doubtful_unless_noise_of_a_known_size_is
     cut = (Step("local", right.cost, 5, 0.1), Step("many starts", right.cost, 50, 2.0, "time"))
     assert replace(right, steps=cut).verdict.level == "good"
     unknown = straight(LINE + noise(0.1), a=1.2)
-    assert unknown.verdict.level == "good"
     doubted = replace(unknown, steps=cut)
-    assert doubted.verdict.level == "doubtful"
-    assert kinds(doubted) == ["search cut short"]
-    assert steps(doubted) == ["next: more time"]
-    assert "many starts ended by its limit of time" in str(doubted.verdict).replace("\n  ", " ")
+    assert (unknown.verdict.level, doubted.verdict.level) == ("good", "doubtful")
+    assert (kinds(doubted), steps(doubted)) == (["search cut short"], ["next: more time"])
     for starts, level in (((40, 0, 30), "good"), ((40, 0, 1), "doubtful"), ((40, 1, 30), "bad")):
         assert replace(doubted, starts=starts).verdict.level == level
 
 
 # --- costs without noise ----------------------------------------------------------------------------------------------
-
-
-def test_a_reference_that_is_followed_is_good_and_a_wrong_end_is_not():
-    problem = tracked_drive()
-    right = sf.estimate(problem, strategy="local")
-    np.testing.assert_allclose(right.theta, VEHICLE_TRUTH, rtol=1e-4)
-    assert right.verdict.level == "good"
-    wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9], strategy="local")
-    assert not np.allclose(wrong.theta, VEHICLE_TRUTH, rtol=0.05)
-    assert wrong.verdict.level != "good"
-    assert kinds(wrong)[0] in ("little explained", "unexplained", "not converged")
 
 
 def test_channels_of_no_weight_and_constant_references_are_not_judged():
@@ -369,7 +325,6 @@ def test_a_cost_without_data_is_judged_by_its_minimum():
     fit = sf.estimate(linear(), strategy="local")
     assert str(fit.verdict).startswith("Good: converged; one fit; a minimum (KKT residual ")
     collapsed = sf.estimate(fishing(), strategy="local")
-    assert collapsed.verdict.level == "doubtful"
     assert kinds(collapsed) == ["a mode collapsed"]
     assert "No standard errors" not in collapsed.report(full=True)  # nothing can be done about it
 
@@ -390,20 +345,8 @@ def test_wrong_ends_are_never_good(name):
             assert end.verdict.level == "good"
         else:
             seen.append(end.verdict.level)
-    assert len(seen) > 2
     assert "good" not in seen
     assert "bad" in seen
-
-
-@pytest.mark.parametrize(
-    ("share", "text"),
-    [
-        (1.0, "all"), (0.9999999, "all but 1e-6"), (0.99985999, "99.985 %"), (0.99499, "99.49 %"), (0.61, "61 %"),
-        (0.0, "none"), (-3.0, "none"), (0.95, "95.0 %"), (0.29, "29 %"), (0.57, "57 %"),
-    ],
-)  # fmt: skip
-def test_shares_are_never_rounded_up(share, text):
-    assert format_share(share) == text
 
 
 # --- files and the command line ---------------------------------------------------------------------------------------
@@ -411,13 +354,17 @@ def test_shares_are_never_rounded_up(share, text):
 
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_file_begins_with_the_verdict_and_a_loaded_estimate_has_it(tmp_path):
-    for k, fit in enumerate((straight(TIMES + noise(0.1), sigma=0.1), straight(np.sin(TIMES), sigma=0.01))):
-        path = tmp_path / f"{k}.json"
-        fit.save(path)
-        content = json.loads(path.read_text(encoding="utf-8"))
-        assert next(iter(content)) == "verdict"
-        assert list(content["verdict"].items())[:2] == [("level", fit.verdict.level), ("text", str(fit.verdict))]
-        assert [reason["kind"] for reason in content["verdict"]["reasons"]] == kinds(fit)
-        loaded = sf.Estimate.load(path)
-        assert loaded.verdict == fit.verdict
-        assert loaded.success == fit.success == (k == 0)
+    fit, path = straight(np.sin(TIMES), sigma=0.01), tmp_path / "fit.json"
+    fit.save(path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert next(iter(content)) == "verdict"
+    assert list(content["verdict"].items())[:2] == [("level", fit.verdict.level), ("text", str(fit.verdict))]
+    loaded = sf.Estimate.load(path)
+    assert loaded.verdict == fit.verdict
+    assert not loaded.success
+
+
+def test_shares_are_never_rounded_up():
+    """0.29 * 100 is below 29."""
+    texts = {1.0: "all", 0.9999999: "all but 1e-6", 0.99985999: "99.985 %", 0.61: "61 %", 0.0: "none", 0.29: "29 %"}
+    assert {share: format_share(share) for share in texts} == texts

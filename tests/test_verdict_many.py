@@ -1,35 +1,43 @@
 """Verdicts on many fits: each as that on a single fit as far as J tells, and rules for all of them together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from models import temperature
 from test_batch import ROOM, TIMES, TRUTH
 from test_batch import room as heat
 
 import switchfit as sf
-from switchfit.batch.fits import FAR_AWAY, _count_collapsed, measure_distances
+from switchfit.batch.fits import _count_collapsed
 from switchfit.batch.program import CHUNK
 from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
-
-def temperatures(tau=2.1, k=0.8):
-    rising = 1 / k + (0.2 - 1 / k) * np.exp(-k * np.minimum(TIMES, tau))
-    return rising * np.exp(-k * np.maximum(TIMES - tau, 0.0))
+TEMPERATURES = temperature(TIMES, 2.1, 1.0, 0.8)
 
 
-def room(values=None, *, sigma=0.01, seed=0, noise=0.01, **settings):
-    values = temperatures() if values is None else values
+def room(values=TEMPERATURES, *, sigma=0.01, seed=0, noise=0.01, **settings):
     values = values + noise * np.random.default_rng(seed).standard_normal(24)
     return heat(sf.Measurements(TIMES, values, sigma=sigma), **settings)
 
 
 def wave(size):
-    return temperatures() + size * np.sin(4 * TIMES)
+    return TEMPERATURES + size * np.sin(4 * TIMES)
+
+
+def test_the_share_of_a_reference_is_that_of_a_single_fit_and_a_cost_without_data_has_none():
+    signal = sf.ReferenceSignal.from_samples(np.r_[0.0, TIMES], np.r_[0.2, wave(0.1)][:, None])
+    problem = sf.Problem(ROOM, sf.Experiment(signal, ("on", "off"), (1.7,), 0.0, 6.0), {"k": 1.0})
+    single, many = sf.estimate(problem, strategy="local"), sf.estimate_many([problem, problem])
+    assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-3)
+    assert many.verdict.level == single.verdict.level == "doubtful"
+    assert "little of the variance is explained in 2 of 2 fits" in str(many.verdict)
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 0.8) ** 2), ("on", "off"), (1.0,), 0.0, 6.0)
+    many = sf.estimate_many([sf.Problem(ROOM, run, {"k": sf.Parameter(0.8, fixed=True)})])
+    assert np.isnan(many.explained).all()
+    assert str(many.verdict) == "Good: 1 good of 1 fit."
 
 
 def kinds(result):
@@ -39,23 +47,11 @@ def kinds(result):
 # --- fits of logs -----------------------------------------------------------------------------------------------------
 
 
-def test_good_fits_are_good():
-    good = sf.estimate_many([room(seed=seed) for seed in range(12)])
-    assert good.verdict.level == "good"
-    assert good.levels.tolist() == ["good"] * 12
-    worst = int(np.argmin(good.explained))
-    assert str(good.verdict).startswith("Good: 12 good of 12 fits, explaining 99.")
-    assert f"(fit {worst} least)" in str(good.verdict)
-    assert str(good).startswith(str(good.verdict))
-    assert good.verdict.next_steps == ()
-
-
 @pytest.mark.parametrize(
     ("settings", "level"),
     [
         ({}, "good"),
         ({"values": wave(0.03)}, "doubtful"),  # what is left is no noise
-        ({"values": wave(0.3)}, "doubtful"),
         ({"values": wave(1.0)}, "bad"),
         ({"noise": 0.5, "sigma": 0.5}, "good"),
         ({"prior": sf.Normal(0.9, 0.05)}, "good"),
@@ -66,41 +62,23 @@ def test_good_fits_are_good():
 )
 def test_level_and_share_that_is_explained_are_those_of_a_single_fit(settings, level):
     problem = room(**settings)
-    single = sf.estimate(problem, strategy="local")
-    many = sf.estimate_many([problem])
-    assert single.verdict.level == level
-    assert many.levels.tolist() == [level]
-    assert many.verdict.level == many.levels[0]
+    single, many = sf.estimate(problem, strategy="local"), sf.estimate_many([problem])
+    assert single.verdict.level == many.verdict.level == many.levels[0] == level
     assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-9)
-
-
-def test_the_share_of_a_reference_is_that_of_a_single_fit():
-    signal = sf.ReferenceSignal.from_samples(np.r_[0.0, TIMES], np.r_[0.2, wave(0.1)][:, None])
-    problem = sf.Problem(ROOM, sf.Experiment(signal, ("on", "off"), (1.7,), 0.0, 6.0), {"k": 1.0})
-    single = sf.estimate(problem, strategy="local")
-    many = sf.estimate_many([problem, problem])
-    assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-3)
-    assert many.verdict.level == single.verdict.level == "doubtful"
-    assert "little of the variance is explained in 2 of 2 fits" in str(many.verdict)
-
-
-def test_a_cost_without_data_has_no_share():
-    cost = sf.RunningCost(lambda t, x, p: (x[0] - 0.8) ** 2)
-    k = sf.Parameter(0.8, fixed=True)
-    many = sf.estimate_many([sf.Problem(ROOM, sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, 6.0), {"k": k})])
-    assert np.isnan(many.explained).all()
-    assert str(many.verdict) == "Good: 1 good of 1 fit."
 
 
 def test_one_bad_fit_among_many_is_named_and_all_are_bad_where_half_of_them_are():
     problems = [room(wave(1.0)) if seed < 3 else room(seed=seed) for seed in range(6)]
     assert sf.estimate_many(problems).verdict.level == "bad"
     many = sf.estimate_many(problems[2:])
-    assert np.flatnonzero(many.levels == "bad").tolist() == [0]
+    assert many.levels.tolist() == ["bad", "good", "good", "good"]
     said = str(many.verdict)
     assert said.startswith("Doubtful: 3 good and 1 bad of 4 fits; the model is far from the data in ")
     assert "(fit 0 explains" in said
     assert said.endswith("fit problem 0 by itself with sf.estimate.")
+    good = sf.estimate_many(problems[3:])
+    assert str(good).startswith(str(good.verdict))
+    assert str(good).startswith("Good: 3 good of 3 fits, explaining 99.")
 
 
 def test_chi_square_is_shared_among_the_fits():
@@ -118,9 +96,15 @@ def test_collapsed_modes_are_counted():
     cold = 0.2 * np.exp(-0.8 * TIMES)
     many = sf.estimate_many([room(cold, guess=(1.0, 1.0), upper=1.1, seed=seed) for seed in range(3)])
     assert (many.collapsed == 1).any()
-    assert many.verdict.level == "doubtful"
-    assert "some a mode collapsed" in kinds(many)
-    assert "modes collapsed in" in str(many.verdict)
+    assert (many.verdict.level, "some a mode collapsed" in kinds(many)) == ("doubtful", True)
+
+
+@pytest.mark.parametrize(("failed", "level"), [(2, "good"), (3, "doubtful"), (99, "doubtful"), (100, "bad")])
+def test_a_hundredth_of_a_study_may_fail_and_an_integration_error_counts(study, failed, level):
+    status = study.status.astype(object)
+    status[:failed] = "MAX_ITERATIONS"
+    assert replace(study, status=status.astype(str), integration_error=9e-4).verdict.level == level
+    assert replace(study, integration_error=1.1e-3).verdict.level == "bad"
 
 
 def test_a_short_mode_is_one_of_its_horizon_wherever_the_clock_begins():
@@ -152,8 +136,7 @@ def test_a_study_with_more_noise_than_sigma_says_so():
 def test_an_end_in_another_minimum_is_found(study):
     theta = study.theta.copy()
     theta[17] += 30 * study.standard_deviation
-    away, every = replace(study, theta=theta), np.ones(theta.shape[1], dtype=bool)
-    assert np.flatnonzero(measure_distances(away, every) > FAR_AWAY).tolist() == [17]
+    away = replace(study, theta=theta)
     assert away.verdict.level == "doubtful"
     assert "1 of 200 fits ended in another minimum, fit 17 farthest off" in str(away.verdict)
 
@@ -165,14 +148,8 @@ def test_a_hundredth_of_a_study_may_fail(study, failed, level):
     assert replace(study, status=status.astype(str)).verdict.level == level
 
 
-def test_an_integration_error_counts(study):
-    assert replace(study, integration_error=9e-4).verdict.level == "good"
-    assert replace(study, integration_error=1.1e-3).verdict.level == "bad"
-
-
 def test_a_bootstrap_of_a_bad_fit_is_bad():
     found = sf.bootstrap(sf.estimate(room(wave(1.0)), strategy="local"), 20)
-    assert found.origin.level == "bad"
     assert found.verdict.level == "bad"
     assert str(found).startswith("Bad: the fit that was resampled is bad")
     fine = sf.bootstrap(sf.estimate(room(wave(0.03)), strategy="local"), 20)
@@ -197,7 +174,6 @@ def test_many_starts_have_the_verdict_of_the_best_and_say_how_many_found_it():
     assert found.verdict.level == found.best.verdict.level == "good"
     looked = found.verdict.answers[1]
     assert looked.figures["agreeing"] == np.sum(found.clusters == 0) - 1
-    assert str(found).startswith("Good: ")
     assert replace(found, best=None).verdict.level == "bad"  # no start could be fitted
 
 

@@ -1,16 +1,11 @@
 """Zero times what is not finite is not a number, in machine code as in JAX."""
 
-from __future__ import annotations
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.engine.native.trace import trace_scalars
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.1, 1.0, 5)
 GOOD, BAD = 0.5, -0.5
@@ -83,35 +78,8 @@ def test_simulations_see_it_too():
     problem = problem_of(plain, observe=lambda t, x, p: x[:1] + 0.0 * jnp.log(p["b"]))
     theta = problem.initial_theta
     theta[-1] = BAD
-    assert np.isnan(evaluator_of(problem).cost(theta))
     sf.simulate(problem, theta)  # the states are finite
     with pytest.raises(ValueError, match=r"initial_state .* not finite"):
         sf.simulate(problem_of(plain, initial=lambda p: jnp.ones(2) + 0.0 * jnp.log(p["b"])), theta)
     with pytest.raises(ValueError, match="mode 'one' returned"):
         sf.simulate(problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.log(p["b"])), theta)
-
-
-# What is presumed
-
-
-def presumed(function, *shapes):
-    with use_float64():
-        return {node.op for node in trace_scalars(function, *shapes).presumed}
-
-
-@pytest.mark.parametrize(
-    ("function", "ops"),
-    [
-        (lambda x: [0.0 * jnp.log(x)], {"log"}),
-        (lambda x: [0.0 * jnp.sin(x)], set()),
-        (lambda x: [0.0 * (x * x + 1.0) * jnp.tanh(x)], set()),
-        (lambda x: [0.0 * (1.0 + jnp.sqrt(jnp.log(x)))], {"sqrt", "log"}),
-        (lambda x: [0.0 / x], {"div"}),
-        (lambda x: [0.0 / (jnp.cos(x) + 2.0)], {"div"}),
-        (lambda x: [x / 3.0 * 0.0], set()),
-        (lambda x: [jax.jacfwd(lambda x: x[0] * jnp.exp(x[1]))(jnp.stack([x, 2.0 * x]))], {"exp"}),
-        (lambda x: [jnp.log(x)], set()),
-    ],
-)
-def test_what_has_to_be_finite(function, ops):
-    assert presumed(function, ()) == ops
