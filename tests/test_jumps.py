@@ -16,7 +16,7 @@ from switchfit.fit.solution import idle_unknowns
 from switchfit.io.command_line import summarize_estimate
 from switchfit.io.problem_file import load_problem, read_experiments
 from switchfit.problem.functions import use_float64
-from switchfit.report.html.page import collect_curves
+from switchfit.report.html.curves import collect_curves
 from switchfit.report.text import write_experiments
 from switchfit.strategy.known_order import find_times
 

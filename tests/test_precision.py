@@ -41,7 +41,6 @@ WITH_LINE = r"a constant of mode 'on' \(test_precision.py:\d+\) must be in doubl
         ({"mode": lambda t, x, p: -DRAG[1] * x}, WITH_LINE + "0.3 became 0.3000000119"),
         ({"mode": lambda t, x, p: -HALF * x}, WITH_LINE + r".*\(bfloat16\)"),
         ({"mode": lambda t, x, p: jax.lax.fori_loop(0, 2, lambda k, y: y - DRAG[1] * x, x)}, "a constant of mode 'on'"),
-        ({"mode": Body()}, "a constant of mode 'on'"),
         ({"mode": lambda t, x, p: -jnp.float32(0.3) * x}, "a constant of mode 'on'.*0.3 became"),
         ({"reset": scaled}, r"a constant of reset map \('on', 'off'\)"),
         ({"initial_state": lambda p: jnp.ones(1) * K}, "a constant of initial_state"),

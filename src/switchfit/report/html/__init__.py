@@ -1,8 +1,8 @@
 """Results as HTML: in a notebook, their text with a small figure below; the report of a fit as one file.
 
 The file needs no network: templates of Jinja2, figures of Bokeh where sliders move them, of Matplotlib elsewhere. Both
-libraries come with the extra ``report``. They, and `page`, which puts the file together, are
-imported when a page is made, not with switchfit.
+libraries come with the extra ``report``. They, `page`, which puts the file together and draws what moves, and `curves`,
+which prepares its numbers, are imported when a page is made, not with switchfit.
 """
 
 from __future__ import annotations

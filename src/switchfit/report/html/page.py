@@ -1,14 +1,12 @@
-"""The page: what the templates show, and the JSON from which the page's script draws figures with Bokeh.
+"""The page: what the templates show, and the JSON that the page's script turns into figures.
 
 Import this only where Bokeh and Jinja2 are installed.
 
-The numbers of a run are thinned to what can be seen, with their derivatives in the unknowns that move them. They are in
-columns by the names that the script puts into the sources of the figures. It keeps what sliders move (t, y0.., x, left,
-right) as fit_t, fit_y0.. as well. Tangents and bands are float32.
+Figures of a page, drawn with Bokeh. Import this only where Bokeh is installed.
 
-The curves move by their derivatives, ``x(t; theta + d) ~ x + S d``. J along one unknown, the others held, is
-evaluated, and shows beside its quadratic approximation how far derivatives hold; where several are moved, J is that
-approximation, ``J + g d + d' H d / 2``.
+The figures of runs are drawn without numbers, which the page's script puts into the sources by their names. Colours
+that have to change with the reader's light or dark background carry the tag "ink", "muted" or "edge"; the script sets
+them, and those of axes.
 """
 
 from __future__ import annotations
@@ -16,41 +14,237 @@ from __future__ import annotations
 import base64
 import gzip
 import io
-import itertools
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jinja2
 import numpy as np
+from bokeh import models
+from bokeh.core.serialization import Serializer
+from bokeh.embed import json_item
+from bokeh.layouts import column
+from bokeh.plotting import figure
 from bokeh.resources import Resources
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.formats import (
-    describe_clock,
-    format_span,
-    format_unit,
-    get_unit,
-    label_quantity,
-    label_time,
-    list_dated,
+from switchfit.report.formats import Timed, describe_clock, format_span, label_quantity, label_time
+from switchfit.report.html.curves import (
+    Columns,
+    Curves,
+    build_sliders,
+    choose_points,
+    collect_curves,
+    drop_nan,
+    list_places,
+    list_spans,
+    list_transitions,
 )
-from switchfit.report.plot import choose_mode_colours, find_plane, has_bands, replace_infinities
+from switchfit.report.plot import choose_mode_colours, find_plane
 from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.prediction import Points, predict
-from switchfit.uncertainty.residuals import explain_worst, find_transition_intervals, rank_runs
+from switchfit.uncertainty.residuals import explain_worst, rank_runs
 from switchfit.uncertainty.verdict import find_issues
+
+FIT, DATA = "#d0392b", "#5b6470"
+"""Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
+HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SLICE_HEIGHT = 270, 130, 420, 230
+LEFT = 78
+"""Pixels to the left of all axes, so that figures below one another share their times."""
+UNBROKEN = {"break-inside": "avoid"}
+"""A channel is printed on one page."""
+WIDE: dict[str, Any] = {"sizing_mode": "stretch_width"}
+TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
+UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
+DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
+DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
+"""Of shades below the curves, of what was measured, and of what it is compared with."""
+DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
+"""Of up to so many samples."""
+LABELS = {"measurements": "measured", "reference": "reference"}
+
+
+def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> Any:
+    """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
+
+    Parameters
+    ----------
+    curves : sequence of Curves
+        Of one of the runs that share the drawing.
+    columns : mapping of name to columns
+        Of the same run, by the names of their sources.
+    run : Timed
+    """
+    sources = {name: make_source(name, own) for name, own in columns.items()}
+    times = models.Range1d(name="times")
+    blocks: list[Any] = []
+    for c, own in enumerate(curves):
+        curve, samples = sources[f"curve-{c}"], sources.get(f"samples-{c}")
+        for k, name in enumerate(own.names):
+            panel = _make_time_figure(HEIGHT, times, label_quantity(name, own.units[k]), sources, run)
+            line = _draw_curve(panel, own, k, curve)
+            parts = [panel]
+            if samples is not None:
+                _draw_samples(panel, own, k, samples, run)
+                below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual", sources, run)
+                below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
+                _draw_residuals(below, own, k, samples)
+                panel.xaxis.visible = False
+                parts.append(below)
+            parts[-1].xaxis.axis_label.text = label_time(run)
+            _add_hover(panel, line, [("fitted", f"@y{k}{{%.6g}}"), ("mode", "@mode")], run)
+            _put_legend_above(panel)
+            blocks.append(column(*parts, name=f"channel-{c}-{k}", spacing=0, styles=UNBROKEN, **WIDE))
+        if samples is not None and (plane := find_plane(own.names, own.units)) is not None:
+            blocks.append(_draw_path(own, plane, curve, samples))
+    return column(*blocks, spacing=6, **WIDE)
+
+
+def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
+    """Return a source with the columns, and those of the fit that the page's script keeps, but none of their numbers.
+
+    Parameters
+    ----------
+    name : str
+    columns : iterable of str
+    """
+    return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
+
+
+def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
+    """Return an empty figure with the labels of its axes."""
+    frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": LEFT, "min_border_right": 10}
+    plot = figure(height=height, tools=TOOLS, active_drag="box_zoom", toolbar_location="right", **frame, **settings)
+    plot.toolbar.logo = None
+    plot.toolbar.autohide = True
+    plot.background_fill_color = plot.outline_line_color = None
+    plot.xaxis.axis_label, plot.yaxis.axis_label = models.PlainText(text=x), models.PlainText(text=y)
+    return plot
+
+
+def _make_time_figure(
+    height: int, times: models.Range1d, label: str, sources: Mapping[str, models.ColumnDataSource], run: Timed
+) -> Any:
+    """Return a figure over time with the modes shaded, and the transition times in their intervals."""
+    plot = _make_figure(height, "", label, x_range=times)
+    plot.xgrid.visible = False
+    plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
+    clock = describe_clock(run)
+    if clock is not None:
+        find = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
+        label = "return switchfitDates.label(tick, ticks, start, length, zone)"
+        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=find)
+        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=label)
+    plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
+    own = sources["transitions"]
+    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
+    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
+    if height > RESIDUAL_HEIGHT:
+        tips = [("transition", "@name"), ("modes", "@modes"), ("time", "@value"), ("95 %", "@interval")]
+        _add_hover(plot, line, tips)
+    return plot
+
+
+def _put_legend_above(plot: Any) -> None:
+    """Move the legend out of the way of the data; a click on an entry hides what it stands for."""
+    plot.legend.click_policy = "hide"
+    plot.legend.orientation = "horizontal"
+    plot.add_layout(plot.legend[0], "above")
+
+
+def _tag(renderer: Any, tag: str) -> Any:
+    """Let the page's script colour a glyph."""
+    renderer.glyph.tags = [tag]
+    return renderer
+
+
+def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
+    """Show (label, column) under the pointer, and the time of a run before them.
+
+    Bokeh escapes what is in columns, but neither labels nor units.
+    """
+    formatters: dict[str, Any] = {text.partition("{")[0]: "printf" for _, text in tips if "%" in text}
+    if run is not None:
+        clock, unit = describe_clock(run), run.time_unit
+        plain = unit if unit.isalnum() and unit != "1" else ""
+        tips = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
+        code = "return switchfitDates.show(value, 0.001, start, length, zone)"
+        formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
+    tool = models.HoverTool(renderers=[renderer], tooltips=list(tips), formatters=formatters, visible=False)
+    plot.add_tools(tool)
+
+
+def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
+    """Draw what is fitted: its band, the fit itself that is shown once something has been moved; return what moves."""
+    if "lo0" in curves.curve:
+        band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
+        plot.varea(x="fit_t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
+    still = _tag(plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED), "muted")
+    still.name, still.visible = "still", False
+    return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
+
+
+def _draw_measured(
+    plot: Any, curves: Curves, x: str, y: str, source: models.ColumnDataSource, *, scale: float = 1.0, **legend: Any
+) -> Any:
+    """Draw what is measured as dots, or a reference signal as a dashed line."""
+    if curves.kind == "reference":
+        return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
+    size = next(size for most, size in DOT_SIZES.items() if len(curves.samples["t"]) <= most)
+    return _tag(plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend), "ink")
+
+
+def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
+    drawn = _draw_measured(plot, curves, "t", f"m{k}", source, legend_label=LABELS[curves.kind])
+    if "o0" in curves.samples:
+        label = "weighed down"
+        plot.scatter("t", f"o{k}", source=source, size=11, fill_color=None, line_color=FIT, legend_label=label)
+    tips = [(LABELS[curves.kind], f"@m{k}{{%.6g}}"), ("residual", f"@y{k}{{%.6g}}")]
+    _add_hover(plot, drawn, tips, run)
+
+
+def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
+    plot.hspan(y=0.0, line_color=FIT, line_width=1)
+    for side in ("s", "n") if "s0" in curves.samples else ():
+        _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
+    _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
+
+
+def _draw_path(
+    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource
+) -> Any:
+    """Draw two positions against one another, with the transitions on the fitted path."""
+    x, y = plane
+    labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
+    plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
+    _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
+    plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
+    mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
+    _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
+    _put_legend_above(plot)
+    return plot
+
+
+def draw_slice() -> Any:
+    """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
+    plot = _make_figure(SLICE_HEIGHT, "", "rise of J")
+    plot.xaxis.axis_label.name = "slice-label"
+    source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
+    plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")
+    _tag(plot.line("x", "quadratic", source=source, legend_label="quadratic", **DASHED), "muted")
+    _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
+    plot.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
+    plot.xaxis.ticker.desired_num_ticks = 4  # labels of dates are long
+    plot.xaxis.formatter = models.CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
+    _put_legend_above(plot)
+    return plot
+
 
 MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
@@ -88,7 +282,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
         drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
     if any(record.optimality > 0 for record in estimate.history):
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
-    library = "".join(Resources(mode="inline", components=["bokeh", "bokeh-api"]).js_raw)
+    library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
     content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
@@ -110,12 +304,8 @@ def _compress_svg(figure: Figure) -> str:
 
 
 def _write_json(value: Any) -> str:
-    """Return JSON that can stand inside a script element; arrays as their bytes in base64, with the type of numbers."""
-
-    def pack(array: Any) -> dict[str, str]:
-        return {"dtype": array.dtype.str, "data": base64.b64encode(array.tobytes()).decode()}
-
-    written = json.dumps(value, allow_nan=False, separators=(",", ":"), default=pack)
+    """Return JSON that can stand inside a script element."""
+    written = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -129,41 +319,37 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
     curves = {e: collect_curves(estimate, e, places[e], points) for e in order}
     colours = choose_mode_colours(estimate.trajectories, lines=True)
+    templates: dict[str, Any] = {}
+    layouts: dict[Any, str] = {}
+    figures: list[dict[str, Any]] = []
+    for e in order:
+        run, own = estimate.trajectories[e], curves[e]
+        sources = {"modes": list_spans(estimate, e, colours), "transitions": list_transitions(estimate, e)}
+        for c, part in enumerate(own):
+            sources |= {f"curve-{c}": part.curve} | ({f"samples-{c}": part.samples} if part.samples else {})
+        # What two runs have to share to be shown by the same drawing, which takes Bokeh a tenth of a second, while its
+        # numbers take a thousandth; tangents are not drawn.
+        drawn = ((c.names, c.units, c.kind, *(key for key in (*c.curve, *c.samples) if key[0] != "d")) for c in own)
+        template = layouts.setdefault((run.time_unit, run.origin, *drawn), f"run-{len(layouts)}")
+        if template not in templates:
+            templates[template] = json_item(draw_run(own, sources, run=run))
+        first, last = float(run.times[0]), float(run.times[-1])
+        margin = MARGIN * (last - first)
+        written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
+        ranges = {"times": {"start": first - margin, "end": last + margin}}
+        figures.append({"template": template, "sources": written, "ranges": ranges})
     sliders: list[dict[str, Any]] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
         movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
         sliders = build_sliders(estimate, curves, list(movable))
+        templates |= {"slice": json_item(draw_slice())} if sliders else {}
     moved = [slider["place"] for slider in sliders]
     for slider in sliders:
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
     derivatives = {"gradient": estimate.gradient[moved], "hessian": estimate.hessian[np.ix_(moved, moved)]}
     costs = {name: drop_nan(value) for name, value in {"cost": estimate.cost, **derivatives}.items()}
-    payload = {"runs": [_prepare_run(estimate, e, curves[e], colours) for e in order], "sliders": sliders, **costs}
+    payload = {"templates": templates, "runs": figures, "sliders": sliders, **costs}
     return [_describe_run(estimate, e, curves[e], colours) for e in order], payload
-
-
-def _prepare_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
-    """Return what the page's script draws of a run: the columns of its sources, and what the curves are."""
-    run = fit.trajectories[e]
-    sources: dict[str, Columns] = {"modes": list_spans(fit, e, colours), "transitions": list_transitions(fit, e)}
-    for c, own in enumerate(curves):
-        sources |= {f"curve-{c}": own.curve} | ({f"samples-{c}": own.samples} if own.samples else {})
-    first, last = float(run.times[0]), float(run.times[-1])
-    margin = MARGIN * (last - first)
-    drawn: list[dict[str, Any]] = []
-    for part in curves:
-        plane = find_plane(part.names, part.units) if part.samples else None
-        labels = list(map(label_quantity, part.names, part.units))
-        drawn.append({"kind": part.kind, "labels": labels, "plane": plane})
-    # Bokeh escapes what is in columns, but no units in tips.
-    unit = run.time_unit if run.time_unit.isalnum() and run.time_unit != "1" else ""
-    times = {
-        "label": label_time(run),
-        "unit": unit,
-        "clock": describe_clock(run),
-        "range": [first - margin, last + margin],
-    }
-    return {"sources": sources, "curves": drawn, "times": times}
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
@@ -183,319 +369,3 @@ def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[s
         "channels": channels,
         "curves": curves,
     }
-
-
-# --- the numbers of the figures ---------------------------------------------------------------------------------------
-
-MOST_POINTS, FEWEST_POINTS = 800, 80
-"""Points of one curve: with more of them a figure looks the same."""
-MOST_SAMPLES = 2000
-"""Samples of one channel that are drawn."""
-BUDGET = 300_000
-"""Numbers that the curves of all runs may have together, with their derivatives: 1.6 MB in the page."""
-
-
-Columns = Mapping[str, Any]
-"""Numbers by the names that they have in the page."""
-
-
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """One of the data of a run, or its states: a curve of Q channels, and what was measured of it.
-
-    Attributes
-    ----------
-    names, units : tuple of str, one a channel
-    kind : {"measurements", "reference", "states"}
-    curve : mapping of name to (L,)
-        Times t, with NaN where a transition breaks the curve, and mode. Of channel k the values y{k}, the 95 %
-        confidence band from lo{k} to hi{k}, if there is one, and the derivatives d{i}_{k} in theta[i] at a fixed time.
-    samples : mapping of name to (K,)
-        Empty for states. Times t; of channel k what is measured, m{k}, its residuals y{k}, sigma s{k} and n{k} = -s{k},
-        outliers o{k}, and the derivatives d{i}_{k} of the residuals.
-    left_out : int
-        Samples that are not drawn.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    kind: str
-    curve: Columns
-    samples: Columns = field(default_factory=dict)
-    left_out: int = 0
-
-
-def list_places(estimate: Estimate, e: int) -> list[int]:
-    """Return the places in theta of the unknowns that move the curves of a run; nothing where the model is not there.
-
-    Delays move their curve in time, and are left out.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    e : int
-    """
-    if estimate.problem is None:
-        return []
-    run, places = estimate.problem.experiments[e], estimate.problem.places[e]
-    delays = [run.parameter_map.get(item.delay, item.delay) for item in run.measurements]
-    return [place for place in sorted(set(places[places >= 0].tolist())) if estimate.theta_names[place] not in delays]
-
-
-def choose_points(estimate: Estimate, runs: Sequence[int], unknowns: int) -> int:
-    """Return how many points a curve may have, so that all of them stay in the `BUDGET`.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    runs : sequence of int
-        Which are shown.
-    unknowns : int
-        That a run depends on, at most.
-    """
-    states = sum(estimate.trajectories[e].states.shape[1] for e in runs)
-    channels = states + sum(len(comparison.names) for e in runs for comparison in estimate.comparisons[e])
-    return int(np.clip(BUDGET / max(channels * (unknowns + 4), 1), FEWEST_POINTS, MOST_POINTS))
-
-
-def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: int) -> list[Curves]:
-    """Return the curves of one run: an entry for each of its data, then the states that are not measured by name.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    e : int
-        Which run, from 0.
-    places : sequence of int
-        Unknowns whose derivatives are wanted.
-    points : int
-        Of one curve.
-    """
-    trajectory = estimate.trajectories[e]
-    has_slopes = estimate.problem is not None and estimate.has_room_for_sensitivities()
-    nodes = estimate.sensitivities[e].nodes if has_slopes else None
-    times = trajectory.times if nodes is None else nodes.times
-    segments = np.concatenate([[0], np.flatnonzero(np.diff(times) == 0) + 1, [len(times)]])
-    if len(segments) != len(trajectory.pieces):  # a mode without duration: other meshes have other nodes there
-        times, nodes, segments = trajectory.times, None, trajectory.pieces
-    values, slopes, band = _stack_outputs_and_states(estimate, e, nodes)
-    kept, breaks = _thin(segments, points)
-    modes = np.repeat([trajectory.modes[start] for start in trajectory.pieces[:-1]], np.diff(segments))[kept]
-
-    def at_nodes(values: FloatArray) -> FloatArray:
-        """Thin values at the nodes (L,), and break them at transitions."""
-        return replace_infinities(np.insert(values[kept], breaks, np.nan))
-
-    def list_curve(columns: Sequence[int], late: float) -> dict[str, Any]:
-        curve: dict[str, Any] = {"t": np.insert(times[kept], breaks, np.nan) + late}
-        curve["mode"] = np.insert(modes.astype(object), breaks, "").tolist()
-        for k, column in enumerate(columns):
-            curve[f"y{k}"] = at_nodes(values[:, column])
-            if band is not None:
-                low, high = (at_nodes(edge).astype("f4") for edge in band[:, column].T)
-                curve |= {f"lo{k}": low, f"hi{k}": high}
-            if slopes is not None:
-                curve |= {f"d{i}_{k}": at_nodes(slopes[:, column, i]).astype("f4") for i in places}
-        return curve
-
-    found, first = [], 0
-    for comparison in estimate.comparisons[e]:
-        names, units = comparison.names, [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
-        columns = range(first, first := first + len(names))
-        late = float(comparison.curve_times[0] - trajectory.times[0])
-        count = len(comparison.times)
-        drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
-        if comparison.kind == "reference" and count == len(times):
-            drawn = kept
-        curve = list_curve(columns, late)
-        if find_plane(names, units) is not None:
-            before_breaks = np.append(False, np.isnan(curve["t"][:-1]))
-            curve["size"] = np.where(before_breaks, 13.0, 0.0).astype("f4")
-        moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late)
-        samples = _list_samples(comparison, drawn, moved, places)
-        left_out = count - len(drawn) if comparison.kind == "measurements" else 0
-        found.append(Curves(names, tuple(units), comparison.kind, curve, samples, left_out))
-    measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
-    hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
-    if hidden:
-        names, given = (tuple(own[k] for k in hidden) for own in (trajectory.state_names, trajectory.state_units))
-        found.append(
-            Curves(names, tuple(map(format_unit, given)), "states", list_curve([first + k for k in hidden], 0))
-        )
-    return found
-
-
-def _list_samples(
-    comparison: Comparison, drawn: NDArray[np.intp], slopes: FloatArray | None, places: Sequence[int]
-) -> Columns:
-    """Return the columns of the samples that are drawn; the slopes (K, Q, d) are those of what is fitted."""
-    columns: dict[str, Any] = {"t": comparison.times[drawn]}
-    for k in range(len(comparison.names)):
-        measured, fitted = (replace_infinities(own[drawn, k]) for own in (comparison.measured, comparison.fitted))
-        columns |= {f"m{k}": measured, f"y{k}": measured - fitted}
-        if comparison.sigma is not None:
-            sigma = replace_infinities(comparison.sigma[drawn, k])
-            columns |= {f"s{k}": sigma, f"n{k}": -sigma}
-        if comparison.downweighted is not None:
-            columns[f"o{k}"] = np.where(comparison.downweighted[drawn, k], measured, np.nan)
-        if slopes is not None:
-            columns |= {f"d{i}_{k}": -replace_infinities(slopes[:, k, i]).astype("f4") for i in places}
-    return columns
-
-
-def _stack_outputs_and_states(
-    estimate: Estimate, e: int, nodes: Points | None
-) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
-    """Return all outputs and then all states of a run, their derivatives in theta, and their bands.
-
-    Without derivatives those of the fit, and no bands; bands need a covariance as well.
-    """
-    if nodes is None:
-        return np.hstack([*(c.curve for c in estimate.comparisons[e]), estimate.trajectories[e].states]), None, None
-    values, slopes = np.hstack([nodes.outputs, nodes.states]), np.hstack([nodes.outputs_d, nodes.states_d])
-    if not has_bands(estimate):
-        return values, slopes, None
-    prediction = predict(estimate, experiment=e)
-    return values, slopes, np.hstack([prediction.output_band(), prediction.state_band()])
-
-
-def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return which nodes are kept, the ends of all segments among them, and before which of these a curve breaks."""
-    stride = max(-(-int(segments[-1]) // points), 1)
-    parts = [
-        np.unique(np.concatenate([np.arange(start, end, stride), [end - 1]]))
-        for start, end in itertools.pairwise(segments.tolist())
-    ]
-    return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
-
-
-def _find_sample_slopes(
-    comparison: Comparison, nodes: Points, columns: Sequence[int], drawn: NDArray[np.intp], late: float
-) -> FloatArray:
-    """Return the derivatives of what is fitted at the samples that are drawn, all of them nodes unless late: (K, Q, d).
-
-    At a transition, that just before it.
-    """
-    nearest = np.minimum(np.searchsorted(nodes.times, comparison.times[drawn] - late), len(nodes.times) - 1)
-    is_every_node = comparison.kind == "reference" and len(comparison.times) == len(nodes.times)
-    return nodes.outputs_d[drawn if is_every_node else nearest][:, columns]
-
-
-def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
-    """Return the modes of one run: left, right, colour, the places in theta of the ends, -1 where these are known.
-
-    Parameters
-    ----------
-    fit : Fit
-    e : int, from 0
-    colours : mapping of mode to colour
-    """
-    modes, left, right = zip(*fit.trajectories[e].mode_spans, strict=True)
-    places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
-    ends = {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
-    return {"left": np.array(left), "right": np.array(right), "colour": [colours[mode] for mode in modes], **ends}
-
-
-def list_transitions(fit: Fit, e: int) -> Columns:
-    """Return the transitions of one run: x, the ends of its interval, names, places in theta.
-
-    Parameters
-    ----------
-    fit : Fit
-    e : int, from 0
-    """
-    low, high = find_transition_intervals(fit, e).T
-    own = [t for t in fit.transitions if t.experiment == e]
-    words = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
-    times = np.array([t.time for t in own], dtype=float)
-    return {"x": times, "low": low, "high": high, **words, "place": [-1 if t.index is None else t.index for t in own]}
-
-
-SIDE_POINTS = 20
-"""Values of J to each side of the estimate."""
-VISIBLE = 0.15
-"""Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
-
-
-def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
-    """Return what the page knows of a slider, for each unknown that has room to move.
-
-    Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
-    held, None where it cannot be evaluated.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        With its problem.
-    runs : mapping of run to its curves
-        Those that are shown.
-    places : sequence of int
-        The unknowns.
-    """
-    found = []
-    for place in places:
-        (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
-        if not low < high:
-            continue
-        sides = np.linspace(low, theta, SIDE_POINTS + 1), np.linspace(theta, high, SIDE_POINTS + 1)
-        values = np.unique(np.concatenate(sides))
-        costs = np.array([evaluate_moved(estimate, place, value) for value in values])
-        run = list_dated(estimate)[place]
-        slider = {"place": place, "name": estimate.theta_names[place], "theta": theta}
-        slider |= {"clock": run and describe_clock(run), "unit": format_unit(estimate.theta_units[place])}
-        found.append({**slider, "values": drop_nan(values), "costs": drop_nan(costs)})
-    return found
-
-
-def drop_nan(values: Any) -> Any:
-    """Return a number or an array for JSON, with None for what is not finite."""
-    return np.where(np.isfinite(values), values, np.array(None)).tolist()
-
-
-def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
-    """Return how far an unknown can be moved: until a curve has moved visibly, inside its bounds, in its order.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    runs : mapping of run to its curves
-    place : int
-    """
-    theta = float(estimate.theta[place])
-    wanted = []
-    for own in (own for run in runs.values() for own in run if f"d{place}_0" in own.curve):
-        for k in range(len(own.names)):
-            known = own.curve[f"y{k}"][np.isfinite(own.curve[f"y{k}"])]
-            slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
-            if len(known) and np.ptp(known) > 0 and slope > 0:
-                wanted.append(VISIBLE * float(np.ptp(known)) / slope)
-    half = min(wanted, default=0.0) or 0.1 * abs(theta) or 1.0
-    constraints = estimate.evaluator_at_solution().problem.constraints
-    slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
-    room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
-    low = max(theta - np.min(room[slopes > 0], initial=half), float(estimate.lower[place]))
-    high = min(theta + np.min(room[slopes < 0], initial=half), float(estimate.upper[place]))
-    return low, high
-
-
-def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
-    """Return J with one unknown moved, by evaluating the runs that depend on it.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    place : int
-    value : float
-    """
-    evaluator = estimate.evaluator_at_solution()
-    problem = evaluator.problem
-    moved = estimate.theta.copy()
-    moved[place] = value
-    runs = [e for e, places in enumerate(problem.places) if place in places]
-
-    def add_up(theta: FloatArray) -> float:
-        costs = [evaluator.engines[e].cost(*problem.vectors(theta, e)) for e in runs]
-        return sum(costs) + float(problem.unknowns.priors.evaluate(theta)[0])
-
-    total = estimate.cost + add_up(moved) - add_up(estimate.theta)
-    return float(total) if np.isfinite(total) else np.nan

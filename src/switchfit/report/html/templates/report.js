@@ -126,185 +126,28 @@ window.switchfitDates = switchfitDates;
     }
   }
 
-  // --- drawing -------------------------------------------------------------------------------------------------------
-  // Colours that change with the reader's light or dark background carry the tag "ink", "muted" or "edge"; `paint` sets
-  // them, and those of axes. Sources have names, by which sliders find them.
-
-  const FIT = "#d0392b", DATA = "#5b6470"; // of what is fitted; of what is measured, until it is painted
-  const LABELS = { measurements: "measured", reference: "reference" };
-  const DASHED = { line_color: DATA, line_dash: "dashed" };
-  const UNDERLAY = { line_color: null, level: "underlay" };
-  const RESIDUAL_HEIGHT = 130;
-  const SIX = "{" + "%.6g}"; // six digits; in two parts, since this file is a template
-
-  // Arrays of JSON, or the bytes of numbers.
-  function unpackNumbers(packed) {
-    if (Array.isArray(packed)) return packed;
-    const bytes = Uint8Array.from(atob(packed.data), (letter) => letter.charCodeAt(0));
-    return packed.dtype === "<f4" ? new Float32Array(bytes.buffer) : new Float64Array(bytes.buffer);
-  }
-
-  // What sliders move is kept as it was fitted, too.
-  function makeSource(name, columns) {
-    const data = Object.fromEntries(Object.entries(columns).map(([key, values]) => [key, unpackNumbers(values)]));
-    for (const key of Object.keys(data)) if (/^(t|y\d+|x|left|right)$/.test(key)) data[`fit_${key}`] = data[key];
-    return new Bokeh.ColumnDataSource({ data, name });
-  }
-
-  // Draw a glyph; of its settings, columns are given as {field: name}.
-  function draw(plot, kind, source, settings, tag) {
-    const renderer = plot[kind]({ source, ...settings });
-    if (tag) renderer.glyph.tags = [tag];
-    return renderer;
-  }
-  const columns = (names) => Object.fromEntries(Object.entries(names).map(([key, field]) => [key, { field }]));
-
-  function makeFigure(height, x, y, more) {
-    const plot = Bokeh.Plotting.figure({
-      height, tools: "box_zoom,pan,wheel_zoom,reset,save", active_drag: "box_zoom", toolbar_location: "right",
-      sizing_mode: "stretch_width", min_border_left: 78, min_border_right: 10, // figures below one another share times
-      background_fill_color: null, outline_line_color: null, ...more,
-    });
-    plot.toolbar.setv({ logo: null, autohide: true });
-    plot.xaxes[0].axis_label = new Bokeh.PlainText({ text: x, name: "x-label" });
-    plot.yaxes[0].axis_label = new Bokeh.PlainText({ text: y });
-    return plot;
-  }
-
-  // Out of the way of the data; a click on an entry hides what it stands for.
-  function putLegendAbove(plot) {
-    plot.legend.setv({ click_policy: "hide", orientation: "horizontal" });
-    plot.add_layout(plot.legend, "above");
-  }
-
-  // Show (label, column) under the pointer, and the time of a run before them.
-  function addHover(plot, renderer, tips, times) {
-    const formatters = Object.fromEntries(tips.filter(([, text]) => text.includes("%")).map(([, text]) => [text.split("{")[0], "printf"]));
-    const tooltips = [...tips];
-    if (times) {
-      tooltips.unshift(["time", times.clock ? "@t{custom}" : `@t${SIX} ${times.unit}`.trim()]);
-      const code = "return switchfitDates.show(value, 0.001, start, length, zone)";
-      formatters["@t"] = times.clock ? new Bokeh.CustomJSHover({ args: times.clock, code }) : "printf";
+  // Put numbers into a copy of a drawing, by the names of its sources and ranges.
+  function fill(part, figure) {
+    if (Array.isArray(part)) return part.map((entry) => fill(entry, figure));
+    if (part === null || typeof part !== "object") return part;
+    const copy = Object.fromEntries(Object.entries(part).map(([key, value]) => [key, fill(value, figure)]));
+    const name = part.type === "object" && part.attributes && part.attributes.name;
+    if (name && figure.sources[name]) {
+      const { entries } = figure.sources[name];
+      const fit = entries.filter(([key]) => /^(t|y\d+|x|left|right)$/.test(key)).map(([key, values]) => [`fit_${key}`, values]);
+      copy.attributes.data = { type: "map", entries: [...entries, ...fit] };
     }
-    plot.add_tools(new Bokeh.HoverTool({ renderers: [renderer], tooltips, formatters, visible: false }));
+    if (name && figure.ranges[name]) Object.assign(copy.attributes, figure.ranges[name]);
+    if (name === "slice-label") copy.attributes.text = sliceLabel(); // there is no room for one that comes later
+    return copy;
   }
 
-  // A figure over time with the modes shaded, and the transition times in their intervals.
-  function makeTimeFigure(height, range, label, sources, times) {
-    const plot = makeFigure(height, "", label, { x_range: range });
-    plot.xgrids[0].visible = false;
-    plot.yaxes[0].ticker.desired_num_ticks = height > RESIDUAL_HEIGHT ? 5 : 3;
-    if (times.clock) {
-      const find = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)";
-      const write = "return switchfitDates.label(tick, ticks, start, length, zone)";
-      plot.xaxes[0].ticker = new Bokeh.CustomJSTicker({ args: times.clock, major_code: find });
-      plot.xaxes[0].formatter = new Bokeh.CustomJSTickFormatter({ args: times.clock, code: write });
-    }
-    const { modes, transitions } = sources;
-    draw(plot, "vstrip", modes, { ...columns({ x0: "left", x1: "right", fill_color: "colour" }), fill_alpha: 0.16, ...UNDERLAY });
-    draw(plot, "vstrip", transitions, { ...columns({ x0: "low", x1: "high" }), fill_color: DATA, fill_alpha: 0.18, ...UNDERLAY });
-    const line = plot.vspan({ field: "x" }, { source: transitions, line_color: DATA, line_width: 1.3 });
-    line.glyph.tags = ["ink"];
-    if (height > RESIDUAL_HEIGHT) addHover(plot, line, [["transition", "@name"], ["modes", "@modes"]]);
-    return plot;
-  }
-
-  // What is measured as dots, or a reference signal as a dashed line.
-  function drawMeasured(plot, kind, source, names, more = {}, scale = 1) {
-    if (kind === "reference") return draw(plot, "line", source, { ...columns(names), line_width: 1.6, ...DASHED, ...more }, "ink");
-    const count = source.data.t.length;
-    const size = scale * (count <= 150 ? 6 : count <= 600 ? 4 : 2.5);
-    return draw(plot, "scatter", source, { ...columns(names), size, fill_color: DATA, fill_alpha: 0.75, line_color: null, ...more }, "ink");
-  }
-
-  // What is fitted: its band, the fit itself that is shown once something has been moved, and what moves.
-  function drawCurve(plot, k, source) {
-    if ("lo0" in source.data) {
-      const band = columns({ x: "fit_t", y1: `lo${k}`, y2: `hi${k}` });
-      draw(plot, "varea", source, { ...band, fill_color: FIT, fill_alpha: 0.25, legend_label: "95 % band" });
-    }
-    const still = draw(plot, "line", source, { ...columns({ x: "fit_t", y: `fit_y${k}` }), line_width: 1.2, ...DASHED }, "muted");
-    still.setv({ name: "still", visible: false });
-    return draw(plot, "line", source, { ...columns({ x: "t", y: `y${k}` }), line_color: FIT, line_width: 2, legend_label: "fitted" });
-  }
-
-  function drawSamples(plot, below, kind, k, source, times) {
-    const label = LABELS[kind];
-    const drawn = drawMeasured(plot, kind, source, { x: "t", y: `m${k}` }, { legend_label: label });
-    if ("o0" in source.data) {
-      const ring = { size: 11, fill_color: null, line_color: FIT, legend_label: "weighed down" };
-      draw(plot, "scatter", source, { ...columns({ x: "t", y: `o${k}` }), ...ring });
-    }
-    addHover(plot, drawn, [[label, `@m${k}${SIX}`], ["residual", `@y${k}${SIX}`]], times);
-    below.yaxes[0].formatter = new Bokeh.PrintfTickFormatter({ format: "%.2g" });
-    below.hspan([0], { line_color: FIT, line_width: 1 });
-    for (const side of "s0" in source.data ? ["s", "n"] : []) {
-      draw(below, "line", source, { ...columns({ x: "t", y: `${side}${k}` }), line_color: DATA, line_dash: "dotted" }, "muted");
-    }
-    drawMeasured(below, kind, source, { x: "t", y: `y${k}` }, {}, 0.75);
-  }
-
-  // Two positions against one another, with the transitions on the fitted path.
-  function drawPath({ kind, labels, plane: [x, y] }, curve, samples) {
-    const plot = makeFigure(420, labels[x], labels[y], { match_aspect: true });
-    drawMeasured(plot, kind, samples, { x: `m${x}`, y: `m${y}` }, { legend_label: LABELS[kind] });
-    const path = columns({ x: `y${x}`, y: `y${y}` });
-    draw(plot, "line", curve, { ...path, line_color: FIT, line_width: 2, legend_label: "fitted" });
-    const mark = { marker: "diamond", size: { field: "size" }, fill_color: FIT, line_color: DATA, legend_label: "transition" };
-    draw(plot, "scatter", curve, { ...path, ...mark }, "edge");
-    putLegendAbove(plot);
-    return plot;
-  }
-
-  // The figures of one run below one another: each channel with its residuals, and the path in the plane.
-  function drawRun({ sources: given, curves, times }) {
-    const sources = Object.fromEntries(Object.entries(given).map(([name, own]) => [name, makeSource(name, own)]));
-    const [start, end] = times.range;
-    const range = new Bokeh.Range1d({ start, end });
-    const blocks = [];
-    const wide = { sizing_mode: "stretch_width" };
-    curves.forEach((own, c) => {
-      const [curve, samples] = [sources[`curve-${c}`], sources[`samples-${c}`]];
-      own.labels.forEach((label, k) => {
-        const panel = makeTimeFigure(270, range, label, sources, times);
-        const line = drawCurve(panel, k, curve);
-        const parts = [panel];
-        if (samples) {
-          parts.push(makeTimeFigure(RESIDUAL_HEIGHT, range, "residual", sources, times));
-          drawSamples(...parts, own.kind, k, samples, times);
-          panel.xaxes[0].visible = false;
-        }
-        parts[parts.length - 1].xaxes[0].axis_label.text = times.label;
-        addHover(panel, line, [["fitted", `@y${k}${SIX}`], ["mode", "@mode"]], times);
-        putLegendAbove(panel);
-        const whole = { "break-inside": "avoid" }; // printed on one page
-        blocks.push(new Bokeh.Column({ children: parts, name: `channel-${c}-${k}`, spacing: 0, styles: whole, ...wide }));
-      });
-      if (own.plane) blocks.push(drawPath(own, curve, samples));
-    });
-    return new Bokeh.Column({ children: blocks, spacing: 6, ...wide });
-  }
-
-  // The rise of J along the unknown that was moved last.
-  function drawSliceFigure() {
-    const plot = makeFigure(230, sliceLabel(), "rise of J");
-    const [slice, mark] = ["slice", "mark"].map((name) => new Bokeh.ColumnDataSource({ data: sliceColumns()[name], name }));
-    draw(plot, "line", slice, { ...columns({ x: "x", y: "exact" }), line_color: FIT, line_width: 2, legend_label: "exact" });
-    draw(plot, "line", slice, { ...columns({ x: "x", y: "quadratic" }), legend_label: "quadratic", ...DASHED }, "muted");
-    draw(plot, "scatter", mark, { ...columns({ x: "x", y: "y" }), size: 10, fill_color: FIT, line_color: DATA }, "edge");
-    plot.yaxes[0].formatter = new Bokeh.PrintfTickFormatter({ format: "%.2g" });
-    plot.xaxes[0].ticker.desired_num_ticks = 4; // labels of dates are long
-    plot.xaxes[0].formatter = new Bokeh.CustomJSTickFormatter({ code: "return switchfitSlice.label(tick, ticks)" });
-    putLegendAbove(plot);
-    return plot;
-  }
-
-  async function embed(name, build) {
+  async function embed(name, figure) {
     if (documents.has(name)) return;
     documents.set(name, null);
-    const root = build();
+    const views = await Bokeh.embed.embed_item(fill(payload.templates[figure.template], figure), name);
+    const root = [...views.roots][0].model;
     paint(root, name);
-    await Bokeh.Plotting.show(root, document.getElementById(name));
     documents.set(name, root.document);
     document.getElementById(name).closest(".run")?.querySelectorAll("[data-channel]").forEach(switchChannel);
   }
@@ -333,7 +176,7 @@ window.switchfitDates = switchfitDates;
     document.querySelectorAll(".slider").forEach((element, k) => {
       element.classList.toggle("shown", chosen.some((run) => sliders[k].runs.includes(Number(run))));
     });
-    for (const run of chosen) await embed(`run-${run}`, () => drawRun(payload.runs[run]));
+    for (const run of chosen) await embed(`run-${run}`, payload.runs[run]);
     move();
   }
 
@@ -426,11 +269,16 @@ window.switchfitDates = switchfitDates;
     },
   };
 
+  function sliceSources() {
+    return Object.fromEntries(Object.entries(sliceColumns()).map(([name, columns]) =>
+      [name, { type: "map", entries: Object.entries(columns) }]));
+  }
+
   function drawSlice() {
     const doc = documents.get("slice");
     if (!doc) return;
     for (const [name, columns] of Object.entries(sliceColumns())) doc.get_model_by_name(name).data = columns;
-    doc.get_model_by_name("x-label").text = sliceLabel();
+    doc.get_model_by_name("slice-label").text = sliceLabel();
   }
 
   function move() {
@@ -484,7 +332,7 @@ window.switchfitDates = switchfitDates;
   (async () => {
     await show("0");
     for (const [name, packed] of Object.entries(payload.drawings)) await unpack(name, packed);
-    if (sliders.length) await embed("slice", drawSliceFigure);
+    if (sliders.length) await embed("slice", { template: "slice", sources: sliceSources(), ranges: {} });
     move();
     document.documentElement.dataset.ready = "true";
   })();

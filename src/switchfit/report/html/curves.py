@@ -1,0 +1,352 @@
+"""What the figures of one run show, thinned to what can be seen, with its derivatives in the unknowns that move it.
+
+It is in columns by the names that the page's script puts into the sources of the figures. The script keeps what sliders
+move (t, y0.., x, left, right) as fit_t, fit_y0.. as well. Tangents and bands are float32.
+
+Sliders: how far an unknown may be moved, and the exact J on the way.
+
+The curves move by their derivatives, ``x(t; theta + d) ~ x + S d``. J along one unknown, the others held, is
+evaluated, and shows beside its quadratic approximation how far derivatives hold; where several are moved, J is that
+approximation, ``J + g d + d' H d / 2``.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Comparison
+from switchfit.problem.data import FloatArray
+from switchfit.report.formats import describe_clock, format_estimate, format_unit, get_unit, list_dated
+from switchfit.report.plot import find_plane, has_bands, replace_infinities
+from switchfit.report.text import format_end
+from switchfit.uncertainty.prediction import Points, predict
+from switchfit.uncertainty.residuals import correct_errors, find_transition_intervals
+
+MOST_POINTS, FEWEST_POINTS = 800, 80
+"""Points of one curve: with more of them a figure looks the same."""
+MOST_SAMPLES = 2000
+"""Samples of one channel that are drawn."""
+BUDGET = 300_000
+"""Numbers that the curves of all runs may have together, with their derivatives: 1.6 MB in the page."""
+
+
+Columns = Mapping[str, Any]
+"""Numbers by the names that they have in the page."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """One of the data of a run, or its states: a curve of Q channels, and what was measured of it.
+
+    Attributes
+    ----------
+    names, units : tuple of str, one a channel
+    kind : {"measurements", "reference", "states"}
+    curve : mapping of name to (L,)
+        Times t, with NaN where a transition breaks the curve, and mode. Of channel k the values y{k}, the 95 %
+        confidence band from lo{k} to hi{k}, if there is one, and the derivatives d{i}_{k} in theta[i] at a fixed time.
+    samples : mapping of name to (K,)
+        Empty for states. Times t; of channel k what is measured, m{k}, its residuals y{k}, sigma s{k} and n{k} = -s{k},
+        outliers o{k}, and the derivatives d{i}_{k} of the residuals.
+    left_out : int
+        Samples that are not drawn.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    kind: str
+    curve: Columns
+    samples: Columns = field(default_factory=dict)
+    left_out: int = 0
+
+
+def list_places(estimate: Estimate, e: int) -> list[int]:
+    """Return the places in theta of the unknowns that move the curves of a run; nothing where the model is not there.
+
+    Delays move their curve in time, and are left out.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    e : int
+    """
+    if estimate.problem is None:
+        return []
+    run, places = estimate.problem.experiments[e], estimate.problem.places[e]
+    delays = [run.parameter_map.get(item.delay, item.delay) for item in run.measurements]
+    return [place for place in sorted(set(places[places >= 0].tolist())) if estimate.theta_names[place] not in delays]
+
+
+def choose_points(estimate: Estimate, runs: Sequence[int], unknowns: int) -> int:
+    """Return how many points a curve may have, so that all of them stay in the `BUDGET`.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    runs : sequence of int
+        Which are shown.
+    unknowns : int
+        That a run depends on, at most.
+    """
+    states = sum(estimate.trajectories[e].states.shape[1] for e in runs)
+    channels = states + sum(len(comparison.names) for e in runs for comparison in estimate.comparisons[e])
+    return int(np.clip(BUDGET / max(channels * (unknowns + 4), 1), FEWEST_POINTS, MOST_POINTS))
+
+
+def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: int) -> list[Curves]:
+    """Return the curves of one run: an entry for each of its data, then the states that are not measured by name.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    e : int
+        Which run, from 0.
+    places : sequence of int
+        Unknowns whose derivatives are wanted.
+    points : int
+        Of one curve.
+    """
+    trajectory = estimate.trajectories[e]
+    has_slopes = estimate.problem is not None and estimate.has_room_for_sensitivities()
+    nodes = estimate.sensitivities[e].nodes if has_slopes else None
+    times = trajectory.times if nodes is None else nodes.times
+    segments = np.concatenate([[0], np.flatnonzero(np.diff(times) == 0) + 1, [len(times)]])
+    if len(segments) != len(trajectory.pieces):  # a mode without duration: other meshes have other nodes there
+        times, nodes, segments = trajectory.times, None, trajectory.pieces
+    values, slopes, band = _stack_outputs_and_states(estimate, e, nodes)
+    kept, breaks = _thin(segments, points)
+    modes = np.repeat([trajectory.modes[start] for start in trajectory.pieces[:-1]], np.diff(segments))[kept]
+
+    def at_nodes(values: FloatArray) -> FloatArray:
+        """Thin values at the nodes (L,), and break them at transitions."""
+        return replace_infinities(np.insert(values[kept], breaks, np.nan))
+
+    def list_curve(columns: Sequence[int], late: float) -> dict[str, Any]:
+        curve: dict[str, Any] = {"t": np.insert(times[kept], breaks, np.nan) + late}
+        curve["mode"] = np.insert(modes.astype(object), breaks, "").tolist()
+        for k, column in enumerate(columns):
+            curve[f"y{k}"] = at_nodes(values[:, column])
+            if band is not None:
+                low, high = (at_nodes(edge).astype("f4") for edge in band[:, column].T)
+                curve |= {f"lo{k}": low, f"hi{k}": high}
+            if slopes is not None:
+                curve |= {f"d{i}_{k}": at_nodes(slopes[:, column, i]).astype("f4") for i in places}
+        return curve
+
+    found, first = [], 0
+    for comparison in estimate.comparisons[e]:
+        names, units = comparison.names, [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
+        columns = range(first, first := first + len(names))
+        late = float(comparison.curve_times[0] - trajectory.times[0])
+        count = len(comparison.times)
+        drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
+        if comparison.kind == "reference" and count == len(times):
+            drawn = kept
+        curve = list_curve(columns, late)
+        if find_plane(names, units) is not None:
+            before_breaks = np.append(False, np.isnan(curve["t"][:-1]))
+            curve["size"] = np.where(before_breaks, 13.0, 0.0).astype("f4")
+        moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late)
+        samples = _list_samples(comparison, drawn, moved, places)
+        left_out = count - len(drawn) if comparison.kind == "measurements" else 0
+        found.append(Curves(names, tuple(units), comparison.kind, curve, samples, left_out))
+    measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
+    hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
+    if hidden:
+        names, given = (tuple(own[k] for k in hidden) for own in (trajectory.state_names, trajectory.state_units))
+        found.append(
+            Curves(names, tuple(map(format_unit, given)), "states", list_curve([first + k for k in hidden], 0))
+        )
+    return found
+
+
+def _list_samples(
+    comparison: Comparison, drawn: NDArray[np.intp], slopes: FloatArray | None, places: Sequence[int]
+) -> Columns:
+    """Return the columns of the samples that are drawn; the slopes (K, Q, d) are those of what is fitted."""
+    columns: dict[str, Any] = {"t": comparison.times[drawn]}
+    for k in range(len(comparison.names)):
+        measured, fitted = (replace_infinities(own[drawn, k]) for own in (comparison.measured, comparison.fitted))
+        columns |= {f"m{k}": measured, f"y{k}": measured - fitted}
+        if comparison.sigma is not None:
+            sigma = replace_infinities(comparison.sigma[drawn, k])
+            columns |= {f"s{k}": sigma, f"n{k}": -sigma}
+        if comparison.downweighted is not None:
+            columns[f"o{k}"] = np.where(comparison.downweighted[drawn, k], measured, np.nan)
+        if slopes is not None:
+            columns |= {f"d{i}_{k}": -replace_infinities(slopes[:, k, i]).astype("f4") for i in places}
+    return columns
+
+
+def _stack_outputs_and_states(
+    estimate: Estimate, e: int, nodes: Points | None
+) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+    """Return all outputs and then all states of a run, their derivatives in theta, and their bands.
+
+    Without derivatives those of the fit, and no bands; bands need a covariance as well.
+    """
+    if nodes is None:
+        return np.hstack([*(c.curve for c in estimate.comparisons[e]), estimate.trajectories[e].states]), None, None
+    values, slopes = np.hstack([nodes.outputs, nodes.states]), np.hstack([nodes.outputs_d, nodes.states_d])
+    if not has_bands(estimate):
+        return values, slopes, None
+    prediction = predict(estimate, experiment=e)
+    return values, slopes, np.hstack([prediction.output_band(), prediction.state_band()])
+
+
+def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return which nodes are kept, the ends of all segments among them, and before which of these a curve breaks."""
+    stride = max(-(-int(segments[-1]) // points), 1)
+    parts = [
+        np.unique(np.concatenate([np.arange(start, end, stride), [end - 1]]))
+        for start, end in itertools.pairwise(segments.tolist())
+    ]
+    return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
+
+
+def _find_sample_slopes(
+    comparison: Comparison, nodes: Points, columns: Sequence[int], drawn: NDArray[np.intp], late: float
+) -> FloatArray:
+    """Return the derivatives of what is fitted at the samples that are drawn, all of them nodes unless late: (K, Q, d).
+
+    At a transition, that just before it.
+    """
+    nearest = np.minimum(np.searchsorted(nodes.times, comparison.times[drawn] - late), len(nodes.times) - 1)
+    is_every_node = comparison.kind == "reference" and len(comparison.times) == len(nodes.times)
+    return nodes.outputs_d[drawn if is_every_node else nearest][:, columns]
+
+
+def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
+    """Return the modes of one run: left, right, colour, the places in theta of the ends, -1 where these are known.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : int, from 0
+    colours : mapping of mode to colour
+    """
+    modes, left, right = zip(*fit.trajectories[e].mode_spans, strict=True)
+    places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
+    ends = {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
+    return {"left": np.array(left), "right": np.array(right), "colour": [colours[mode] for mode in modes], **ends}
+
+
+def list_transitions(fit: Fit, e: int) -> Columns:
+    """Return the transitions of one run: x, ends of the interval, both as the table has them, places in theta.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : int, from 0
+    """
+    errors, run, intervals = correct_errors(fit), fit.trajectories[e], find_transition_intervals(fit, e)
+    own = [t for t in fit.transitions if t.experiment == e]
+    values, shown = [], []
+    for t, ends in zip(own, intervals, strict=True):
+        value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], run)
+        unit = format_unit(t.unit) if run.origin is None or error else ""
+        values.append(" ".join(filter(None, (value, error, unit))))
+        low, high = (format_end(end, ends, run) for end in ends)
+        shown.append(f"{low} to {high}" if low and high else "not known")
+    numbers = {"x": np.array([t.time for t in own], dtype=float), "low": intervals[:, 0], "high": intervals[:, 1]}
+    words: dict[str, Any] = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
+    words |= {"value": values, "interval": shown}
+    return {**numbers, **words, "place": [-1 if t.index is None else t.index for t in own]}
+
+
+SIDE_POINTS = 20
+"""Values of J to each side of the estimate."""
+VISIBLE = 0.15
+"""Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
+
+
+def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
+    """Return what the page knows of a slider, for each unknown that has room to move.
+
+    Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
+    held, None where it cannot be evaluated.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        With its problem.
+    runs : mapping of run to its curves
+        Those that are shown.
+    places : sequence of int
+        The unknowns.
+    """
+    found = []
+    for place in places:
+        (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
+        if not low < high:
+            continue
+        sides = np.linspace(low, theta, SIDE_POINTS + 1), np.linspace(theta, high, SIDE_POINTS + 1)
+        values = np.unique(np.concatenate(sides))
+        costs = np.array([evaluate_moved(estimate, place, value) for value in values])
+        run = list_dated(estimate)[place]
+        slider = {"place": place, "name": estimate.theta_names[place], "theta": theta}
+        slider |= {"clock": run and describe_clock(run), "unit": format_unit(estimate.theta_units[place])}
+        found.append({**slider, "values": drop_nan(values), "costs": drop_nan(costs)})
+    return found
+
+
+def drop_nan(values: Any) -> Any:
+    """Return a number or an array for JSON, with None for what is not finite."""
+    return np.where(np.isfinite(values), values, np.array(None)).tolist()
+
+
+def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
+    """Return how far an unknown can be moved: until a curve has moved visibly, inside its bounds, in its order.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    runs : mapping of run to its curves
+    place : int
+    """
+    theta = float(estimate.theta[place])
+    wanted = []
+    for own in (own for run in runs.values() for own in run if f"d{place}_0" in own.curve):
+        for k in range(len(own.names)):
+            known = own.curve[f"y{k}"][np.isfinite(own.curve[f"y{k}"])]
+            slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
+            if len(known) and np.ptp(known) > 0 and slope > 0:
+                wanted.append(VISIBLE * float(np.ptp(known)) / slope)
+    half = min(wanted, default=0.0) or 0.1 * abs(theta) or 1.0
+    constraints = estimate.evaluator_at_solution().problem.constraints
+    slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
+    room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
+    low = max(theta - np.min(room[slopes > 0], initial=half), float(estimate.lower[place]))
+    high = min(theta + np.min(room[slopes < 0], initial=half), float(estimate.upper[place]))
+    return low, high
+
+
+def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
+    """Return J with one unknown moved, by evaluating the runs that depend on it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    place : int
+    value : float
+    """
+    evaluator = estimate.evaluator_at_solution()
+    problem = evaluator.problem
+    moved = estimate.theta.copy()
+    moved[place] = value
+    runs = [e for e, places in enumerate(problem.places) if place in places]
+
+    def add_up(theta: FloatArray) -> float:
+        costs = [evaluator.engines[e].cost(*problem.vectors(theta, e)) for e in runs]
+        return sum(costs) + float(problem.unknowns.priors.evaluate(theta)[0])
+
+    total = estimate.cost + add_up(moved) - add_up(estimate.theta)
+    return float(total) if np.isfinite(total) else np.nan
