@@ -184,4 +184,3 @@ def test_figures_of_several_panels(heater, starts):
     for figure in (validation, fits, forecast, *(study.plot() for study in studies)):
         assert all(ax.has_data() for ax in figure.axes)
         assert figure._repr_png_()[:4] == b"\x89PNG"
-

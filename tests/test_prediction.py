@@ -11,6 +11,7 @@ from models import heated_room
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.uncertainty.prediction import (
+    build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
 )
@@ -91,19 +92,6 @@ def test_at_a_transition_the_derivative_jumps_by_that_of_the_vector_field():
     assert found.states_d[before, 0, 0] == pytest.approx(0.0, abs=1e-14)
     assert found.states_d[after, 0, 0] == pytest.approx((power - k * x) - (-k * x), rel=1e-12)  # X of equation (8)
     np.testing.assert_allclose(found.states_d[before, 0, 1:], found.states_d[after, 0, 1:], rtol=1e-12)
-
-
-def build_gauss_newton(problem, theta, samples):
-    """A sample contributes rho' w (D h)' D h, and 2 (D log sigma)' D log sigma if its sigma is a parameter."""
-    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
-    for run in problem.experiments:
-        for item in run.measurements:
-            for values, name in zip(item.values.T, item.sigma_names, strict=False):
-                span = None if name is None else problem.unknowns.parameters.get(run.parameter_map.get(name, name))
-                if span is not None:
-                    information[span, span] += 2.0 * np.count_nonzero(~np.isnan(values)) / theta[span] ** 2
-    weight = samples.influence * samples.weight
-    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
 
 
 @pytest.mark.parametrize(

@@ -322,8 +322,6 @@ def test_rows_beside_transitions_are_halved_too():
         assert tau - fine[fine < tau][-1] <= 0.5 * before * (1 + 1e-12)
 
 
-
-
 # The beam along a log whose order of modes is known: all that a problem may have, from a bad guess
 
 SEQUENCE, TAU, BAD = ("on", "off", "on", "off"), (1.83, 5.32, 7.1), (0.5, 1.0, 9.5)

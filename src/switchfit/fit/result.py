@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -299,6 +299,8 @@ class Fit(Termination):
         Wall time of the estimation, always in seconds.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
+    saved_gauss_newton : (d, d) or None
+        The Gauss-Newton matrix of the samples, if it has been evaluated.
     saved_pieces : (T, 2, P, 5)
         Of transition times whose intervals follow from them, in a fit that was saved: as `Fits.pieces`.
     saved_piece_places : (T,) int
@@ -370,6 +372,7 @@ class Fit(Termination):
     seconds: float
     log_origins: FloatArray
     constraints: tuple[tuple[str, float, float], ...] = ()
+    saved_gauss_newton: FloatArray | None = None
     saved_pieces: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 1, 5)))
     saved_piece_places: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     priors: Mapping[str, str] = field(default_factory=dict)
@@ -473,6 +476,11 @@ class Fit(Termination):
     def freedom(self) -> int:
         """Degrees of freedom: number of measured values and priors minus number of free unknowns."""
         return self.samples + len(self.priors) - self.free_basis.shape[1]
+
+    @property
+    def gauss_newton(self) -> FloatArray | None:
+        """The Gauss-Newton matrix of the samples and priors: (d, d); None if it is unknown."""
+        return self.saved_gauss_newton
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -590,6 +598,50 @@ def measure_variance(cost: Any, freedom: Any, sigma_known: bool | None) -> Any:
         return np.ones(np.shape(cost))
     there = (freedom > 0) & (sigma_known is False)
     return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
+
+
+class Disagreement(NamedTuple):
+    """Difference between the standard errors from the exact Hessian and from the Gauss-Newton matrix.
+
+    Attributes
+    ----------
+    factor : float
+        Largest ratio of the larger to the smaller one, over all linear combinations of the unknowns.
+    name : str
+        The unknown whose own standard errors differ the most.
+    exact, gauss_newton : float
+        Its standard errors.
+    """
+
+    factor: float
+    name: str
+    exact: float
+    gauss_newton: float
+
+
+@one_thread()
+def disagreement(fit: Fit) -> Disagreement | None:
+    """Compare the two covariances of a fit; None if one of them is unknown.
+
+    The ratios of the two variances over all linear combinations of the unknowns lie between the smallest and the
+    largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix.
+    """
+    Z, A = fit.free_basis, fit.gauss_newton
+    if A is None or fit.sigma_known is None or Z.shape[1] == 0:
+        return None
+    both = fit.covariance, fit.variance_scale * inverse_on(Z, A)
+    if not all(np.isfinite(covariance).all() for covariance in both):
+        return None
+    errors = np.sqrt([np.diag(covariance) for covariance in both])
+    ratios = []
+    for one, other in ((fit.hessian, A), (A, fit.hessian)):  # of each the largest, which no rounding hides
+        values, vectors, size = compute_scaled_spectrum(one, Z)
+        root = size[:, None] * vectors / np.sqrt(values)  # root' one root = 1
+        ratios.append(float(np.linalg.eigvalsh(root.T @ other @ root)[-1]))
+    held = errors[0] <= 0
+    changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
+    k = int(np.argmax(changes))
+    return Disagreement(max(ratios) ** 0.5, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))
 
 
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:

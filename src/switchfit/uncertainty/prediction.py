@@ -191,6 +191,32 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
+def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDerivatives) -> FloatArray:
+    """Return the Gauss-Newton matrix of the samples and the priors at theta: (d, d).
+
+    A sample contributes ``rho' w (D h)' D h``, and ``2 (D log sigma)' D log sigma`` if its sigma is a parameter: the
+    Fisher information of normal noise, which has nothing between sigma and the rest.
+
+    Parameters
+    ----------
+    problem : Problem
+        No delay of it is a parameter.
+    theta : (d,)
+    samples : SampleDerivatives
+        At theta.
+    """
+    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
+    for run in problem.experiments:
+        for item in run.measurements:
+            for values, name in zip(item.values.T, item.sigma_names, strict=False):
+                span = None if name is None else problem.unknowns.parameters.get(run.parameter_map.get(name, name))
+                if span is not None:  # it is not fixed
+                    # In log sigma each sample has the information 2, in sigma 2 / sigma^2.
+                    information[span, span] += 2.0 * np.count_nonzero(~np.isnan(values)) / theta[span] ** 2
+    weight = samples.influence * samples.weight
+    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction(Tabular):
     """States and outputs of one experiment with their standard errors.

@@ -25,7 +25,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.fit.result import NAMED, Fit, list_without_effect
+from switchfit.fit.result import NAMED, Fit, disagreement, list_without_effect
 from switchfit.optimize import Status
 from switchfit.problem.inspection import name_whole_parameters
 from switchfit.runtime.errors import Issue
@@ -169,6 +169,14 @@ def find_levels(doubts: list[Doubt], count: int) -> NDArray[np.str_]:
     return np.array(LEVELS)[places]
 
 
+UNSEEN = 100.0
+"""Factor between the standard errors of the two Hessians above which the Gauss-Newton matrix counts as singular, as for
+a transition at which the vector field does not jump, such as a block that comes to rest."""
+DIFFERENT = 1.2
+"""Factor between the standard errors of the two Hessians, for any combination of the unknowns, above which a warning is
+given: a 95 % interval that is too narrow by this factor covers 90 %, one that is too wide 98 %."""
+
+
 def find_issues(fit: Fit) -> Iterator[Issue]:
     """Yield the warnings about a fit, in the order of the report.
 
@@ -190,6 +198,7 @@ def find_issues(fit: Fit) -> Iterator[Issue]:
     yield from _find_missing_errors(fit, smallest)
     if fit.status.successful:
         yield from find_residual_issues(fit)
+        yield from _compare_covariances(fit)
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield Issue("large integration error", (fit.integration_error_of,), {"error": fit.integration_error})
 
@@ -252,6 +261,15 @@ def _find_missing_errors(fit: Fit, smallest: float) -> Iterator[Issue]:
     elif fit.sigma_known or fit.freedom > 0:  # with too few samples the verdict says so
         names = () if missing.all() else tuple(np.array(fit.theta_names, dtype=object)[missing].tolist())
         yield Issue("no errors: not positive definite", names, {"eigenvalue": smallest})
+
+
+def _compare_covariances(fit: Fit) -> Iterator[Issue]:
+    """Test whether the exact Hessian and the Gauss-Newton matrix give different standard errors."""
+    found = disagreement(fit)
+    if found is not None and found.factor > DIFFERENT:
+        kind = "known to second order" if found.factor > UNSEEN else "covariances differ"
+        figures = {"factor": found.factor, "exact": found.exact, "Gauss-Newton": found.gauss_newton}
+        yield Issue(kind, (found.name,), figures)
 
 
 @dataclass(frozen=True)
