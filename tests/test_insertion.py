@@ -146,7 +146,6 @@ def test_rates_are_not_defined_where_a_pulse_would_end_with_a_reset_map_or_guard
     assert np.isfinite(rest).all()
     if system is None:
         np.testing.assert_array_equal(np.isnan(swing), names == "fall")
-        assert str(found).splitlines()[-1].endswith("a pulse of fall in swing, swing in fall.")
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])

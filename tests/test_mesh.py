@@ -21,6 +21,7 @@ from switchfit.engine import adaptive
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.native.engine import native_experiment
 from switchfit.engine.protocol import runs_of
+from switchfit.engine.stiffness import Watch
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 
@@ -191,7 +192,7 @@ def test_both_engines_take_the_steps_of_scipy():
             stretch = adaptive._Stretch(mode, start, end, np.array(x))
             natively = adaptive._NativeSteps(native, mode, stretch, np.zeros(0), tolerances)
             in_python = adaptive._PythonSteps(solve._build_slope(stretch, mode), stretch, tolerances)
-            found = [solve._take_steps(stretch, steps, None) for steps in (natively, in_python)]
+            found = [solve._take_steps(stretch, steps, Watch()) for steps in (natively, in_python)]
         for steps, after, crossing in found:
             assert crossing is None
             assert len(steps) == len(expected) > 10

@@ -228,7 +228,6 @@ def test_a_time_near_the_largest_float_is_reached_by_implicit_steps(fitted):
 def test_bands_in_the_figure_with_each_transition_twice(fitted):
     found, panel = fitted.predict(), fitted.plot().axes[0]
     assert np.sum(found.times == fitted.theta[0]) == 2
-    assert found.near_transition[found.times == fitted.theta[0]].all()
     top = max(path.vertices[:, 1].max() for path in panel.collections[1].get_paths())
     assert top == pytest.approx(found.output_band().max(), rel=1e-9)
     for without in (fitted.plot(bands=False), replace(fitted, problem=None).plot()):

@@ -426,7 +426,7 @@ class System:
 
         return np.array([kind(name) for name in self.problem.theta_names])
 
-    def nodes(self, run: reference.Run) -> np.ndarray:
+    def nodes(self, run: Any) -> np.ndarray:
         """Moments of a run at which a transition may tie with something: samples and knots."""
         times = [item.times - item.delay for item in run.samples if not isinstance(item.delay, str)]
         signals = [signal for signal in (*[item.signal for item in run.tracking], run.input) if signal is not None]

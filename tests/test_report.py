@@ -111,16 +111,17 @@ def several(count: int, names=None) -> Fit:
         lower=np.full(count + 1, -np.inf),
         upper=np.full(count + 1, np.inf),
         run_names=tuple(names),
-        transition_times=tuple(np.array([3.0 + 0.1 * e, 7.0]) for e in range(count)),
+        transition_times=tuple(times),
         transition_places=tuple(np.array([e, -1]) for e in range(count)),
         final_places=(-1,) * count,
         gradient=np.zeros(count + 1),
         hessian=np.diag(np.linspace(100.0, 400.0, count + 1)),
         free_basis=np.eye(count + 1),
         trajectories=trajectories,
+        cost=29.0 * count,
         comparisons=tuple((comparison_of(t, names=("X", "dX")),) for t in trajectories),
         history=tuple(IterationRecord(k, 900.0 / (k + 1), 10.0**-k, 1.0, theta, k + 1) for k in range(3)),
-    )  # fmt: skip
+    )
 
 
 def write_report(fit: Fit, certificate=None, **settings) -> str:

@@ -120,7 +120,7 @@ def test_a_real_fit_comes_back(tmp_path):
     estimate.save(tmp_path / "fit.json")
     loaded = sf.Estimate.load(tmp_path / "fit.json")
     for field in fields(Fit):
-        assert_same(getattr(estimate.complete(), field.name), getattr(loaded, field.name), field.name)
+        assert_same(getattr(estimate.complete(), field.name), getattr(loaded, field.name))
     assert_same(estimate.certificate, loaded.certificate)
     assert str(loaded) == str(estimate)
     with pytest.raises(ValueError, match=r"loaded without its model: load it with Estimate.load\(path, problem="):

@@ -269,7 +269,7 @@ def test_a_simulation_up_to_a_free_tf_and_times_outside():
         (heater_problem(), [1.0, 1.0], inside + r"\[0.0, 6.0\] h; got 1.0"),
         (heater_problem(), [], r"times must be finite numbers of shape \(K,\); got shape \(0,\)"),
         (heater_problem(), [np.nan], "times must be finite numbers"),
-        (heater_problem(), "samples", "times must be a number or a date"),
+        (problem, "samples", "times='samples' needs Measurements, and experiment 0 has none"),
     ):
         with pytest.raises(ValueError, match=message):
             sf.simulate(given, times=times)

@@ -172,7 +172,7 @@ def _check_files(problem: Path, full: bool) -> None:
 OutputFile = Annotated[Path, option("--out", metavar="FILE.csv", help="CSV file to write.")]
 Times = Annotated[
     str,
-    option(metavar="STEP", help="A step, such as 0.1. Default: the integrator's."),
+    option(metavar="STEP", help="A step, such as 0.1, or 'samples': times of the data. Default: the integrator's."),
 ]
 
 

@@ -248,8 +248,8 @@ class Estimate(Fit, Tabular, Displayed):
         Raises
         ------
         ValueError
-            For another kind. For "gauss-newton" if the matrix is unknown: it needs a cost of Measurements alone, and the
-            problem, unless it was saved. For "sandwich" without the problem, with a cost of anything but Measurements,
+            For another kind. For "gauss-newton" if the matrix is unknown: it needs a cost of Measurements alone, and
+            the problem, unless it was saved. For "sandwich" without the problem, with a cost of other terms,
             with priors, constraints, or a sigma or delay that is a parameter, and with no more values than free
             unknowns.
 

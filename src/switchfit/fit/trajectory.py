@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -175,7 +176,7 @@ def simulate(
     problem: Problem,
     theta: ArrayLike | None = None,
     *,
-    times: ArrayLike | None = None,
+    times: ArrayLike | Literal["samples"] | None = None,
     experiment: int = 0,
 ) -> Trajectory:
     """Integrate the model to the problem's tolerances.
@@ -185,10 +186,11 @@ def simulate(
     problem : Problem
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
-    times : (K,) array_like, optional
+    times : (K,) array_like or "samples", optional
         Times that increase, inside [t0, tf], at which states are returned, as numbers, or as dates where the times of
-        the experiment are dates; at a transition it is the state just before it. All nodes of the mesh if left out,
-        each transition twice. The steps that the tolerances need are taken whatever these times are.
+        the experiment are dates; at a transition it is the state just before it. "samples": the times of the
+        Measurements. All nodes of the mesh if left out, each transition twice. The steps that the tolerances need are
+        taken whatever these times are.
     experiment : int, optional
         Index of the experiment, from 0.
 
@@ -256,10 +258,17 @@ def read_times(experiment: Experiment, times: ArrayLike) -> FloatArray:
     return asked
 
 
-def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike) -> FloatArray:
+def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike | Literal["samples"]) -> FloatArray:
     """Return the times at which a simulation is asked for, (K,)."""
-    experiment, asked = problem.experiments[e], read_times(problem.experiments[e], times)
+    experiment = problem.experiments[e]
     t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
+    if isinstance(times, str) and times == "samples":
+        found = np.unique(np.concatenate([np.zeros(0), *(item.times for item in experiment.measurements)]))
+        inside = found[(t0 <= found) & (found <= tf)]
+        if not len(inside):
+            raise ValueError(f"times='samples' needs Measurements, and experiment {e} has none; give times.")
+        return inside
+    asked = read_times(experiment, times)
     wrong = np.append(False, np.diff(asked) <= 0) | (asked < t0) | (asked > tf)
     if wrong.any():
         unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""

@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -42,8 +42,8 @@ from switchfit.uncertainty.verdict import Verdict
 MOST_TIMES = 10_000_000
 
 
-def choose_times(given: str, experiment: Experiment) -> FloatArray | None:
-    """Return the times that ``--times`` stands for, (K,): a step from t0 to tf; None if it is left out.
+def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["samples"] | None:
+    """Return the times that ``--times`` stands for, (K,): a step from t0 to tf, "samples", or None if it is left out.
 
     Parameters
     ----------
@@ -53,17 +53,17 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | None:
     Raises
     ------
     InputError
-        If the step makes no or too many times.
+        If it is neither, or the step makes no or too many times.
     """
-    if not given:
-        return None
+    if given in ("", "samples"):
+        return "samples" if given else None
     t0, tf = experiment.ends_of_modes(experiment.initial_times)[[0, -1]].tolist()
     step = np.nan
     with contextlib.suppress(ValueError):
         step = float(given)
     if not (0 < step < np.inf and (tf - t0) / step < MOST_TIMES):
         raise InputError(
-            f"--times must be a positive step, such as 0.1, that makes at most {MOST_TIMES:,} times from "
+            f"--times must be 'samples', or a positive step, such as 0.1, that makes at most {MOST_TIMES:,} times from "
             f"t0 = {t0:g} to tf = {tf:g}; got {given!r}."
         )
     count = int(np.floor((tf - t0) / step * (1 + 1e-12)))

@@ -307,7 +307,6 @@ EXAMPLES = {
 """What to keep from where an operation is not defined, or has no derivative."""
 
 
-"""Of a channel."""
 _DELAYED = " J has a kink where a transition meets a late sample's moment: fix the delay at its estimate to see."
 """Behind why a line search failed if a delay is estimated."""
 
