@@ -16,7 +16,10 @@ import switchfit as sf
 from switchfit.experiment_design import (
     Candidates,
     Nominal,
+    _build_criterion,
+    _describe,
     choose_samples,
+    differentiate_criterion,
     replace_inputs,
     simulate_values,
     stack_inputs,
@@ -24,6 +27,7 @@ from switchfit.experiment_design import (
 from switchfit.fit.evaluator import Evaluator
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
+from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.0, 4.0, 9)
 
@@ -261,31 +265,42 @@ def test_shares_of_the_information_add_up_to_one():
 KNOTS = [1.0, -0.4, 0.3, 0.8]
 NOISE_AND_DELAY = {"noise": sf.Parameter(0.1, lower=0.01), "late": sf.Parameter(0.2, lower=0.0, upper=0.4)}
 PROBLEMS = {
-    "linear": lag(KNOTS, kind="linear"),
-    "cubic": lag([*KNOTS, 0.2], kind="cubic"),
-    "constant": lag([0.5]),
-    "implicit": lag(KNOTS, solver="stiff"),
-    "sigma and delay": lag(KNOTS[:2], data={"sigma": "noise", "delay": "late"}, parameters=NOISE_AND_DELAY),
-    "robust": lag([1.0, 0.3], data={"loss": "cauchy"}, parameters={"b": sf.Parameter(2, prior=sf.Normal(2, 0.1))}),
-    "two runs": two_lags(),
-    "transitions at knots": transitions_at_knots(),
+    "linear, E": (lag(KNOTS, kind="linear"), 20.0),
+    "cubic": (lag([*KNOTS, 0.2], kind="cubic"), 0.0),
+    "constant": (lag([0.5]), 1.0),
+    "implicit": (lag(KNOTS, solver="stiff"), 0.0),
+    "sigma and delay": (lag(KNOTS[:2], data={"sigma": "noise", "delay": "late"}, parameters=NOISE_AND_DELAY), 1.0),
+    "prior": (lag([1.0, 0.3], data={"loss": "cauchy"}, parameters={"b": sf.Parameter(2, prior=sf.Normal(2, 0.1))}), 0),
+    "two runs": (two_lags(), 0.0),
+    "transitions at knots": (transitions_at_knots(), 0.0),
 }
 
 
-@pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS)
-def test_information_with_another_input_is_that_of_a_problem_with_it(problem):
-    """On the same mesh, with two thirds of the samples."""
+@pytest.mark.parametrize(("problem", "power"), PROBLEMS.values(), ids=PROBLEMS)
+def test_gradient_against_differences(problem, power):
+    """The exact gradient by JAX, against differences of the criterion by the engine of the problem on the same mesh."""
     whole = [np.ones(len(item.times), dtype=bool) for item in problem.experiments[0].data]
-    theta, changed = problem.initial_theta, stack_inputs(problem.experiments[0])[::-1] + 0.2
+    problem, d = simulate_values(problem, 0, problem.initial_theta, whole), len(problem.theta_names)
+    nominal = Nominal(problem, 0, problem.initial_theta)
+    rule = _build_criterion(nominal, np.arange(d), np.linspace(1.0, 2.0, d))
+    table, taken = stack_inputs(problem.experiments[0]), [np.arange(len(whole[0])) % 3 > 0]
 
-    def plan(problem):
-        return Nominal(simulate_values(problem, 0, theta, whole), 0, theta)
+    def rate(changed):
+        other = Nominal(simulate_values(replace_inputs(problem, 0, changed), 0, nominal.theta, whole), 0, nominal.theta)
+        other.evaluator = Evaluator(other.problem, meshes=nominal.evaluator.meshes)
+        own = other.candidates.information[taken[0]].sum(0)
+        return float(rule.rate(nominal.candidates.others + own, power)[0])
 
-    nominal, other = plan(problem), plan(replace_inputs(problem, 0, changed))
-    other.evaluator = Evaluator(other.problem, meshes=nominal.evaluator.meshes)
-    taken = np.arange(len(whole[0])) % 3 > 0
-    found = nominal.inform(nominal.change_input(nominal.keep_samples([taken]), changed))
-    np.testing.assert_allclose(found, other.candidates.information[taken].sum(0), rtol=1e-9, atol=1e-9 * found.max())
+    with use_float64():
+        background = _describe(nominal, rule, taken)
+        structure = nominal.evaluator.structures[0]
+        value, slope = differentiate_criterion(table, background, structure=structure, power=power)
+    assert float(value) == pytest.approx(rate(table), abs=1e-9)
+    for place in list(np.ndindex(table.shape))[:6]:
+        step = np.zeros_like(table)
+        step[place] = 1e-4
+        difference = (rate(table + step) - rate(table - step)) / 2e-4
+        assert float(slope[place]) == pytest.approx(difference, rel=1e-5, abs=1e-7)
 
 
 def test_a_gain_is_known_best_with_the_input_at_its_limit():
@@ -393,8 +408,13 @@ def test_problems_that_cannot_be_designed():
     corner = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + p["b"] * u}, [1.0])
     for problem, free, error, message in (
         (3, None, TypeError, r"problem must be an sf\.Problem"),
-        (line(sigma=None), None, ValueError, "design needs Measurements with sigma, for the data of run1"),
-        (cost, None, ValueError, "design needs Measurements with sigma, for the data of run1"),
+        (
+            line(sigma=None),
+            None,
+            ValueError,
+            "design needs sigma, the standard deviation of the noise, for the data of r",
+        ),
+        (cost, None, ValueError, "design needs Measurements, for the data of run1"),
         (replace(one, system=corner), {"u": (0.0, 1.0)}, ValueError, "free cannot be used where"),
     ):
         with pytest.raises(error, match=message):

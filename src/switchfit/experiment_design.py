@@ -15,10 +15,10 @@ Sample times and sensors are chosen from candidates, each of which adds its info
 and Nachtsheim, [2]_): candidates are dropped one by one, that which is missed least first, until as many are left as
 are allowed; then each of them is exchanged for the best that is left out, until no exchange helps.
 
-Inputs that lower the criterion are found by L-BFGS-B between limits, with a gradient by differences, from many starts.
-The information of a sample is ``C' C / sigma**2`` with the sensitivities C (q, D) of its q values, as in the
-Gauss-Newton matrix: it does not depend on what is measured. That of a sigma which is a parameter is ``2 / sigma**2``
-for each value, apart from everything else.
+Inputs that lower the criterion are found by L-BFGS-B between limits, with the exact gradient, from many starts. JAX
+differentiates the sensitivities of all samples, forward in theta, backward in the input. The information of a
+sample is ``C' C / sigma**2`` with the sensitivities C (q, D) of its q values: it does not depend on what is measured.
+That of a sigma which is a parameter is ``2 / sigma**2`` for each value, apart from everything else.
 
 References
 ----------
@@ -32,15 +32,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Arguments, split_by_cell
+from switchfit.discretization.mesh import Arguments, build_arguments, split_by_cell
+from switchfit.discretization.model import Model
+from switchfit.discretization.propagation import propagate, see_samples
 from switchfit.engine.branches import has_corners
 from switchfit.engine.choice import engine_of
 from switchfit.fit.evaluator import Evaluator, find_free_directions, place_on_guards
@@ -50,8 +55,11 @@ from switchfit.optimize.threads import one_thread
 from switchfit.problem import validation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
+from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem, require_estimable
+from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_count, as_names, as_positive, join_names, shorten
+from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.files import to_json, write_document
 from switchfit.runtime.presentation import Figure, Printed, draw_figure, format_line, join_first
 
@@ -85,21 +93,27 @@ class Criterion(NamedTuple):
     basis: FloatArray
     size: FloatArray
 
-    def rate(self, information: FloatArray, power: float) -> FloatArray:
-        """Return log m: (...,).
+    def rate(self, information: Any, power: float, xp: Any = np) -> tuple[Any, Any]:
+        """Return log m (...,), and its derivative in the information (..., d, d).
 
         Parameters
         ----------
         information : (..., d, d) array
         power : float
             q.
+        xp : module, optional
+            NumPy or `jax.numpy`.
         """
         basis = self.basis * self.size[None, :]
         across = basis[self.chosen] / self.scales[:, None]
-        half = across @ np.linalg.inv(basis.T @ information @ basis + RIDGE * np.eye(len(self.size)))
-        logs = np.log(np.maximum(np.linalg.eigvalsh(half @ across.T), 1e-300))
-        parts = np.exp(power * (logs - logs[..., -1:]))
-        return np.log(parts.mean(-1)) / power + logs[..., -1] if power else logs.mean(-1)
+        half = across @ xp.linalg.inv(basis.T @ information @ basis + RIDGE * xp.eye(len(self.size)))
+        values, vectors = xp.linalg.eigh(half @ across.T)
+        logs = xp.log(xp.maximum(values, 1e-300))
+        parts = xp.exp(power * (logs - logs[..., -1:]))
+        mean = xp.log(parts.mean(-1)) / power + logs[..., -1] if power else logs.mean(-1)
+        weights = parts / parts.sum(-1, keepdims=True) / xp.exp(logs)
+        root = xp.sqrt(weights)[..., None] * (xp.swapaxes(vectors, -1, -2) @ half @ basis.T)
+        return mean, -xp.swapaxes(root, -1, -2) @ root
 
     def measure(self, kind: str, covariance: FloatArray) -> float:
         """Return the criterion as textbooks have it: log det C (D), its trace (A) or its largest eigenvalue (E).
@@ -176,11 +190,7 @@ class Nominal:
     """
 
     def __init__(self, problem: Problem, e: int, theta: FloatArray) -> None:
-        # With another input the simulated values are met no longer: a robust loss would take them for outliers.
-        data = [replace(item, loss="linear") for item in problem.experiments[e].data]
-        plain = [replace(run, data=data) if k == e else run for k, run in enumerate(problem.experiments)]
-        self.problem, self.e, self.theta = problem, e, theta
-        self.evaluator = Evaluator(replace(problem, experiments=plain), theta)
+        self.problem, self.e, self.theta, self.evaluator = problem, e, theta, Evaluator(problem, theta)
         self.basis = np.eye(len(theta))
         if problem.constraint_names:
             self.evaluator, self.theta = place_on_guards(problem, theta)
@@ -189,46 +199,24 @@ class Nominal:
         self.information = 0.5 * sum(each_side, np.zeros((len(theta),) * 2))
         self.covariance = inverse_on(self.basis, self.information)
 
-    def keep_samples(self, taken: Sequence[NDArray[np.bool_]]) -> Arguments:
-        """Return the arguments of run e in which only samples that are taken count, (K,) of each sensor."""
-        arguments, kept = self.evaluator.arguments[self.e], []
-        for samples, own in zip(arguments.samples, taken, strict=True):
-            weight: Any = np.zeros_like(samples.weight)
-            weight[np.flatnonzero(own)] = samples.weight[np.flatnonzero(own)]
-            kept.append(samples._replace(weight=weight))
-        return arguments._replace(samples=tuple(kept))
-
-    def change_input(self, arguments: Arguments, table: FloatArray) -> Arguments:
-        """Return the arguments of run e with other values (K, q) of the input at its knots."""
-        signals: Any = np.einsum("gck,kq->gcq", self.cells, table)
-        return arguments._replace(signals=signals)
-
-    @cached_property
-    def cells(self) -> FloatArray:
-        """The signal of each knot of the input whose value is 1, as cubics in the cells of the mesh: (G, 4, K)."""
-        run, mesh = self.problem.experiments[self.e], self.evaluator.meshes[self.e]
-        knots = replace(run.inputs, values=np.eye(len(run.inputs.times)), units=None)
-        return split_by_cell(knots.signal(run.t0, run.end), mesh.pad_to(len(self.evaluator.arguments[self.e].signals)))
-
-    def inform(self, arguments: Arguments) -> FloatArray:
-        """Return the information of run e with other samples, or another input: (d, d)."""
-        own, mine = self.problem.own_places[self.e]
-        engine = engine_of(self.evaluator.runs[self.e], arguments, self.evaluator.meshes[self.e])
-        found = np.zeros_like(self.information)
-        for side in SIDES:
-            H = engine.derivatives(*self.problem.vectors(self.theta, self.e), side, "gauss-newton").hessian
-            np.add.at(found, (mine[:, None], mine), 0.5 * H[own[:, None], own])
-        return found
-
     @cached_property
     def candidates(self) -> Candidates:
         """The information of each sample of run e, all others being left out."""
-        counts = [len(item.times) for item in self.problem.experiments[self.e].data]
-        sensor, found = np.repeat(np.arange(len(counts)), counts), []
-        for k in range(len(sensor)):
-            only = np.split(np.arange(len(sensor)) == k, np.cumsum(counts)[:-1])
-            found.append(self.inform(self.keep_samples(only)))
-        return Candidates(sensor, np.array(found), self.information - sum(found))
+        problem, e, found = self.problem, self.e, []
+        arguments, (own, mine) = self.evaluator.arguments[e], problem.own_places[e]
+        counts = [len(item.times) for item in problem.experiments[e].data]
+        for s, count in enumerate(counts):
+            for k in range(count):
+                weights: list[Any] = [np.zeros_like(each.weight) for each in arguments.samples]
+                weights[s][k] = arguments.samples[s].weight[k]
+                pairs = zip(arguments.samples, weights, strict=True)
+                only = arguments._replace(samples=tuple(each._replace(weight=weight) for each, weight in pairs))
+                engine = engine_of(self.evaluator.runs[e], only, self.evaluator.meshes[e])
+                found.append(np.zeros_like(self.information))
+                for side in SIDES:
+                    H = engine.derivatives(*problem.vectors(self.theta, e), side, "gauss-newton").hessian
+                    np.add.at(found[-1], (mine[:, None], mine), 0.5 * H[own[:, None], own])
+        return Candidates(np.repeat(np.arange(len(counts)), counts), np.array(found), self.information - sum(found))
 
 
 def simulate_values(problem: Problem, e: int, theta: FloatArray, taken: list[NDArray[np.bool_]]) -> Problem:
@@ -255,12 +243,71 @@ def simulate_values(problem: Problem, e: int, theta: FloatArray, taken: list[NDA
     return replace(problem, experiments=runs)
 
 
+class Background(NamedTuple):
+    """What does not change while an input is looked for; D unknowns of the run, d of the problem.
+
+    Attributes
+    ----------
+    arguments : Arguments
+        On the mesh of the run.
+    cells : (G, 4, K)
+        The signal of each knot whose value is 1, as cubics in the cells of the mesh.
+    theta : (D,), transition times and p of the run
+    taken : tuple of (K,), 1 for samples that are taken and 0 for others, one for each sensor
+    others : (d, d), information of priors and other runs
+    places : (d, D) of 0 and 1, which unknown of the problem is which of the run
+    criterion : Criterion
+    """
+
+    arguments: Arguments
+    cells: Any
+    theta: Any
+    taken: tuple[Any, ...]
+    others: Any
+    places: Any
+    criterion: Criterion
+
+
+@partial(jax.jit, static_argnames=("structure", "power"))
+def differentiate_criterion(
+    inputs: Array, at: Background, *, structure: Structure, power: float
+) -> tuple[Array, Array]:
+    """Return log m, as of `Criterion.rate`, and its derivatives in an input at its knots, (K, q)."""
+
+    def rate(inputs: Array) -> Array:
+        model = Model(structure, at.arguments._replace(signals=jnp.einsum("gck,kq->gcq", at.cells, inputs)))
+
+        def inform(side: Array) -> Array:
+            slopes, weights = jax.jacfwd(partial(_see, model, side), has_aux=True)(at.theta)
+            own = jnp.zeros((at.theta.size, at.theta.size))
+            for taken, (C, L), w in zip(at.taken, slopes, weights, strict=True):
+                own += jnp.einsum("k,kqd,kq,kqe->de", taken, C, w, C) + 2.0 * jnp.einsum("k,kqd,kqe->de", taken, L, L)
+            return own
+
+        own = jax.lax.map(inform, jnp.array(SIDES, dtype=float)).mean(0)
+        return at.criterion.rate(at.others + at.places @ own @ at.places.T, power, jnp)[0]
+
+    return jax.value_and_grad(rate)(inputs)
+
+
+def _see(model: Model, side: Array, theta: Array) -> tuple[list[tuple[Array, Array]], list[Array]]:
+    """Return the values of all samples of each sensor and log sigma, (K, q) each; and the weights ``1 / sigma**2``."""
+    p = theta[model.structure.N :]
+    path = propagate(model, theta[: model.structure.N], p, side)
+    found, weights = [], []
+    for k, sensor in enumerate(model.structure.measurements):
+        samples, states = see_samples(model, path, k, p)
+        values = jax.vmap(partial(model.sample_residual, k), in_axes=(0, 0, None))(samples, states, p)
+        logs = jnp.zeros_like(values)
+        if sensor.sigma:
+            logs = jax.vmap(partial(model.log_sigma, k), in_axes=(0, None))(samples, p)
+        found.append((values, logs))
+        weights.append(samples.weight * jnp.exp(-2.0 * logs))
+    return found, weights
+
+
 UNUSABLE = 1e3
 """log m of a design whose trajectory cannot be integrated."""
-
-SEARCH = {"eps": 1e-6, "ftol": 1e-6}
-"""Change of an input, as a part of its range, by which its gradient is found; and the part of log m by which it must
-fall in an iteration."""
 
 
 def name_inputs(run: Experiment) -> tuple[str, ...]:
@@ -355,22 +402,44 @@ def improve_input(
     from scipy.optimize import minimize  # here, since importing it takes longer than most fits
 
     lower, width = limits[0], limits[1] - limits[0]
-    free, arguments, others = width > 0, here.keep_samples(taken), here.candidates.others
+    free, background, structure = width > 0, _describe(here, criterion, taken), here.evaluator.structures[here.e]
 
     def place(x: FloatArray) -> FloatArray:
         table = lower.copy()
         table[free] += x * width[free]
         return table
 
-    def rate(x: FloatArray) -> float:
-        information = others + here.inform(here.change_input(arguments, place(x)))
-        return float(criterion.rate(information, power)) if np.isfinite(information).all() else UNUSABLE
+    def rate(x: FloatArray) -> tuple[float, FloatArray]:
+        value, slope = differentiate_criterion(place(x), background, structure=structure, power=power)
+        slope = np.asarray(slope * width)[free]
+        return (float(value), slope) if np.isfinite([value, *slope]).all() else (UNUSABLE, np.zeros_like(slope))
 
     found = []
-    for start in starts:
-        x = np.clip((start - lower)[free] / width[free], 0.0, 1.0)
-        found.append(minimize(rate, x, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(x), options=SEARCH))
+    with use_float64(), use_compilation_cache():
+        for start in starts:
+            x = np.clip((start - lower)[free] / width[free], 0.0, 1.0)
+            found.append(minimize(rate, x, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(x)))
     return place(min(found, key=lambda end: end.fun).x)
+
+
+def _describe(here: Nominal, criterion: Criterion, taken: Sequence[NDArray[np.bool_]]) -> Background:
+    """Return what does not change."""
+    problem, e, mesh = here.problem, here.e, here.evaluator.meshes[here.e]
+    run, mesh = problem.experiments[e], mesh.pad_to(1 << mesh.cells.bit_length())  # few lengths: few programs
+    knots = replace(run.inputs, values=np.eye(len(run.inputs.times)), units=None)
+    (own, mine), (tau, p) = problem.own_places[e], problem.vectors(here.theta, e)
+    places = np.zeros((len(here.theta), len(problem.places[e])))
+    places[mine, own] = 1.0
+    lengths = zip(taken, problem.sample_lengths[e], strict=True)
+    return Background(
+        arguments=build_arguments(problem, e, mesh),
+        cells=split_by_cell(knots.signal(run.t0, run.end), mesh),
+        theta=np.append(tau, p),
+        taken=tuple(np.pad(each.astype(float), (0, length - len(each))) for each, length in lengths),
+        others=here.candidates.others,
+        places=places,
+        criterion=criterion,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -597,7 +666,7 @@ def design(
     Notes
     -----
     The information is ``sum C' C / sigma**2``, with the sensitivities C of all samples at theta, plus the inverse
-    variances of priors. Inputs are found by L-BFGS-B: a local optimum, the best of all starts.
+    variances of priors. Inputs are found by L-BFGS-B with the exact gradient: a local optimum, the best of all starts.
     Samples and sensors are found by an exchange algorithm, in turns with the inputs.
 
     See Also
@@ -644,7 +713,7 @@ def design(
             begin = [improve_input(here, rule, min(power, SMOOTH), taken, (lower, upper), begin)]
             changed = replace_inputs(before.problem, e, begin[0])
             here = Nominal(simulate_values(changed, e, nominal, every), e, nominal)
-        choices = (choose_samples(here.candidates, own, lambda F: rule.rate(F, power)) for own in most)
+        choices = (choose_samples(here.candidates, own, lambda F: rule.rate(F, power)[0]) for own in most)
         value, chosen_samples = min(choices, key=lambda choice: choice[0])
         gain = lowest - value
         if gain > 0:
@@ -653,8 +722,8 @@ def design(
         if gain < ENOUGH:
             break
     planned = Nominal(simulate_values(best.problem, e, best.theta, taken), e, best.theta)
-    whole, step = best.candidates.add(np.concatenate(taken)), 1e-5 * best.candidates.information
-    shares = (rule.rate(whole - step, power) - rule.rate(whole + step, power)) / 2e-5  # of each sample
+    slope = rule.rate(best.candidates.add(np.concatenate(taken)), power)[1]
+    shares = -np.einsum("de,kde->k", slope, best.candidates.information)
     return Design(
         run=problem.run_names[e],
         theta_names=problem.theta_names,
@@ -692,8 +761,10 @@ def _check_data(problem: Problem) -> None:
     """Raise ValueError unless all data are `Measurements` with sigma: their information does not depend on values."""
     for name, run in zip(problem.run_names, problem.experiments, strict=True):
         for item in run.data:
-            if not isinstance(item, Measurements) or item.sigma is None:
-                raise ValueError(f"design needs Measurements with sigma, for the data of {name}; got {shorten(item)}.")
+            if not isinstance(item, Measurements):
+                raise ValueError(f"design needs Measurements, for the data of {name}; got {shorten(item)}.")
+            if item.sigma is None:
+                raise ValueError(f"design needs sigma, the standard deviation of the noise, for the data of {name}.")
 
 
 def _find_chosen(problem: Problem, names: Any) -> tuple[NDArray[np.intp], FloatArray]:

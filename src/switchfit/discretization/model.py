@@ -57,7 +57,7 @@ def _polynomial(s: Array, c: Array) -> Array:
 
     Its derivative in s is defined as a polynomial too. JAX would propagate a tangent in every direction through each
     step of Horner's scheme, which took a quarter of an evaluation with a reference signal. The coefficients are data,
-    without tangents.
+    without tangents in all programs but those of `switchfit.experiment_design`, where an input is what is looked for.
     """
     value = c[-1]
     for k in reversed(range(c.shape[0] - 1)):
@@ -66,10 +66,11 @@ def _polynomial(s: Array, c: Array) -> Array:
 
 
 def _polynomial_jvp(at: tuple[Array, Array], direction: tuple[Any, Any]) -> tuple[Array, Array]:
-    (s, c), (s_d, _) = at, direction
+    (s, c), (s_d, c_d) = at, direction
     powers = jnp.arange(1.0, c.shape[0])[:, None]
     slope = _polynomial(s, powers * c[1:]) if c.shape[0] > 1 else jnp.zeros_like(c[0])
-    return _polynomial(s, c), jnp.zeros_like(c[0]) if isinstance(s_d, SymbolicZero) else slope * s_d
+    tangent = jnp.zeros_like(c[0]) if isinstance(s_d, SymbolicZero) else slope * s_d
+    return _polynomial(s, c), tangent if isinstance(c_d, SymbolicZero) else tangent + _polynomial(s, c_d)
 
 
 _polynomial.defjvp(_polynomial_jvp, symbolic_zeros=True)
