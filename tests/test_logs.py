@@ -156,7 +156,6 @@ TIMES = [
     # Since 1970; nanoseconds too, which doubles cannot hold
     ("timestamp,x\n1700000000.25,1\n1700000000.5,2", [0, 0.25], "s", NOVEMBER),
     ("timestamp,x\n1700000000250,1\n1700000000500,2", [0, 250], "ms", NOVEMBER),
-    ("timestamp,x\n1700000000250000,1\n1700000000500000,2", [0, 250_000], "us", NOVEMBER),
     ("timestamp,x\n1700000000250000001,1\n1700000000500000001,2", [0, 250_000_000], "ns", NOVEMBER),
     # Since boot, in microseconds
     ("timestamp,x\n1700000000,1\n1700004001,2", [1.7e9, 1700004001], "", None),
@@ -197,7 +196,6 @@ def test_times(write, text, times, unit, start):
         ("t,x\n0,1\n\n1,two\n", r"a\.csv, line 4, column 'x': 'two' is not a number; leave the cell empty"),
         ('# a\nt,x\n0,1\n\n1,"2\n2,3"\n3,a\n', r"a\.csv, line 6, column 'x': '22,3' is not a number"),
         ("t,x\n0,1\n1,1_0\n", r"a\.csv, line 3, column 'x': '1_0' is not a number"),
-        ("t,x\n0,1\nlate,2\n", r"a\.csv, line 3, column 't': 'late' is not a number"),
         ("t,x\n0,1\n1\n", r"a\.csv, line 3: 1 fields where the header has 2; is a field missing\? repair='drop-bro"),
         ("t,x\n0,5,1,5\n1,5,2,5\n", r"a\.csv, line 2: 4 fields .* decimal commas\? Then separate fields by semicolons"),
         ("t;x\n0,5;1.5\n1;2\n", r"with decimal commas and with decimal points: '0,5' in line 2, '1\.5' in line 2"),

@@ -286,16 +286,9 @@ def test_files_that_are_not_there(project, tmp_path):
     assert f"{path} cannot be built again, since log.csv in {project} is missing" in refuse_to_build(path, project)
 
 
-DAMAGES = [
-    (lambda p: p["files"][0].update(size="big"), "provenance is not what was written"),
-    (lambda p: p.update(versions=[]), "provenance is not what was written"),
-]
-
-
-@pytest.mark.parametrize(("edit", "message"), DAMAGES)
-def test_provenance_that_is_damaged(project, edit, message):
+def test_provenance_that_is_damaged(project):
     content = json.loads(FIT.read_text())
-    edit(content["provenance"])
+    content["provenance"]["files"][0].update(size="big")
     FIT.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=re.escape(f"{FIT} is damaged: {message}")):
+    with pytest.raises(ValueError, match=re.escape(f"{FIT} is damaged: provenance is not what was written")):
         sf.Estimate.load(FIT)

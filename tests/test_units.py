@@ -220,12 +220,9 @@ def test_each_experiment_has_its_own_unit(tmp_path):
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("unit", "message"), [(None, "must be a string such as 's' or 'min'"), ("\n\t", "must not be empty")]
-)
-def test_a_unit_is_a_string_that_is_not_blank(unit, message):
-    with pytest.raises((TypeError, ValueError), match=f"time_unit {message}; got"):
-        run(time_unit=unit)
+def test_a_unit_is_not_blank():
+    with pytest.raises(ValueError, match="time_unit must not be empty; got"):
+        run(time_unit="\n\t")
 
 
 @pytest.mark.parametrize(("given", "unit", "fixed"), [("min", "s", False), ("1", "s", True)])
@@ -243,15 +240,9 @@ def room_folder(tmp_path):
 
 def test_a_problem_file_with_two_units_for_one_run(room_folder):
     path = room_folder / "problem.toml"
-    for old, new, said in (
-        ('time_unit = "min"\n', "", r"experiments\[1\]: transition time 1 has the unit 'min', but time_unit .* is 's'"),
-        ('time_unit = "min"\n', "time_unit = 60\n", r"experiments\[1\]\.time_unit' must be a string; got 60"),
-        ('unit = "min" }', 'unit = "h" }', "transition time 1 has the unit 'h'"),
-    ):
-        assert old in FILE
-        path.write_text(FILE.replace(old, new))
-        with pytest.raises(ValueError, match=said):
-            load_problem(path)
+    path.write_text(FILE.replace('time_unit = "min"\n', ""))
+    with pytest.raises(ValueError, match=r"experiments\[1\]: transition time 1 has the unit 'min', but"):
+        load_problem(path)
 
 
 def test_one_column_of_times_has_one_unit(room_folder):
