@@ -70,8 +70,6 @@ def test_a_function_that_casts_is_refused(mode):
         (lambda t, x, p: -EXACT[0] * p["a"] * x, lambda a: -0.5 * a),
         (lambda t, x, p: -jnp.array([0.1]) * p["a"] * x, lambda a: -0.1 * a),
         (lambda t, x, p: x[jnp.array([0])] * p["a"], lambda a: a),
-        (lambda t, x, p: -np.float64(0.1) * x, lambda a: -0.1),
-        (lambda t, x, p: jnp.maximum(-EXACT[0], -EXACT[1]) * x, lambda a: -0.5),
         (lambda t, x, p: jnp.where(EXACT[:1] > 0.25, x, -x), lambda a: 1.0),
     ],
 )

@@ -57,14 +57,10 @@ NUMBERS = {
     "tf": lambda bad: run(tf=bad(1.1)),
     "transition_times": lambda bad: run(transition_times=bad([0.1])),
     "a parameter": lambda bad: sf.Problem(SYSTEM, run(), {"k": bad(0.1)}),
-    "lower": lambda bad: sf.Parameter(1.0, lower=bad(0.1)),
     "values in a list": lambda bad: samples(values=[bad(0.1), 0.5]),
     "sigma of a channel": lambda bad: samples(values=[[1.0, 2.0]] * 2, sigma=["s", bad(0.1)]),
-    "weights": lambda bad: sf.ReferenceSignal.from_samples(**REFERENCE, weights=bad([0.1])),
-    "input values": lambda bad: sf.Input([0.0, 1.0], bad([0.1, 2.0])),
     "rtol": lambda bad: sf.Problem(SYSTEM, run(), {"k": 1.0}, rtol=bad(0.1)),
     "theta": lambda bad: sf.evaluate(PROBLEM, bad([0.1, 1.0])),
-    "noise": lambda bad: sf.monte_carlo(PROBLEM, 1, noise=bad(0.1)),
 }
 
 
