@@ -106,7 +106,6 @@ def refused(build, error, *said):
         (lambda: system(reset_maps={"grow": grow}), ["reset_maps must be a dict of (mode before, mode after)", "grow"]),
         (lambda: samples(observe=3), ["observe must be a function h(t, x, p); got 3"]),
         (lambda: samples(sigma={"x": 1}), ["sigma must be a number or an array of numbers; got {'x': 1}"]),
-        (lambda: sf.RunningCost(3), ["RunningCost must be a function ell(t, x, p); got 3"]),
         (lambda: sf.ReferenceSignal(TIMES), ["by sf.ReferenceSignal.from_samples(times, values, ...)"]),
         (lambda: sf.Parameter(1.0, prior=0.1), ["must be an sf.Normal or an sf.LogNormal; got 0.1"]),
         (lambda: experiment(mode_sequence="grow"), ["mode_sequence must be a sequence of mode names; got 'grow': giv"]),
@@ -148,7 +147,6 @@ def test_wrong_types(build, said):
         (lambda: samples(delay=math.nan), ["delay (a number, or the name of a parameter) must be finite; got nan"]),
         (lambda: sf.Input([0, 1, 2], [1, 2, 3], kind="cubic"), ["Input needs 4 sample(s) or more; got 3"]),
         (lambda: reference([0, 1, 2, 2, 3], [1, 2, 3, 4, 5]), ["four samples or more in each part; got 2"]),
-        (lambda: reference([0, 1, 2, 3], [1, math.nan, 2, 3]), ["four samples or more in each part; got 3"]),
         (lambda: reference(weights=[1.0, 2.0]), ["weights must have shape (1,) or (1, 1); got (2,)"]),
         (lambda: reference(values=np.zeros((5, 2)), weights=[[1.0, 2.0], [0.0, 1.0]]), ["symmetric and positive semi"]),
         (lambda: reference(weights=[-1.0]), ["positive semi-definite; got [[-1.0]]"]),
@@ -183,8 +181,6 @@ def test_wrong_types(build, said):
         (lambda: problem(rtol=1e-16), ["rtol must lie between 1e-13", "got 1e-16"]),
         (lambda: problem(parameters={"k": "x"}), ["parameter 'k' must be a number, an array or an sf."]),
         (lambda: problem(experiment(transition_times=(KNOWN,)), parameters={"k": KNOWN}), ["Nothing to estimate: eve"]),
-        (lambda: problem(min_duration=-0.5), ["min_duration must be 0 or more; got -0.5"]),
-        (lambda: problem(experiment(initial_state=[1.0, 2.0])), ["as many entries in the system and all experiments;"]),
         (lambda: with_data(samples(values=[[1.0, 2.0]])), ["whole state is compared: its 1 entries; got 2", "-> (2,)"]),
         # Noise, priors and delays of a problem
         (lambda: noisy("s"), ["sigma names 's', which must be a parameter of one number; the problem has k"]),
@@ -254,15 +250,8 @@ def test_a_state_that_blows_up(call):
 
 
 @pytest.mark.parametrize("call", [sf.evaluate, sf.simulate, sf.check_derivatives])
-@pytest.mark.parametrize(
-    ("theta", "said"),
-    [
-        ([0.4, math.nan], ["theta must be finite; got nan at index [1]"]),
-        ([1.5, 1.0], ["must not decrease inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
-    ],
-)
-def test_theta(call, theta, said):
-    refused(lambda: call(GOOD, theta), ValueError, *said)
+def test_theta(call):
+    refused(lambda: call(GOOD, [0.4, math.nan]), ValueError, "theta must be finite; got nan at index [1]")
 
 
 def test_results():

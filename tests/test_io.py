@@ -225,11 +225,7 @@ def test_forms_of_keys(folder, old, new, find, expected):
 
 @pytest.mark.parametrize(
     ("name", "tau"),
-    [
-        ('"built.py:make"', 2.5),
-        ('"built.py:problem"', 2.5),
-        ('{ name = "built.py:make", arguments = { tau = 1.5 } }', 1.5),
-    ],
+    [('"built.py:problem"', 2.5), ('{ name = "built.py:make", arguments = { tau = 1.5 } }', 1.5)],
 )
 def test_problem_built_in_python(folder, name, tau):
     (folder / "built.py").write_text(
@@ -261,7 +257,6 @@ WRONG = [
     ("value = 0.3,", "value = 0.3, prior = { mean = 1.0 },", r"prior needs mean and sd \(normal\), or median"),
     ('"log.csv"', r'"a\u0000b"', "is not a file name"),
     ("room.py:room", "room", r"model 'room' is not known; the built-in models are skid_steer, sliding"),
-    ("rtol = 1e-7", "rtol = -1.0", r"'options\.rtol' must be greater than 0; got -1\.0"),
     ("rtol = 1e-7", 'hessian = "newton"', r"'options\.hessian' must be 'auto', 'exact', 'descent-first'"),
     ("[parameters]", "[parameters", r"is not valid TOML: .*line 3"),
     ('model = "room.py:room"', "", r"the key 'model' is missing; name one of skid_steer, sliding_block, magic"),

@@ -259,17 +259,14 @@ def test_one_column_of_times_has_one_unit(room_folder):
     assert out.read_text().splitlines()[0] == "experiment,t (min),mode,x1"
 
 
-def test_what_is_one_number_has_one_unit(tmp_path):
-    """The shortest duration of all runs, transition times of many fits, a saved fit and its problem."""
+def test_what_is_one_number_has_one_unit():
+    """The shortest duration of all runs, transition times of many fits."""
     minutes, hours = (sf.Problem(room(), run(time_unit=unit), RATES) for unit in ("min", "h"))
     both = [run(time_unit="min"), run(time_unit="h", name="other")]
     with pytest.raises(ValueError, match=r"min_duration must be 0 .* different units \(h, min\); got"):
         sf.Problem(room(), both, RATES, min_duration=1e-3)
     with pytest.raises(ValueError, match="problem 2 has its times in h, the first one in min"):
         sf.estimate_many([minutes, minutes, hours])
-    sf.estimate(minutes, strategy="local").save(tmp_path / "fit.json")
-    with pytest.raises(ValueError, match=r"fit\.json holds times in min, the problem has them in h"):
-        sf.Estimate.load(tmp_path / "fit.json", problem=hours)
 
 
 def test_a_delay_is_a_time():
