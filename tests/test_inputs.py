@@ -103,7 +103,6 @@ def test_columns_of_a_data_frame():
     ("values", "error", "message"),
     [
         ({}, ValueError, "Input values must have a name for each entry of u, .*; got an empty dict"),
-        ({1: SAMPLES}, TypeError, "names in Input values must be strings; got 1"),
         ({"a": SAMPLES, "b": SAMPLES[:3]}, ValueError, r"Input 'b' needs .* got \(7,\) and \(3,\)"),
         ({"a": np.ones((7, 2))}, ValueError, r"Input 'a' needs .* values of shape \(K,\); got \(7,\) and \(7, 2\)"),
     ],

@@ -133,7 +133,6 @@ DATES = [datetime.datetime(2020, 1, 1), datetime.datetime(2020, 1, 2)]
         (np.array(["1.0"]), ValueError, r"got \['1.0'\] \(<U3\)"),
         ({1.0, 2.0}, TypeError, "give a list or an array"),
         ((value for value in (1.0,)), TypeError, "give a list or an array"),
-        (np.array([1.0, None], dtype=object), TypeError, "in which None is not a number"),
         (Fraction(10**400), ValueError, "beyond the largest double"),
         ([[1.0], [2.0, 3.0]], ValueError, "whose rows differ in length"),
         (DATES, TypeError, "dates and time differences are not supported.*np.timedelta64"),
