@@ -31,10 +31,6 @@ def experiment(**changes):
     return sf.Experiment(**(given | changes))
 
 
-def three_modes(times, **changes):
-    return experiment(mode_sequence=("grow", "shrink", "grow"), transition_times=times, **changes)
-
-
 def problem(run=None, of=None, parameters=None, **settings):
     parameters = {"k": 1.0} if parameters is None else parameters
     return sf.Problem(system() if of is None else of, experiment() if run is None else run, parameters, **settings)
@@ -66,12 +62,8 @@ def starting_at(initial_state):
     return problem(of=system(initial_state=initial_state))
 
 
-def with_modes(mode, run=None, **changes):
-    return problem(run, system(modes={"grow": mode, "shrink": decay}, **changes))
-
-
-def resetting(reset_map):
-    return problem(of=system(reset_maps={("grow", "shrink"): reset_map}))
+def with_modes(mode, run=None):
+    return problem(run, system(modes={"grow": mode, "shrink": decay}))
 
 
 def on_a_long_horizon(mode):
@@ -82,20 +74,13 @@ def two(t, x, p):
     return jnp.zeros(2)
 
 
-def loud(t, x, p):
-    raise AssertionError("not here")
-
-
 GOOD = problem()
 RUNNING = sf.RunningCost(lambda t, x, p: x[0])
-TERMINAL = sf.TerminalCost(lambda x, p: x[0])
 BROKEN = sf.RunningCost(lambda t, x, p: jnp.sqrt(0.3 - t))
-UP_TO_HALF, UP_TO_TWO = sf.Input([0.0, 0.5], [1.0, 2.0], kind="linear"), samples([0.0, 2.0], [1.0, 1.0])
 KNOWN = sf.Parameter(0.4, fixed=True)
 NOISE = {"k": 1.0, "s": sf.Parameter(0.1, lower=0.01)}
 PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
 LATE = {"k": 1.0, "d": sf.Parameter(0.1, 0.0, 0.3)}
-DELAYED = with_data(seen(sigma=1.0, delay="d"), parameters=LATE)
 
 
 def refused(build, error, *said):
@@ -114,26 +99,15 @@ def refused(build, error, *said):
         (lambda: system(modes={1: grow}), ["mode names must be strings; got 1"]),
         (lambda: system(modes={"grow": 3}), ["mode 'grow' must be a function f(t, x, p); got 3"]),
         (lambda: system(reset_maps={"grow": grow}), ["reset_maps must be a dict of (mode before, mode after)", "grow"]),
-        (lambda: system(reset_maps={("grow", "shrink"): 1}), ["reset map ('grow', 'shrink') must be a function"]),
-        (lambda: system(state_names="x"), ["state_names must be a sequence of strings", "got 'x': give a list or a t"]),
         (lambda: samples(observe=3), ["observe must be a function h(t, x, p); got 3"]),
         (lambda: samples(sigma={"x": 1}), ["sigma must be a number or an array of numbers; got {'x': 1}"]),
-        (
-            lambda: samples(values=[[1.0, 2.0]], sigma=["s", None]),
-            ["sigma (a number, or the name of", "number", "None"],
-        ),
-        (lambda: sf.RunningCost(3), ["RunningCost must be a function ell(t, x, p); got 3"]),
-        (lambda: sf.TerminalCost(3), ["TerminalCost must be a function phi(x, p); got 3"]),
         (lambda: sf.ReferenceSignal(TIMES), ["by sf.ReferenceSignal.from_samples(times, values, ...)"]),
         (lambda: sf.Parameter(1.0, prior=0.1), ["must be an sf.Normal or an sf.LogNormal; got 0.1"]),
         (lambda: experiment(mode_sequence="grow"), ["mode_sequence must be a sequence of mode names; got 'grow': giv"]),
-        (lambda: experiment(transition_times=[None]), ["a transition time must be a number", "None"]),
-        (lambda: experiment(inputs=3), ["inputs must be an sf.Input; got int"]),
         (lambda: experiment(data=[SAMPLES, 3]), ["data must be sf.Measurements", "or a list of them; got int"]),
         (lambda: problem(of=3), ["system must be an sf.HybridSystem; got int"]),
         (lambda: problem([]), ["experiments must be an sf.Experiment or a non-empty list of them; got []"]),
         (lambda: problem(parameters=["k"]), ["parameters must be a dict of name -> value", "got ['k']"]),
-        (lambda: problem(parameters={"k": 1.0, 1: 2.0}), ["parameter names must be strings; got 1"]),
     ],
 )
 def test_wrong_types(build, said):
@@ -145,131 +119,86 @@ def test_wrong_types(build, said):
     [
         # Systems
         (lambda: system(modes={}), ["modes must be a non-empty dict", "got {}"]),
-        (lambda: system(initial_state="a"), ["initial_state must be an array of numbers", "got 'a'"]),
         (lambda: system(initial_state=[]), ["initial_state must have shape (n,)", "got shape (0,)"]),
         (lambda: system(initial_state=[math.nan]), ["initial_state must be finite; got nan at index [0]"]),
         (lambda: system(reset_maps={("grow", "fall"): grow}), ["reset_maps names the unknown mode 'fall'; the modes"]),
-        (lambda: system(state_names=("x", "y")), ["state_names must have one entry for each of the 1 states; got ('x"]),
         (lambda: problem(of=system(initial_state=lambda p: p["k"][None], state_names=("x", "y"))), ["of the 1 states"]),
         # Data
         (lambda: samples([0.0, 0.0], [1.0, 2.0]), ["must increase strictly; got 0.0 followed by 0.0"]),
         (lambda: samples([0.0, 1.0], [1.0]), ["values of shape (K,) or (K, q); got (2,) and (1,)"]),
-        (lambda: samples([], []), ["Measurements needs 1 sample(s) or more; got 0"]),
         (lambda: samples([], np.empty((0, 0))), ["Measurements needs 1 sample(s) or more; got 0"]),
         (lambda: samples([], np.empty((0, 2)), sigma=np.empty((0, 2))), ["sigma must be", "shape (2,)"]),
         (lambda: samples([math.nan], [1.0]), ["Measurements times must be finite; got nan at index [0]"]),
-        (lambda: samples("a", "b"), ["Measurements times must be a number or a date; got 'a'"]),
         (lambda: samples([0.0], [[[1.0]]]), ["values of shape (K,) or (K, q)", "(1,) and (1, 1, 1)"]),
         (lambda: samples([0.0], [math.inf]), ["must be finite, or NaN where a sample is missing"]),
         (lambda: samples([0.0], [math.nan]), ["Measurements values are all NaN: there is nothing to fit"]),
         (lambda: samples(sigma=0.0), ["sigma must be positive and finite", "0.0"]),
         (lambda: samples(sigma=[1.0, 2.0]), ["sigma must be", "of shape (1,) (one per channel)", "(2,)"]),
         (lambda: samples(sigma=["s", 1.0]), ["sigma must have one entry for each of the 1 channels"]),
-        (lambda: samples(names=("a", "b")), ["names must have one entry for each of the 1 channels"]),
         (lambda: samples(loss="Huber"), ["one of linear, soft_l1, huber, cauchy; got 'Huber'"]),
         (lambda: samples(sigma=1.0, loss="huber", loss_scale=0.0), ["loss_scale must be positive", "0.0"]),
         (lambda: samples(loss="huber"), ["loss='huber' measures residuals in units of sigma: give it"]),
         (lambda: samples(sigma="s", loss="cauchy"), ["needs a loss_scale above 1", "got 1.0"]),
         (lambda: samples(delay=math.nan), ["delay (a number, or the name of a parameter) must be finite; got nan"]),
-        (lambda: samples(delay=[1.0, 2.0]), ["delay (a number, or the name of a parameter) must be a"]),
-        (lambda: sf.Input([0.0], [1.0], kind="step"), ["'hold', 'linear' or 'cubic'; got 'step'"]),
         (lambda: sf.Input([0, 1, 2], [1, 2, 3], kind="cubic"), ["Input needs 4 sample(s) or more; got 3"]),
-        (lambda: sf.Input([0.0], [math.nan]), ["Input values must be finite; got nan at index [0]"]),
-        (lambda: reference([0, 1, 2], [1, 2, 3]), ["ReferenceSignal needs 4 sample(s) or more; got 3"]),
         (lambda: reference([0, 1, 2, 2, 3], [1, 2, 3, 4, 5]), ["four samples or more in each part; got 2"]),
-        (lambda: reference([0, 1, 2, 3], [1, math.nan, 2, 3]), ["four samples or more in each part; got 3"]),
-        (lambda: reference(values=[1, 2, math.inf, 4, 5]), ["must be finite, or NaN", "got infinity"]),
-        (lambda: reference(lowpass_hz=0), ["lowpass_hz must be positive; got 0"]),
         (lambda: reference(weights=[1.0, 2.0]), ["weights must have shape (1,) or (1, 1); got (2,)"]),
         (lambda: reference(values=np.zeros((5, 2)), weights=[[1.0, 2.0], [0.0, 1.0]]), ["symmetric and positive semi"]),
         (lambda: reference(weights=[-1.0]), ["positive semi-definite; got [[-1.0]]"]),
         # Parameters
-        (lambda: sf.Parameter("a"), ["Parameter value must be a number or a date; got 'a'"]),
         (lambda: sf.Parameter([1.0, 2.0], lower=[1, 2, 3]), ["lower must fit the value, of shape (2,)", "1.0, 2.0, 3"]),
         (lambda: sf.Parameter([]), ["Parameter value must have one entry or more"]),
         (lambda: sf.Parameter(math.nan), ["Parameter value must be finite; got nan"]),
         (lambda: sf.Parameter(1.5, lower=2.0, upper=1.0), ["value 1.5 lies outside its bounds [2.0, 1.0]"]),
-        (lambda: sf.Parameter(1.0, scale="ln"), ["Parameter scale must be 'linear' or 'log'; got 'ln'"]),
         (lambda: sf.Parameter(0.0, scale="log"), ["with scale='log' must be positive; got 0.0"]),
         (lambda: sf.Parameter(1.0, -1.0, scale="log"), ["with scale='log' must be positive", "lower bound -1.0"]),
         (lambda: sf.Parameter(1.0, prior=sf.Normal([1, 2], 1)), ["prior must fit the value, of shape ()"]),
         (lambda: sf.Parameter(1.0, prior=sf.LogNormal(1.0, 0.1)), ["needs a lower bound above 0", "lower bound -inf"]),
-        (lambda: sf.Normal(0.0, 0.0), ["Normal sd must be positive and finite", "got 0.0"]),
         (lambda: sf.LogNormal(0.0, 1.0), ["LogNormal median must be positive; got 0.0"]),
         # Experiments
         (lambda: experiment(t0=1.0, tf=0.0), ["finite horizon with t0 < tf; got (1.0, 0.0)"]),
-        (lambda: experiment(tf="end"), ["tf must be a number", "got 'end'"]),
         (lambda: experiment(t0=[0.0, 1.0]), ["t0 must be a single number; got [0.0, 1.0]"]),
         (lambda: experiment(mode_sequence=()), ["mode_sequence is empty; name at least one mode"]),
         (lambda: experiment(transition_times=()), ["one fewer than the 2 modes", "got 0"]),
         (lambda: experiment(transition_times=(1.5,)), ["increase strictly inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
         (lambda: experiment(transition_times=(math.nan,)), ["a transition time must be a number", "must be finite; g"]),
-        (lambda: three_modes((0.5, 0.5)), ["transition_times must increase strictly", "got [0.5, 0.5]"]),
-        (lambda: three_modes([[0.5, 0.6], 0.7]), ["transition time 1 must be a single number", "(2,)"]),
-        (lambda: experiment(inputs=UP_TO_HALF), ["known over (t0, tf) = (0.0, 1.0); its samples reach from 0.0 to 0."]),
-        (lambda: experiment(initial_state=[math.nan]), ["initial_state must be finite; got nan at index [0]"]),
+        (lambda: experiment(transition_times=[[0.5, 0.6]]), ["transition time 1 must be a single number", "(2,)"]),
         (lambda: experiment(data=[]), ["data is empty: an experiment needs at least one cost"]),
         (lambda: experiment(data=samples([-1, 0.5, 2], [1, 1, 1])), ["inside [t0, tf] = [0.0, 1.0]; 2 of 3 do not"]),
         (lambda: experiment(data=reference(TIMES / 2)), ["over (t0, tf) = (0.0, 1.0)", "from 0.0 to 0.5", "Give t0"]),
         # What the horizon is taken from
         (lambda: experiment(data=RUNNING, t0=None, tf=None), ["t0 and tf must be given, as nothing among the data (R"]),
-        (lambda: experiment(data=TERMINAL, tf=None), ["tf must be given, as nothing among the data (TerminalCost) ha"]),
         (lambda: experiment(data=samples(), t0=None, tf=None), ["got (0.5, 0.5) (t0 and tf from the data)"]),
-        (lambda: experiment(t0=2.0, tf=None), ["t0 < tf; got (2.0, 1.0) (tf from the data)"]),
-        (lambda: experiment(t0=None, tf=sf.Parameter(-1.0, upper=2.0)), ["t0 < tf; got (0.0, -1.0) (t0 from the data"]),
-        (lambda: experiment(data=[UP_TO_TWO, reference()], tf=None), ["over (t0, tf) = (0.0, 2.0)", "Give t0 and tf"]),
         # Problems
-        (lambda: problem(experiment(mode_sequence=("grow", "fall"))), ["unknown mode 'fall'; the modes are grow, s"]),
         (lambda: problem(solver="euler"), ["solver must be 'auto', 'explicit' or 'stiff'; got 'euler'"]),
         (lambda: problem(rtol=0), ["rtol must be positive; got 0.0"]),
         (lambda: problem(rtol=1e-16), ["rtol must lie between 1e-13", "got 1e-16"]),
-        (lambda: problem(atol=-1.0), ["atol must be positive; got -1.0"]),
         (lambda: problem(parameters={"k": "x"}), ["parameter 'k' must be a number, an array or an sf."]),
         (lambda: problem(experiment(transition_times=(KNOWN,)), parameters={"k": KNOWN}), ["Nothing to estimate: eve"]),
-        (lambda: problem(parameters={"k": 1.0, "tau_1": 1.0}), ["Two unknowns share a name: tau_1"]),
-        (lambda: problem(min_duration=0.5), ["min_duration is 0.5 s, but the guess gives mode 1 ('grow')"]),
-        (lambda: problem([experiment(), three_modes((0.4, 0.6))], min_duration=0.3), ["mode 2 ('shrink') of run2 onl"]),
-        (lambda: problem(min_duration=-0.5), ["min_duration must be 0 or more; got -0.5"]),
-        (lambda: problem(experiment(initial_state=[1.0, 2.0])), ["as many entries in the system and all experiments;"]),
         (lambda: with_data(samples(values=[[1.0, 2.0]])), ["whole state is compared: its 1 entries; got 2", "-> (2,)"]),
         # Noise, priors and delays of a problem
         (lambda: noisy("s"), ["sigma names 's', which must be a parameter of one number; the problem has k"]),
         (lambda: noisy("s", {"s": 0.1}), ["which must stay positive", "lower bound -inf"]),
-        (lambda: noisy("s", {"s": sf.Parameter([0.1], lower=0.01)}), ["sigma names 's', which must be a parameter of"]),
         (lambda: with_data(seen(), seen(sigma="s"), parameters=NOISE), ["sigma is left out in some Measurements, and"]),
         (lambda: noisy(None, PRIOR), ["something is weighed against the noise: a prior", "sigma is left out"]),
-        (lambda: noisy(0.1, delay="late"), ["delay names 'late', which must be a parameter of one number"]),
-        (lambda: noisy(0.1, {"d": 0.0}, delay="d"), ["may lie in [-inf, inf]", "only from 0 to 0 s are all"]),
         (lambda: noisy(0.1, LATE, delay="d"), ["the delay 'd' may lie in [0.0, 0.3]", "narrower bounds, move t0"]),
         (lambda: noisy(0.1, delay=0.1), ["Measurements times less the delay of 0.1 must lie inside"]),
-        (lambda: sf.evaluate(DELAYED, [0.4, 1.0, 0.6]), ["delays with which samples are of moments from -0.1 to -0.1"]),
         # Functions of other kinds than modes
         (lambda: problem(experiment(inputs=sf.Input([0.0], [1.0]))), ["is called as f(t, x, p, u), but takes the arg"]),
-        (lambda: with_modes(lambda t, x, p: x[0], initial_state=[1.0, 2.0]), ["mode 'grow'", "shape (2,); got shape"]),
-        (lambda: resetting(two), ["reset map ('grow', 'shrink')", "R(t, x, p) must return an array of shape (1,); go"]),
+        (
+            lambda: problem(of=system(reset_maps={("grow", "shrink"): two})),
+            ["reset map ('grow', 'shrink')", "R(t, x, p) must "],
+        ),
         (lambda: starting_at(lambda p: p["k"]), ["initial_state(p) must return an array of shape (n,); got shape ()"]),
-        (lambda: starting_at(lambda p: [p["k"] if p["k"] > 0 else 1.0]), ["initial_state branches on the value of t"]),
-        (lambda: starting_at(lambda: [1.0]), ["is called as initial_state(p), but takes the arguments ()"]),
         (lambda: with_data(samples(observe=two)), ["observe: h(t, x, p)", "shape (1,); got shape (2,)"]),
-        (lambda: with_data(reference(observe=lambda t, x, p: [p["q"]])), ["observe reads 'q'"]),
         (lambda: with_data(sf.RunningCost(two)), ["RunningCost: ell(t, x, p)", "shape (); got shape (2,)"]),
         (lambda: with_data(sf.TerminalCost(grow)), ["TerminalCost is called as phi(x, p), but takes the arguments (t"]),
         # Where the guess cannot be integrated
-        (
-            lambda: sf.evaluate(with_modes(lambda t, x, p: x * jnp.sqrt(0.3 - t))),
-            ["mode 'grow' returned [nan] at t = 0.3", "x = [1.", "guess"],
-        ),
         (lambda: sf.evaluate(on_a_long_horizon(lambda t, x, p: 1000.0 * x)), ["at t = 0.7", "grows without bound"]),
         (lambda: sf.evaluate(with_data(BROKEN)), ["a running cost in mode 'grow' returned nan at t = 0.3", "x = ["]),
         (lambda: sf.evaluate(starting_at(lambda p: [jnp.sqrt(-p["k"])])), ["at p = {'k': 1.0} returned [nan]"]),
-        (lambda: sf.evaluate(resetting(lambda t, x, p: jnp.sqrt(-x))), ["('grow', 'shrink') at t = 0.4 s, x = [1.49"]),
         # Calls
         (lambda: sf.evaluate(GOOD, method="backward"), ["one of auto, forward, discrete-adjoint, adjoint"]),
-        (lambda: sf.evaluate(problem(three_modes((0.3, 0.6))), [0.6, 0.3, 1.0]), ["times in theta", "[0.6, 0.3]"]),
-        (lambda: sf.simulate(GOOD, experiment=1), ["experiment must lie in 0..0; got 1"]),
-        (lambda: sf.estimate(GOOD, hessian="full"), ["hessian must be one of auto, exact, descent-first"]),
-        (lambda: sf.estimate(GOOD, tolerance=0.0), ["tolerance must be positive; got 0.0"]),
-        (lambda: sf.estimate(GOOD, max_iterations=-1), ["max_iterations must not be negative; got -1"]),
     ],
 )
 def test_wrong_values(build, said):
@@ -281,9 +210,7 @@ def test_wrong_values(build, said):
     [
         (lambda t, x, p: jnp.zeros(2), ["f(t, x, p) must return an array of shape (1,); got shape (2,)"]),
         (lambda t, x, p: x.astype(jnp.float32), ["must return float64; got float32", "do not cast them"]),
-        pytest.param(lambda t, x, p: x * 1j, ["must return float64; got complex128"], marks=pytest.mark.promotes),
         (lambda t, x, p: None, ["must return an array of numbers; got None"]),
-        (lambda t, x, p: [x, [x, x]], ["must return an array of numbers; got [JitTracer"]),
         (lambda t, x, p: x if x[0] > 0 else -x, ["branches on the value of t, x or p (an `if`", "make it a mode with"]),
         (lambda t, x, p: math.sin(x[0]) * x, ["branches on the value of t, x or p", "Write it with jax.numpy"]),
         (lambda t, x, p: np.array([x[0]]), ["branches on the value of t, x or p", "numpy function"]),
@@ -291,8 +218,6 @@ def test_wrong_values(build, said):
         (lambda t, x, p: p["q"] * x, ["reads 'q', which is not there: p has k"]),
         (lambda t, x: x, ["is called as f(t, x, p), but takes the arguments (t, x)"]),
         (lambda t, x, p: x.velocity, ["f(t, x, p) raised AttributeError", "velocity"]),
-        (lambda t, x, p: np.ones(3) + np.ones(2), ["f(t, x, p) raised ValueError: operands could not be broadcast"]),
-        (loud, ["f(t, x, p) raised AssertionError: not here"]),
     ],
 )
 def test_vector_field(mode, said):
@@ -317,26 +242,14 @@ def test_a_state_that_blows_up(call):
 
 
 @pytest.mark.parametrize("call", [sf.evaluate, sf.simulate, sf.check_derivatives])
-@pytest.mark.parametrize(
-    ("theta", "said"),
-    [
-        ([0.4], ["theta must have shape (2,): tau_1, k; got shape (1,)"]),
-        ([0.4, math.nan], ["theta must be finite; got nan at index [1]"]),
-        ("guess", ["theta must be a number or an array of numbers; got 'guess'"]),
-        ([1.5, 1.0], ["must not decrease inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
-    ],
-)
-def test_theta(call, theta, said):
-    refused(lambda: call(GOOD, theta), ValueError, *said)
+def test_theta(call):
+    refused(lambda: call(GOOD, [0.4, math.nan]), ValueError, "theta must be finite; got nan at index [1]")
 
 
 def test_results():
     """Two runs, not converged: what the results refuse does not depend on that."""
     fit = sf.estimate(problem([experiment(), experiment()]), max_iterations=0)
     refused(lambda: fit.trajectory, ValueError, "There are 2 experiments: use .trajectories[e]")
-    for level in (0.0, 95.0, math.nan):
-        said = f"level must lie between 0 and 1; got {level}"
-        refused(lambda level=level: fit.confidence_intervals(level), ValueError, said)
 
 
 # --- indices ----------------------------------------------------------------------------------------------------------
@@ -354,8 +267,6 @@ def problem_of_two_states(mode):
         (lambda t, x, p: x * x[2], "reads index 2 of an array of size 2"),
         (lambda t, x, p: x * p["gains"][0, 3], r"reads index 3 of axis 1 of an array of shape \(2, 3\)"),
         (lambda t, x, p: x * jax.jit(lambda x: x[5])(x), "reads index 5 of an array of size 2"),
-        (lambda t, x, p: jnp.where(t > 1.0, x[4], 0.0) * x, "reads index 4 of an array of size 2"),
-        (lambda t, x, p: x.at[5].set(p["a"]), "writes to index 5 of an array of size 2"),
         (lambda t, x, p: x.at[-3].add(p["a"]), "writes to index -3 of an array of size 2"),
         (lambda t, x, p: x.at[2].apply(jnp.sin), "writes to index 2 of an array of size 2"),
         (lambda t, x, p: jax.jvp(lambda x: x.at[4].set(0.0), (x,), (x,))[1], "writes to index 4 of an array of size 2"),

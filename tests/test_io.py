@@ -200,9 +200,7 @@ def test_loss_delay_priors_and_scales(folder):
         assert part in text
 
 
-INPUTS = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = ["u"] }'
-NAMED = INPUTS.replace('["u"]', '{ left = "u", right = "sd" }')
-LOG_SCALE = ("value = 3.0,", 'value = 3.0, scale = "log",')
+NAMED = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = { left = "u", right = "sd" } }'
 MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
 
 
@@ -213,29 +211,21 @@ MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
         ('["T"]\nsigma', '"room.py:fahrenheit"\nsigma', lambda p, run: run.data[0].observe(0.0, 10.0, {}), 50.0),
         ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda p, run: run.data[0].weights.tolist(), [[2.0]]),
         ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda p, run: run.initial_state, [17.0]),
-        ("t0 = 0.0", INPUTS, lambda p, run: (run.inputs.kind, *run.inputs.values[2:5]), ("hold", 1, 1, 0)),
         ("t0 = 0.0", NAMED, lambda p, run: [run.inputs.values[name][2] for name in run.inputs.names], [1.0, 0.2]),
         ('"room.py:room"', MAKE, lambda p, run: p.system.initial_state, [18.0]),
-        ('"room.py:room"', '"room.py:make"', lambda p, run: p.system.initial_state, [15.0]),
         ("min_duration = 0.5", "atol = 1e-5", lambda p, run: (p.atol, p.min_duration), (1e-5, 0.0)),
-        (*LOG_SCALE, lambda p, run: p.unknowns.log_names, ("tau_1",)),
     ],
 )
 def test_forms_of_keys(folder, old, new, find, expected):
     driven = ROOM.replace("(t, x, p)", "(t, x, p, u)")
-    (folder / "room.py").write_text(driven if new in (INPUTS, NAMED) else ROOM)
-    longer = [] if new != LOG_SCALE[1] else [("min_duration = 0.5\n", "")]
-    problem = changed(folder, (old, new), *longer).problem
+    (folder / "room.py").write_text(driven if new == NAMED else ROOM)
+    problem = changed(folder, (old, new)).problem
     assert find(problem, problem.experiments[0]) == expected
 
 
 @pytest.mark.parametrize(
     ("name", "tau"),
-    [
-        ('"built.py:make"', 2.5),
-        ('"built.py:problem"', 2.5),
-        ('{ name = "built.py:make", arguments = { tau = 1.5 } }', 1.5),
-    ],
+    [('"built.py:problem"', 2.5), ('{ name = "built.py:make", arguments = { tau = 1.5 } }', 1.5)],
 )
 def test_problem_built_in_python(folder, name, tau):
     (folder / "built.py").write_text(
@@ -259,10 +249,7 @@ def test_examples_load(path):
 
 
 WRONG = [
-    ("tf = 6.0", "t_f = 6.0", r"unknown key 'experiments\[1\]\.t_f'; did you mean 'tf'\?"),
     ("upper = 5.0 }", "uper = 5.0 }", r"'experiments\[1\]\.transition_times\[1\]\.uper'; did you mean 'upper'\?"),
-    ('columns = ["T"]', 'columns = ["temp"]', r"log\.csv has no column 'temp'; its columns are t, T, sd, u"),
-    ('time = "t"', 'time = "T"', r"log\.csv, column 'T': the time of sample 3 is missing"),
     ('time = "t"', 'time = "t"\nwindow = [10, 20]', r"no time in column 't' lies in the window \[10\.0, 20\.0\]; "),
     ('observe = ["T"]', 'observe = ["x"]', r"data\[1\]: observe names the unknown state 'x'; the states are T"),
     ("sigma = 0.1", 'sigma = 0.1\nkind = "reference"', r"sigma does not belong to kind = 'reference': meas"),
@@ -270,7 +257,6 @@ WRONG = [
     ("value = 0.3,", "value = 0.3, prior = { mean = 1.0 },", r"prior needs mean and sd \(normal\), or median"),
     ('"log.csv"', r'"a\u0000b"', "is not a file name"),
     ("room.py:room", "room", r"model 'room' is not known; the built-in models are skid_steer, sliding"),
-    ("rtol = 1e-7", "rtol = -1.0", r"'options\.rtol' must be greater than 0; got -1\.0"),
     ("rtol = 1e-7", 'hessian = "newton"', r"'options\.hessian' must be 'auto', 'exact', 'descent-first'"),
     ("[parameters]", "[parameters", r"is not valid TOML: .*line 3"),
     ('model = "room.py:room"', "", r"the key 'model' is missing; name one of skid_steer, sliding_block, magic"),
@@ -310,7 +296,6 @@ BEGIN = r" is not valid TOML: .* begin with: switchfit init NAME --from .*"
         ("a.toml", b"a = " + b"[" * 5000, r"a\.toml is not valid TOML: maximum recursion depth"),
         ("log.csv", b"t,x\n0,1\n", rf"log\.csv{BEGIN}log\.csv$"),
         ("a.toml", b'model = "skid_steer"\n', r"\[\[experiments\]\] is missing; give at least one"),
-        ("a.toml", b'problem = "room.py:seven"', r"must be an sf\.Problem or a function that returns one; got int"),
         ("a.toml", b'problem = "room.py:seven"\n[options]\nrtol = 1', r"with 'problem', rtol is set where the sf\.Pro"),
     ],
 )
@@ -329,7 +314,6 @@ def test_files_that_hold_no_problem(folder, name, content, message):
     [
         ("x = 1\ny = x +\n", r"Running .*m\.py failed: .*m\.py, line 2: SyntaxError: invalid syntax"),
         ("def f():\n    return 1 / 0\n\nx = f()\n", r"m\.py, line 2, in f: ZeroDivisionError: division by zero"),
-        ("import nowhere_to_be_found\n", r"m\.py, line 1: ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
         ("raise SystemExit('bye.')\n", r"^Running m\.py failed: m\.py, line 1: SystemExit: bye\.$"),
     ],
 )

@@ -165,13 +165,9 @@ def test_a_fit_that_did_not_converge_is_exit_code_1(project):
     ("arguments", "said"),
     [
         (("validate", "nowhere.json", "other.csv"), "file 'nowhere.json' does not exist."),
-        (("compare", "out", FIT), "'out' is a directory."),
         (("validate", "problem.toml", "other.csv"), "problem.toml is not a saved estimate"),
         (("validate", FIT, "nowhere.csv"), "nowhere.csv; check the name and the folder."),
-        (("validate", FIT, "nowhere.toml"), "There is no problem file nowhere.toml"),
-        (("validate", FIT), "Missing argument 'LOG|PROBLEM.toml'"),
         (("validate", "heater.json", "other.csv"), "in the script that fitted it: estimate.validate(...), sf.compare"),
-        (("compare", FIT), "compare needs two estimates or more; got 1."),
     ],
 )
 def test_what_cannot_be_read(project, arguments, said):
@@ -286,16 +282,9 @@ def test_files_that_are_not_there(project, tmp_path):
     assert f"{path} cannot be built again, since log.csv in {project} is missing" in refuse_to_build(path, project)
 
 
-DAMAGES = [
-    (lambda p: p["files"][0].update(size="big"), "provenance is not what was written"),
-    (lambda p: p.update(versions=[]), "provenance is not what was written"),
-]
-
-
-@pytest.mark.parametrize(("edit", "message"), DAMAGES)
-def test_provenance_that_is_damaged(project, edit, message):
+def test_provenance_that_is_damaged(project):
     content = json.loads(FIT.read_text())
-    edit(content["provenance"])
+    content["provenance"]["files"][0].update(size="big")
     FIT.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=re.escape(f"{FIT} is damaged: {message}")):
+    with pytest.raises(ValueError, match=re.escape(f"{FIT} is damaged: provenance is not what was written")):
         sf.Estimate.load(FIT)

@@ -220,12 +220,9 @@ def test_each_experiment_has_its_own_unit(tmp_path):
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("unit", "message"), [(None, "must be a string such as 's' or 'min'"), ("\n\t", "must not be empty")]
-)
-def test_a_unit_is_a_string_that_is_not_blank(unit, message):
-    with pytest.raises((TypeError, ValueError), match=f"time_unit {message}; got"):
-        run(time_unit=unit)
+def test_a_unit_is_not_blank():
+    with pytest.raises(ValueError, match="time_unit must not be empty; got"):
+        run(time_unit="\n\t")
 
 
 @pytest.mark.parametrize(("given", "unit", "fixed"), [("min", "s", False), ("1", "s", True)])
@@ -243,15 +240,9 @@ def room_folder(tmp_path):
 
 def test_a_problem_file_with_two_units_for_one_run(room_folder):
     path = room_folder / "problem.toml"
-    for old, new, said in (
-        ('time_unit = "min"\n', "", r"experiments\[1\]: transition time 1 has the unit 'min', but time_unit .* is 's'"),
-        ('time_unit = "min"\n', "time_unit = 60\n", r"experiments\[1\]\.time_unit' must be a string; got 60"),
-        ('unit = "min" }', 'unit = "h" }', "transition time 1 has the unit 'h'"),
-    ):
-        assert old in FILE
-        path.write_text(FILE.replace(old, new))
-        with pytest.raises(ValueError, match=said):
-            load_problem(path)
+    path.write_text(FILE.replace('time_unit = "min"\n', ""))
+    with pytest.raises(ValueError, match=r"experiments\[1\]: transition time 1 has the unit 'min', but"):
+        load_problem(path)
 
 
 def test_one_column_of_times_has_one_unit(room_folder):
@@ -268,17 +259,14 @@ def test_one_column_of_times_has_one_unit(room_folder):
     assert out.read_text().splitlines()[0] == "experiment,t (min),mode,x1"
 
 
-def test_what_is_one_number_has_one_unit(tmp_path):
-    """The shortest duration of all runs, transition times of many fits, a saved fit and its problem."""
+def test_what_is_one_number_has_one_unit():
+    """The shortest duration of all runs, transition times of many fits."""
     minutes, hours = (sf.Problem(room(), run(time_unit=unit), RATES) for unit in ("min", "h"))
     both = [run(time_unit="min"), run(time_unit="h", name="other")]
     with pytest.raises(ValueError, match=r"min_duration must be 0 .* different units \(h, min\); got"):
         sf.Problem(room(), both, RATES, min_duration=1e-3)
     with pytest.raises(ValueError, match="problem 2 has its times in h, the first one in min"):
         sf.estimate_many([minutes, minutes, hours])
-    sf.estimate(minutes, strategy="local").save(tmp_path / "fit.json")
-    with pytest.raises(ValueError, match=r"fit\.json holds times in min, the problem has them in h"):
-        sf.Estimate.load(tmp_path / "fit.json", problem=hours)
 
 
 def test_a_delay_is_a_time():
