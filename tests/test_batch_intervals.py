@@ -138,16 +138,6 @@ def test_an_unknown_that_a_bound_holds_has_no_interval():
     assert np.isfinite(many.confidence_intervals()[0, 0]).all()
 
 
-@pytest.mark.parametrize("tau", [2.0, 2.01])
-def test_a_study_covers_the_truth_on_and_beside_a_sample(tau):
-    """As single fits do (benchmarks/coverage.py); with one parabola each 77 % of these intervals hold the truth."""
-    study = sf.monte_carlo(charged(tau, 0, True), 600, theta=[tau])
-    assert 0.92 < study.coverage()[0] < 0.97
-    symmetric = np.abs(study.theta[:, 0] - tau) < 1.96 * study.standard_errors[:, 0]
-    assert symmetric.mean() < 0.84
-    assert study.verdict.level == "good"
-
-
 @pytest.mark.slow
 def test_a_kink_has_an_interval_with_jax_too():
     """Where an evaluation would have to be compiled first, the others keep one parabola."""

@@ -225,15 +225,6 @@ def test_a_time_near_the_largest_float_is_reached_by_implicit_steps(fitted):
     assert found.output_errors[1, 0] < 1e-8
 
 
-def test_bands_in_the_figure_with_each_transition_twice(fitted):
-    found, panel = fitted.predict(), fitted.plot().axes[0]
-    assert np.sum(found.times == fitted.theta[0]) == 2
-    top = max(path.vertices[:, 1].max() for path in panel.collections[1].get_paths())
-    assert top == pytest.approx(found.output_band().max(), rel=1e-9)
-    for without in (fitted.plot(bands=False), replace(fitted, problem=None).plot()):
-        assert not without.axes[0].collections
-
-
 def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known():
     def driven(t, x, p, u):
         return -p["k"] * x + u
@@ -249,10 +240,11 @@ def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known(
         fit("linear").predict([9.0])
 
 
-def test_bands_in_the_figure(fitted):
-    panel, residuals = fitted.plot().axes
+def test_bands_in_the_figure_with_each_transition_twice(fitted):
+    found, (panel, residuals) = fitted.predict(), fitted.plot().axes
+    assert np.sum(found.times == fitted.theta[0]) == 2
     assert len(panel.collections) == len(residuals.collections) == 2
     top = max(path.vertices[:, 1].max() for path in panel.collections[1].get_paths())
-    assert top == pytest.approx(fitted.predict().output_band().max(), rel=1e-9)
+    assert top == pytest.approx(found.output_band().max(), rel=1e-9)
     for without in (fitted.plot(bands=False), replace(fitted, problem=None).plot()):
         assert not without.axes[0].collections

@@ -78,25 +78,14 @@ CASES = {
 }  # fmt: skip
 
 
-COMBINED = "all at once"
-"""The case whose derivatives are checked by default: JAX compiles five programs for each, which takes 20 s."""
-
-
 @pytest.fixture(scope="module", params=CASES)
 def case(request):
     return CASES[request.param]()
 
 
-@pytest.fixture(
-    scope="module", params=[pytest.param(name, marks=[pytest.mark.slow] * (name != COMBINED)) for name in CASES]
-)
-def differentiated(request):
-    return CASES[request.param]()
-
-
 @pytest.mark.slow
-def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(differentiated):
-    check = sf.check_derivatives(differentiated)
+def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(case):
+    check = sf.check_derivatives(case)
     np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
     assert max(check.gradient_gap, check.hessian_gap) < 1e-6
 
@@ -201,7 +190,7 @@ def test_an_unknown_delay_is_found():
 
 @pytest.mark.slow
 def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
-    this = CASES[COMBINED]()
+    this = CASES["all at once"]()
     theta = this.initial_theta
     theta[0] = TIMES[5] - 0.043
     check = sf.check_derivatives(this, theta)
