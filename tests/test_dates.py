@@ -491,16 +491,11 @@ def test_a_log_hands_over_its_dates(cells, zone, first, tmp_path):
 
 FILE = """
 model = "heater.py:HEATER"
-
-[parameters]
-power = 1.5
-loss = 0.1
-
+parameters = {{ power = 1.5, loss = 0.1 }}
 [[experiments]]
 mode_sequence = ["on", "off"]
 time_unit = "d"
 {experiment}
-
 [[experiments.data]]
 file = "{log}"
 columns = ["warmth"]

@@ -122,13 +122,6 @@ def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     assert found.standard_errors[0] == 0.0
 
 
-def test_a_fit_that_passes_samples_does_not_stop_at_them():
-    """The same with a better sample at 0.5: the minimum is at 0.35, where the derivative vanishes."""
-    found = ramp([0.15, 0.45, 0.65], 0.9)
-    assert found.status is sf.Status.CONVERGED
-    assert found.theta[0] == pytest.approx(0.35, abs=1e-9)
-
-
 # Unknowns that the data does not determine
 
 
