@@ -67,15 +67,6 @@ def test_the_dual_programme_against_scipy(seed):
     assert np.linalg.norm(g - rows.T @ lam) == pytest.approx(distance, abs=1e-9)
 
 
-def as_point(evaluate):
-    """The cost, gradient and Hessian that a function of theta and the side returns, as `minimize` wants them."""
-
-    def at(theta, side):
-        return SimpleNamespace(**dict(zip(("cost", "gradient", "hessian"), evaluate(theta, side), strict=True)))
-
-    return at
-
-
 KNOTS = np.arange(0.0, 10.05, 0.5)
 
 
@@ -117,7 +108,10 @@ def test_kinks_hold_and_let_go_inside_the_program_too(share):
         assert np.all((found.left <= 0.0) & (found.gradient >= 0.0) | ~found.held)
         assert found.optimality <= 1e-9
 
-        at = as_point(lambda theta, side, given=(H, centre, weights): kinked(theta, side, *given, np))
+        def at(theta, side, given=(H, centre, weights)):
+            cost, gradient, hessian = kinked(theta, side, *given, np)
+            return SimpleNamespace(cost=cost, gradient=gradient, hessian=hessian)
+
         assert found.cost == pytest.approx(at(found.theta, 1).cost, rel=1e-14)
         for v in rng.standard_normal((50, 3)):
             assert at(found.theta + 1e-6 * v, 1).cost >= found.cost - 1e-14 * abs(found.cost)

@@ -100,17 +100,12 @@ def test_a_minimum_duration_that_is_reached_is_named():
 # Kinks
 
 
-def ramp(values, guess):
-    """x = max(t - tau, 0), at three times."""
-    data = sf.Measurements([0.5, 0.8, 1.0], values, sigma=1.0)
-    return sf.estimate(sf.Problem(models.LATE_RAMP, sf.Experiment(data, ("wait", "ramp"), (guess,), 0.0, 1.0)))
-
-
 @pytest.mark.parametrize("guess", [0.15, 0.45, 0.7])
 def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     """Later samples pull tau below 0.5 with the force 0.3, and a sample at 0.5 that is far too low pushes it up with
     the force 1, but only while tau is below 0.5."""
-    found = ramp([-1.0, 0.5, 0.6], guess)
+    data = sf.Measurements([0.5, 0.8, 1.0], [-1.0, 0.5, 0.6], sigma=1.0)
+    found = sf.estimate(sf.Problem(models.LATE_RAMP, sf.Experiment(data, ("wait", "ramp"), (guess,), 0.0, 1.0)))
     assert found.status is sf.Status.CONVERGED_AT_KINK
     assert found.success
     assert found.theta[0] == 0.5

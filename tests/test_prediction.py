@@ -20,12 +20,8 @@ SIGMA = 0.1
 TIMES = np.linspace(0.25, 6.0, 24)
 
 
-def doubled(t, x, p):
-    return 2.0 * x + p["power"]
-
-
 ROOM = heated_room(0.5)
-JUMPING = heated_room(0.5, reset_maps={("on", "off"): doubled})
+JUMPING = heated_room(0.5, reset_maps={("on", "off"): lambda t, x, p: 2.0 * x + p["power"]})
 
 
 def temperature(t, tau, power, k, *, jump=False):

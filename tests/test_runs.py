@@ -190,12 +190,8 @@ def tanks(count, samples=None, system=TANK, **given):
     return sf.Problem(system, runs, guess)
 
 
-@pytest.fixture(scope="module")
-def fitted():
-    return sf.estimate(tanks(2))
-
-
-def test_the_truth_is_found(fitted):
+def test_the_truth_is_found():
+    fitted = sf.estimate(tanks(2))
     assert fitted.theta_names == (
         "tank0.tau_1", "tank1.tau_1", "k", "c", "r_0", "r_1", "tank0.h(t0)", "tank1.h(t0)",
     )  # fmt: skip
