@@ -61,19 +61,10 @@ CASES = {
     "noise": lambda: problem(sigma="s", more=NOISE),
     "huber": lambda: problem(loss="huber", loss_scale=1.5, outliers=4),
     "soft_l1": lambda: problem(loss="soft_l1", outliers=4),
-    "cauchy": lambda: problem(loss="cauchy", loss_scale=2.0, outliers=4),
-    "noise of one channel, priors": lambda: problem(
-        k=sf.Parameter(2.0, lower=0.1, prior=sf.LogNormal(1.8, 0.02)),
-        tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)),
-        start=[sf.Parameter(1.1, prior=sf.Normal(1.0, 0.01)), 0.0],
-        sigma=["s", 0.03],
-        more=NOISE,
-    ),
-    "delay": lambda: problem(delay="d", more=DELAY),
     "all at once": lambda: problem(
         delay="d", sigma=["s", "s2"], more=DELAY | NOISE | {"s2": NOISE["s"]}, loss="cauchy", loss_scale=2.0,
         k=sf.Parameter(2.0, lower=0.1, prior=sf.LogNormal(1.8, 0.02)), outliers=4,
-        tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)),
+        tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)), start=[sf.Parameter(1.1, prior=sf.Normal(1.0, 0.01)), 0.0],
     ),
 }  # fmt: skip
 
