@@ -138,12 +138,6 @@ def test_losses_are_those_of_scipy(loss):
     np.testing.assert_allclose(influence(loss, scale, r**2), slope, rtol=1e-12)
 
 
-def test_where_rho_bends_down_the_exact_hessian_is_indefinite_and_the_fit_converges():
-    far = problem(k=3.5, loss="cauchy", loss_scale=1.0)
-    assert np.linalg.eigvalsh(sf.evaluate(far).hessian).min() < 0
-    assert sf.estimate(far).status.is_strict_minimum
-
-
 # Priors
 
 

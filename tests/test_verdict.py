@@ -1,6 +1,5 @@
 """The verdict on fits: every rule with a fit that it is about and one just beside it, and known ends."""
 
-import json
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -350,19 +349,7 @@ def test_wrong_ends_are_never_good(name):
     assert "bad" in seen
 
 
-# --- files and the command line ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.usefixtures("quick_certificates")
-def test_a_file_begins_with_the_verdict_and_a_loaded_estimate_has_it(tmp_path):
-    fit, path = straight(np.sin(TIMES), sigma=0.01), tmp_path / "fit.json"
-    fit.save(path)
-    content = json.loads(path.read_text(encoding="utf-8"))
-    assert next(iter(content)) == "verdict"
-    assert list(content["verdict"].items())[:2] == [("level", fit.verdict.level), ("text", str(fit.verdict))]
-    loaded = sf.Estimate.load(path)
-    assert loaded.verdict == fit.verdict
-    assert not loaded.success
+# --- texts ------------------------------------------------------------------------------------------------------------
 
 
 def test_shares_are_never_rounded_up():
