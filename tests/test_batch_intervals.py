@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
+from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem
 from switchfit.batch import simulated
 from switchfit.batch.program import Limits
 from switchfit.batch.study import Study
 from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.walks import Derivatives, Walks, find_ends, trace_walks
-
-SYSTEM = sf.HybridSystem(modes={"rest": rest, "charge": charge}, initial_state=[0.0])
 
 
 def measured(tau, seed, times=TIMES):
@@ -109,7 +107,7 @@ def several_runs(seed, taus=(2.0, 1.51), shift=0.0):
         times = TIMES + shift * seed
         data = sf.Measurements(times, measured(tau, seed + 10 * e, times), sigma=SIGMA)
         runs.append(sf.Experiment(data, ("rest", "charge"), (tau,), 0.0, 4.2))
-    return sf.Problem(SYSTEM, runs, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)})
+    return sf.Problem(charged(2.0, seed).system, runs, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)})
 
 
 @pytest.mark.parametrize(

@@ -452,10 +452,7 @@ def test_the_mesh_is_refined_for_guards():
 # What the defaults promise: J to some 1e-8, its derivatives to some 1e-7, and the solution to 1e-8
 
 
-AWAY = np.array([0.03, 0.02, 0.001])
-
-
-@pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), tuple(models.VEHICLE_TRUTH + AWAY)])
+@pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), (6.03, 10.02, 0.701)])
 def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
     """The paper's problem on its reference of 0.1 s; the last theta is near the solution, where J almost vanishes."""
     problem, theta = build_simulated_problem(), np.array(theta)
