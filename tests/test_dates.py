@@ -66,7 +66,6 @@ NAIVE = {
     "datetime": [dt.datetime.fromisoformat(day) for day in DAYS],
     "date": [dt.date.fromisoformat(day) for day in DAYS],
     "an array of objects": np.array([dt.date.fromisoformat(day) for day in DAYS], dtype=object),
-    "an index": pd.DatetimeIndex(DAYS),
     "a column of pandas": pd.Series(pd.to_datetime(DAYS)),
     "days of polars": pl.Series([dt.date.fromisoformat(day) for day in DAYS]),
     "text of polars": pl.Series(DAYS),
@@ -76,7 +75,6 @@ AWARE = {
     "text": ["2020-03-28T00:00+01:00", "2020-03-29T00:00+01:00", "2020-03-30T00:00+02:00", "2020-03-31T00:00+02:00"],
     "datetime": [dt.datetime.fromisoformat(day).replace(tzinfo=BERLIN) for day in DAYS],
     "an index": pd.DatetimeIndex(DAYS, tz="Europe/Berlin"),
-    "timestamps": list(pd.DatetimeIndex(DAYS, tz="Europe/Berlin")),
     "a column of polars": pl.Series(pd.DatetimeIndex(DAYS, tz="Europe/Berlin")),
     "numbers since 1970": from_epoch([1585350000, 1585436400, 1585519200, 1585605600]),
 }
