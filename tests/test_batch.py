@@ -67,46 +67,6 @@ def test_the_dual_programme_against_scipy(seed):
     assert np.linalg.norm(g - rows.T @ lam) == pytest.approx(distance, abs=1e-9)
 
 
-def valley(theta):
-    """Rosenbrock's function, its gradient and its Hessian, in whatever `theta` is made of."""
-    x, y = theta
-    cost = 100 * (y - x * x) ** 2 + (1 - x) ** 2
-    gradient = [-400 * x * (y - x * x) - 2 * (1 - x), 200 * (y - x * x)]
-    return cost, gradient, [[1200 * x * x - 400 * y + 2, -400 * x], [-400 * x, 200.0]]
-
-
-CASES = {
-    "free": (([[0.0, 0.0]], [-10.0], [-5.0, -5.0], [5.0, 5.0]), [-1.2, 0.7], True),
-    "a row in the way": (([[1.0, -1.0]], [0.1], [-5.0, -5.0], [5.0, np.inf]), [-1.2, -2.0], False),
-    "a corner at the end": (([[-1.0, -1.0]], [-0.4], [-5.0, 0.1], [5.0, 5.0]), [-1.2, 0.7], False),
-}
-"""A row and its offset, bounds, start, and whether the traced optimiser settles it."""
-
-
-def as_point(evaluate):
-    """The cost, gradient and Hessian that a function of theta and the side returns, as `minimize` wants them."""
-
-    def at(theta, side):
-        return SimpleNamespace(**dict(zip(("cost", "gradient", "hessian"), evaluate(theta, side), strict=True)))
-
-    return at
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_traced_optimiser_ends_where_the_other_one_does(name):
-    constraints, start, settled = CASES[name]
-    at = as_point(lambda theta, side: map(np.asarray, valley(theta)))
-    expected = minimize(at, start, constraints=linear(*constraints))
-    with use_float64():
-        none = Breakpoints(np.zeros(0, int), jnp.zeros((0, 1)))
-        evaluate = lambda theta, side: tuple(map(jnp.asarray, valley(theta)))  # noqa: E731
-        task = Task(evaluate, Constraints(*map(jnp.array, constraints)), none, 1e-9, 200)
-        outcome = jax.jit(partial(minimize_traced, task))(jnp.array(start))
-    assert bool(outcome.settled) is settled
-    assert float(outcome.optimality) <= 1e-9
-    np.testing.assert_allclose(outcome.theta, expected.theta, rtol=0, atol=1e-9)
-
-
 KNOTS = np.arange(0.0, 10.05, 0.5)
 
 
@@ -148,7 +108,10 @@ def test_kinks_hold_and_let_go_inside_the_program_too(share):
         assert np.all((found.left <= 0.0) & (found.gradient >= 0.0) | ~found.held)
         assert found.optimality <= 1e-9
 
-        at = as_point(lambda theta, side, given=(H, centre, weights): kinked(theta, side, *given, np))
+        def at(theta, side, given=(H, centre, weights)):
+            cost, gradient, hessian = kinked(theta, side, *given, np)
+            return SimpleNamespace(cost=cost, gradient=gradient, hessian=hessian)
+
         assert found.cost == pytest.approx(at(found.theta, 1).cost, rel=1e-14)
         for v in rng.standard_normal((50, 3)):
             assert at(found.theta + 1e-6 * v, 1).cost >= found.cost - 1e-14 * abs(found.cost)

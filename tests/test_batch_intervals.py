@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
+from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem
 from switchfit.batch import simulated
 from switchfit.batch.program import Limits
 from switchfit.batch.study import Study
 from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.walks import Derivatives, Walks, find_ends, trace_walks
-
-SYSTEM = sf.HybridSystem(modes={"rest": rest, "charge": charge}, initial_state=[0.0])
 
 
 def measured(tau, seed, times=TIMES):
@@ -109,7 +107,7 @@ def several_runs(seed, taus=(2.0, 1.51), shift=0.0):
         times = TIMES + shift * seed
         data = sf.Measurements(times, measured(tau, seed + 10 * e, times), sigma=SIGMA)
         runs.append(sf.Experiment(data, ("rest", "charge"), (tau,), 0.0, 4.2))
-    return sf.Problem(SYSTEM, runs, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)})
+    return sf.Problem(charged(2.0, seed).system, runs, {"k": sf.Parameter(RATE, lower=0.5, upper=40.0)})
 
 
 @pytest.mark.parametrize(
@@ -136,16 +134,6 @@ def test_an_unknown_that_a_bound_holds_has_no_interval():
     assert many.at_bounds.tolist() == [1]
     assert np.isnan(many.confidence_intervals()[0, 1]).all()
     assert np.isfinite(many.confidence_intervals()[0, 0]).all()
-
-
-@pytest.mark.parametrize("tau", [2.0, 2.01])
-def test_a_study_covers_the_truth_on_and_beside_a_sample(tau):
-    """As single fits do (benchmarks/coverage.py); with one parabola each 77 % of these intervals hold the truth."""
-    study = sf.monte_carlo(charged(tau, 0, True), 600, theta=[tau])
-    assert 0.92 < study.coverage()[0] < 0.97
-    symmetric = np.abs(study.theta[:, 0] - tau) < 1.96 * study.standard_errors[:, 0]
-    assert symmetric.mean() < 0.84
-    assert study.verdict.level == "good"
 
 
 @pytest.mark.slow

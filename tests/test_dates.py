@@ -66,7 +66,6 @@ NAIVE = {
     "datetime": [dt.datetime.fromisoformat(day) for day in DAYS],
     "date": [dt.date.fromisoformat(day) for day in DAYS],
     "an array of objects": np.array([dt.date.fromisoformat(day) for day in DAYS], dtype=object),
-    "an index": pd.DatetimeIndex(DAYS),
     "a column of pandas": pd.Series(pd.to_datetime(DAYS)),
     "days of polars": pl.Series([dt.date.fromisoformat(day) for day in DAYS]),
     "text of polars": pl.Series(DAYS),
@@ -76,7 +75,6 @@ AWARE = {
     "text": ["2020-03-28T00:00+01:00", "2020-03-29T00:00+01:00", "2020-03-30T00:00+02:00", "2020-03-31T00:00+02:00"],
     "datetime": [dt.datetime.fromisoformat(day).replace(tzinfo=BERLIN) for day in DAYS],
     "an index": pd.DatetimeIndex(DAYS, tz="Europe/Berlin"),
-    "timestamps": list(pd.DatetimeIndex(DAYS, tz="Europe/Berlin")),
     "a column of polars": pl.Series(pd.DatetimeIndex(DAYS, tz="Europe/Berlin")),
     "numbers since 1970": from_epoch([1585350000, 1585436400, 1585519200, 1585605600]),
 }
@@ -446,7 +444,6 @@ def in_utc(hour):
         (dt.datetime(2020, 3, 23, 17, 41, 12, 356700), 30 * 86400, "2020-03-23"),
         (dt.datetime(2020, 3, 23, 17, 41, 12, 356700), 2 * 86400, "2020-03-23 18h"),
         (dt.datetime(2020, 3, 23, 17, 41, 12, 356700), 3600, "2020-03-23 17:41"),
-        (dt.datetime(2020, 3, 23, 17, 41, 12, 356700), 5, "2020-03-23 17:41:12"),
         (dt.datetime(2020, 3, 23, 17, 41, 12, 356700), 0.004, "2020-03-23 17:41:12.3567"),
         (dt.datetime(2020, 3, 23, 17, 41, 12, 356700), 1e-9, "2020-03-23 17:41:12.356700"),
         (dt.datetime(2020, 2, 29, 23, 59, 58), 60, "2020-02-29 23:59:58"),
@@ -491,16 +488,11 @@ def test_a_log_hands_over_its_dates(cells, zone, first, tmp_path):
 
 FILE = """
 model = "heater.py:HEATER"
-
-[parameters]
-power = 1.5
-loss = 0.1
-
+parameters = {{ power = 1.5, loss = 0.1 }}
 [[experiments]]
 mode_sequence = ["on", "off"]
 time_unit = "d"
 {experiment}
-
 [[experiments.data]]
 file = "{log}"
 columns = ["warmth"]
@@ -568,9 +560,6 @@ def test_origin_and_times_of_a_log(experiment, log, data, origin, first_last_gue
     [
         ("transition_times = [3.0]", "stamps.csv", "", "the times are in ms, but time_unit"),
         ("t0 = true", "naive.csv", "", r"'experiments\[1\]\.t0' must be a number or a date such as 2024-05-01"),
-        ("origin = 3.0", "naive.csv", "", r"experiments\[1\]: origin must be a date, such as .*; got 3.0"),
-        ("time_zone = 'Mars'", "naive.csv", "", "time_zone 'Mars' is not known"),
-        ("t0 = 2020-03-10T00:00:00Z", "naive.csv", "", "t0 has a time zone .*time_zone='Europe/Berlin'"),
         ("t0 = 2020-03-10", "naive.csv", "time_scale = 2.0", r"naive\.csv has dates, which are converted to time_unit"),
         ("", "naive.csv", 'epoch = "ms"', r"naive\.csv has dates already: leave out epoch = 'ms'"),
         ("", "stamps.csv", 'epoch = "s"', r"stamps\.csv: the times are in ms, but epoch is 's'"),

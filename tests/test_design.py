@@ -426,29 +426,21 @@ def test_problems_that_cannot_be_designed():
 
 MODEL = """
 import switchfit as sf
-
 def heat(t, x, p, u):
     return p["b"] * u["power"] + u["sun"] - p["k"] * x
-
 system = sf.HybridSystem({"heat": heat}, [0.0], state_names=("T",))
 """
 
 PROBLEM = """
 model = "model.py:system"
-
 [parameters]
 k = { value = 0.5, lower = 0.0 }
 b = 2.0
-
 [[experiments]]
 mode_sequence = ["heat"]
-t0 = 0.0
-tf = 4.0
-inputs = { file = "plan.csv", time = "t", columns = { power = "power", sun = "sun" } }
-
+inputs = { file = "plan.csv", columns = { power = "power", sun = "sun" } }
 [[experiments.data]]
 file = "plan.csv"
-time = "t"
 columns = ["T"]
 sigma = 0.1
 """
@@ -460,13 +452,8 @@ samples = { T = 3 }
 sensors = { T = 1.0 }
 budget = 2.0
 starts = 0
-
-[design.names]
-k = 0.1
-b = 0.5
-
-[design.free]
-power = [0.0, 1.5]
+names = { k = 0.1, b = 0.5 }
+free = { power = [0.0, 1.5] }
 """
 
 

@@ -100,17 +100,12 @@ def test_a_minimum_duration_that_is_reached_is_named():
 # Kinks
 
 
-def ramp(values, guess):
-    """x = max(t - tau, 0), at three times."""
-    data = sf.Measurements([0.5, 0.8, 1.0], values, sigma=1.0)
-    return sf.estimate(sf.Problem(models.LATE_RAMP, sf.Experiment(data, ("wait", "ramp"), (guess,), 0.0, 1.0)))
-
-
 @pytest.mark.parametrize("guess", [0.15, 0.45, 0.7])
 def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     """Later samples pull tau below 0.5 with the force 0.3, and a sample at 0.5 that is far too low pushes it up with
     the force 1, but only while tau is below 0.5."""
-    found = ramp([-1.0, 0.5, 0.6], guess)
+    data = sf.Measurements([0.5, 0.8, 1.0], [-1.0, 0.5, 0.6], sigma=1.0)
+    found = sf.estimate(sf.Problem(models.LATE_RAMP, sf.Experiment(data, ("wait", "ramp"), (guess,), 0.0, 1.0)))
     assert found.status is sf.Status.CONVERGED_AT_KINK
     assert found.success
     assert found.theta[0] == 0.5
@@ -120,13 +115,6 @@ def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     assert "kink of the cost: tau_1 = 0.5, where the derivative jumps from -7.0e-01 to 3.0e-01" in found.message
     assert found.optimality < 1e-12
     assert found.standard_errors[0] == 0.0
-
-
-def test_a_fit_that_passes_samples_does_not_stop_at_them():
-    """The same with a better sample at 0.5: the minimum is at 0.35, where the derivative vanishes."""
-    found = ramp([0.15, 0.45, 0.65], 0.9)
-    assert found.status is sf.Status.CONVERGED
-    assert found.theta[0] == pytest.approx(0.35, abs=1e-9)
 
 
 # Unknowns that the data does not determine
@@ -464,10 +452,7 @@ def test_the_mesh_is_refined_for_guards():
 # What the defaults promise: J to some 1e-8, its derivatives to some 1e-7, and the solution to 1e-8
 
 
-AWAY = np.array([0.03, 0.02, 0.001])
-
-
-@pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), tuple(models.VEHICLE_TRUTH + AWAY)])
+@pytest.mark.parametrize("theta", [(5.0, 9.0, 0.8), (5.43, 9.27, 0.77), (6.03, 10.02, 0.701)])
 def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
     """The paper's problem on its reference of 0.1 s; the last theta is near the solution, where J almost vanishes."""
     problem, theta = build_simulated_problem(), np.array(theta)

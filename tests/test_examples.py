@@ -245,15 +245,6 @@ def test_the_spreading_rate_changed_three_times():
     np.testing.assert_allclose(search.transition_times[0], known.transition_times[0], atol=1e-3)
 
 
-def test_the_counts_of_the_problem_file_are_those_of_the_example():
-    """Their square roots, at noon of the day of infection."""
-    known = load("covid/covid.py")["make_problem"]().experiments[0]
-    run = load_problem(EXAMPLES / "covid" / "search.toml", searched=True).problem.experiments[0]
-    assert (run.t0, run.end, run.origin) == (known.t0, known.end, known.origin)
-    np.testing.assert_allclose(run.data[0].times, known.data[0].times, atol=1e-12)
-    np.testing.assert_allclose(run.data[0].values, known.data[0].values, rtol=1e-9)
-
-
 @pytest.mark.slow
 def test_the_order_of_the_heaters_is_found_one_heater_at_a_time(monkeypatch):
     """In a free library they are interchangeable: at best J is right, the names are not, and nothing is found."""

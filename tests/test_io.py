@@ -200,7 +200,14 @@ def test_loss_delay_priors_and_scales(folder):
         assert part in text
 
 
+def last_unknown(p, run):
+    return p.theta_names[-1], p.unknowns.units[-1], p.initial_theta[-1], p.unknowns.lower[-1], p.unknowns.upper[-1]
+
+
 NAMED = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = { left = "u", right = "sd" } }'
+UNKNOWN_STATE = 't0 = 0.0\ninitial_state = [{ value = 17.0, lower = 0.0, upper = 20.0, unit = "°C" }]'
+FREE_END = "tf = { value = 7.0, lower = 6.0, upper = 9.0, prior = { mean = 7.5, sd = 0.5 } }"
+MAPPED = 't0 = 0.0\nparameter_map = { heating = "cooling" }'
 MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
 
 
@@ -211,6 +218,14 @@ MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
         ('["T"]\nsigma', '"room.py:fahrenheit"\nsigma', lambda p, run: run.data[0].observe(0.0, 10.0, {}), 50.0),
         ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda p, run: run.data[0].weights.tolist(), [[2.0]]),
         ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda p, run: run.initial_state, [17.0]),
+        ("t0 = 0.0", UNKNOWN_STATE, last_unknown, ("T(t0)", "°C", 17.0, 0.0, 20.0)),
+        (
+            "tf = 6.0",
+            FREE_END,
+            lambda p, run: repr(run.tf),
+            repr(sf.Parameter(7.0, 6.0, 9.0, prior=sf.Normal(7.5, 0.5))),
+        ),
+        ("t0 = 0.0", MAPPED, lambda p, run: run.parameter_map, {"heating": "cooling"}),
         ("t0 = 0.0", NAMED, lambda p, run: [run.inputs.values[name][2] for name in run.inputs.names], [1.0, 0.2]),
         ('"room.py:room"', MAKE, lambda p, run: p.system.initial_state, [18.0]),
         ("min_duration = 0.5", "atol = 1e-5", lambda p, run: (p.atol, p.min_duration), (1e-5, 0.0)),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from models import temperature
 from test_cli import PROBLEM, ROOM, run
 
 import switchfit as sf
@@ -18,8 +19,7 @@ from switchfit.runtime.errors import InputError
 def log_of(switch, heating=0.5):
     """A room that is heated until it is switched off."""
     times = np.arange(0.25, 6.0, 0.5)
-    heated = heating / 0.05 * (1 - np.exp(-0.05 * np.minimum(times, switch)))
-    values = heated * np.exp(-0.05 * np.maximum(times - switch, 0))
+    values = temperature(times, switch, heating, 0.05, start=0.0)
     return "t;T\ns;K\n" + "".join(f"{t:g};{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
 
 

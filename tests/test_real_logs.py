@@ -61,25 +61,12 @@ CASES = {
     "noise": lambda: problem(sigma="s", more=NOISE),
     "huber": lambda: problem(loss="huber", loss_scale=1.5, outliers=4),
     "soft_l1": lambda: problem(loss="soft_l1", outliers=4),
-    "cauchy": lambda: problem(loss="cauchy", loss_scale=2.0, outliers=4),
-    "noise of one channel, priors": lambda: problem(
-        k=sf.Parameter(2.0, lower=0.1, prior=sf.LogNormal(1.8, 0.02)),
-        tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)),
-        start=[sf.Parameter(1.1, prior=sf.Normal(1.0, 0.01)), 0.0],
-        sigma=["s", 0.03],
-        more=NOISE,
-    ),
-    "delay": lambda: problem(delay="d", more=DELAY),
     "all at once": lambda: problem(
         delay="d", sigma=["s", "s2"], more=DELAY | NOISE | {"s2": NOISE["s"]}, loss="cauchy", loss_scale=2.0,
         k=sf.Parameter(2.0, lower=0.1, prior=sf.LogNormal(1.8, 0.02)), outliers=4,
-        tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)),
+        tau=sf.Parameter(1.1, prior=sf.Normal(1.3, 0.02)), start=[sf.Parameter(1.1, prior=sf.Normal(1.0, 0.01)), 0.0],
     ),
 }  # fmt: skip
-
-
-COMBINED = "all at once"
-"""The case whose derivatives are checked by default: JAX compiles five programs for each, which takes 20 s."""
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -87,16 +74,9 @@ def case(request):
     return CASES[request.param]()
 
 
-@pytest.fixture(
-    scope="module", params=[pytest.param(name, marks=[pytest.mark.slow] * (name != COMBINED)) for name in CASES]
-)
-def differentiated(request):
-    return CASES[request.param]()
-
-
 @pytest.mark.slow
-def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(differentiated):
-    check = sf.check_derivatives(differentiated)
+def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(case):
+    check = sf.check_derivatives(case)
     np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
     assert max(check.gradient_gap, check.hessian_gap) < 1e-6
 
@@ -158,12 +138,6 @@ def test_losses_are_those_of_scipy(loss):
     np.testing.assert_allclose(influence(loss, scale, r**2), slope, rtol=1e-12)
 
 
-def test_where_rho_bends_down_the_exact_hessian_is_indefinite_and_the_fit_converges():
-    far = problem(k=3.5, loss="cauchy", loss_scale=1.0)
-    assert np.linalg.eigvalsh(sf.evaluate(far).hessian).min() < 0
-    assert sf.estimate(far).status.is_strict_minimum
-
-
 # Priors
 
 
@@ -201,7 +175,7 @@ def test_an_unknown_delay_is_found():
 
 @pytest.mark.slow
 def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
-    this = CASES[COMBINED]()
+    this = CASES["all at once"]()
     theta = this.initial_theta
     theta[0] = TIMES[5] - 0.043
     check = sf.check_derivatives(this, theta)

@@ -15,7 +15,6 @@ from switchfit.engine.native.program import _program_of
 from switchfit.fit import solution
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
-from switchfit.io.problem_file import load_problem
 from switchfit.problem.functions import Call, trace_function
 from switchfit.strategy.beam import follow_order
 
@@ -191,12 +190,8 @@ def tanks(count, samples=None, system=TANK, **given):
     return sf.Problem(system, runs, guess)
 
 
-@pytest.fixture(scope="module")
-def fitted():
-    return sf.estimate(tanks(2))
-
-
-def test_the_truth_is_found(fitted):
+def test_the_truth_is_found():
+    fitted = sf.estimate(tanks(2))
     assert fitted.theta_names == (
         "tank0.tau_1", "tank1.tau_1", "k", "c", "r_0", "r_1", "tank0.h(t0)", "tank1.h(t0)",
     )  # fmt: skip
@@ -253,44 +248,6 @@ def test_one_program_for_ten_runs_of_different_lengths():
     assert compiled(problem) == 1
     assert compiled(tanks(10, samples[::-1], new)) == 0
     assert compiled(tanks(12, [*samples, 40, 45], new)) == 0
-
-
-# --- problem files ----------------------------------------------------------------------------------------------------
-
-FILE = """
-model = "tank.py:tank"
-[parameters]
-c = 0.2
-[[experiments]]
-mode_sequence = ["fall"]
-transition_times = []
-tf = { value = 3.0, lower = 2.0, upper = 9.0, prior = { mean = 3.5, sd = 0.5 } }
-initial_state = [{ value = 1.5, lower = 0.0, upper = 9.0, unit = "cm" }, { value = 3.5, fixed = true }]
-parameter_map = { r = "c" }
-data = { file = "log.csv", time = "t", columns = ["h"], observe = ["h"], sigma = 0.02 }
-"""
-MODEL = """
-import switchfit as sf
-tank = sf.HybridSystem({"fall": lambda t, x, p: -p["r"] * x}, [0.0, 0.0], state_names=("h", "g"))
-"""
-
-
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "log.csv").write_text("t,h\n0.0,1.0\n1.0,0.9\n2.0,0.7\n")
-    (tmp_path / "tank.py").write_text(MODEL)
-    (tmp_path / "p.toml").write_text(FILE)
-    return tmp_path
-
-
-def test_problem_files_say_it_too(folder):
-    problem = load_problem(folder / "p.toml").problem
-    tf = problem.experiments[0].tf
-    assert (float(tf.value), float(tf.lower), float(tf.upper), tf.prior.mean, tf.prior.sd) == (3.0, 2.0, 9.0, 3.5, 0.5)
-    assert (problem.theta_names, problem.unknowns.units[-1]) == (("tf", "c", "h(t0)"), "cm")
-    assert (problem.unknowns.lower[-1], problem.unknowns.upper[-1]) == (0.0, 9.0)
-    assert problem.experiments[0].parameter_map == {"r": "c"}
-    assert sf.simulate(problem).states[0].tolist() == [1.5, 3.5]
 
 
 # --- arrays of which a run reads some entries -------------------------------------------------------------------------

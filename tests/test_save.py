@@ -118,7 +118,10 @@ def test_a_real_fit_comes_back(tmp_path):
     problem = sf.Problem(RAMP, sf.Experiment(data, ("up", "rest"), (1.0,), 0.0, 2.0), {"v": 2.0})
     estimate = sf.estimate(problem)
     estimate.save(tmp_path / "fit.json")
+    kind, verdict = next(iter(json.loads((tmp_path / "fit.json").read_text(encoding="utf-8")).items()))
+    assert (kind, verdict["level"], verdict["text"]) == ("verdict", estimate.verdict.level, str(estimate.verdict))
     loaded = sf.Estimate.load(tmp_path / "fit.json")
+    assert loaded.verdict == estimate.verdict
     for field in fields(Fit):
         assert_same(getattr(estimate.complete(), field.name), getattr(loaded, field.name))
     assert_same(estimate.certificate, loaded.certificate)

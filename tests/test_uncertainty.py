@@ -19,7 +19,7 @@ from switchfit.fit.result import disagreement
 from switchfit.models import heater_problem, lugre
 from switchfit.optimize import Status
 from switchfit.uncertainty.certificate import LARGEST_GAP, Identifiability, analyse, certify, measure_derivative_gap
-from switchfit.uncertainty.residuals import correct_correlation, diagnose, diagnose_channel
+from switchfit.uncertainty.residuals import correct_correlation, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)
 
@@ -233,13 +233,6 @@ def test_the_correction_of_the_correlation_keeps_within_limits():
     assert correct_correlation(-0.1, 40, 8) == -0.1
     assert correct_correlation(1.0, 40, 8) == 0.999
     assert correct_correlation(0.5, 10**6, 3) == pytest.approx(0.5, abs=1e-5)
-
-
-def test_outliers_are_told():
-    residual = 0.1 * np.random.default_rng(3).standard_normal(100)
-    residual[[20, 70]] = 1.0, -1.2
-    fit = made(comparisons=((diagnostics_of(residual),),), cost=100.0, sigma_known=False)
-    assert diagnose(fit).channels[0].outliers == 2
 
 
 def test_a_cost_without_measurements_has_no_residuals():

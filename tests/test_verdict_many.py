@@ -141,13 +141,6 @@ def test_an_end_in_another_minimum_is_found(study):
     assert "1 of 200 fits ended in another minimum, fit 17 farthest off" in str(away.verdict)
 
 
-@pytest.mark.parametrize(("failed", "level"), [(2, "good"), (3, "doubtful"), (99, "doubtful"), (100, "bad")])
-def test_a_hundredth_of_a_study_may_fail(study, failed, level):
-    status = study.status.astype(object)
-    status[:failed] = "MAX_ITERATIONS"
-    assert replace(study, status=status.astype(str)).verdict.level == level
-
-
 def test_a_bootstrap_of_a_bad_fit_is_bad():
     found = sf.bootstrap(sf.estimate(room(wave(1.0)), strategy="local"), 20)
     assert found.verdict.level == "bad"
