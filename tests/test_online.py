@@ -445,8 +445,8 @@ def test_bad_samples_are_refused_and_change_nothing(problem, log, t, y, message)
 
 def test_bad_settings_are_refused(problem, log):
     for settings, message in (
-        ({"window": -1.0}, "window"),
-        ({"threshold": 1.0, "false_alarms": 1.0}, "not both"),
+        ({"window": -1.0}, "window must be positive; got -1.0"),
+        ({"threshold": 1.0, "false_alarms": 1.0}, "give threshold or false_alarms, not both: one follows from the ot"),
         ({"drift": {"mu": 0.1}}, "window="),
         ({"renews": {"slip": "nu"}}, "no free parameter"),
         ({"renews": {"skid": "mu"}}, "renews names the unknown mode 'skid'"),

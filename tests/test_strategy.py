@@ -1,12 +1,11 @@
 """From a poor guess to the right answer: each strategy by itself, and how `estimate` chooses among them."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay, fishing, heated_room
+from models import approach, decay, fishing, heated_room
 
 import switchfit as sf
 from benchmarks.sharp.problems import dry, valve
@@ -28,14 +27,7 @@ TIMES = np.linspace(0.25, 10.0, 40)
 
 def temperatures(times, switches, power, k):
     """Closed form of x' = P(t) - k x with the power on, off, on, ..., from 0.2."""
-    edges = np.concatenate([[0.0], switches, [np.inf]])
-    found, x = np.zeros(len(times)), 0.2
-    for i, (begin, end) in enumerate(pairwise(edges.tolist())):
-        level = power / k if i % 2 == 0 else 0.0
-        inside = (times >= begin) & (times < end)
-        found[inside] = level + (x - level) * np.exp(-k * (times[inside] - begin))
-        x = level + (x - level) * np.exp(-k * (end - begin))
-    return found
+    return approach(times, switches, (k, k), (power / k, 0.0))
 
 
 def thermostat(guess=None, sigma=0.02, modes=("on", "off") * 3):
