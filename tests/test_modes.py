@@ -418,6 +418,7 @@ def test_parameters_far_off_are_found_from_other_starts():
         ({"successions": {"rise": "jump"}}, "successions of 'rise' names the unknown mode 'jump'"),
         ({"successions": {"rise": "rise"}}, "names the mode itself"),
         ({"min_duration": -1.0}, "min_duration must be 0 or more; got -1.0"),
+        ({"min_duration": 9.0}, "leaves no room"),
         ({"width": 2}, "width must be 3 or more; got 2"),
         ({"criterion": "aic"}, "criterion must be one of"),
         ({"criterion": "cost"}, "criterion='cost' needs switch_cost"),
@@ -446,11 +447,6 @@ BOUNDED = {"mode_sequence": ("rise", "fall"), "transition_times": (sf.Parameter(
 def test_problems_that_cannot_be_searched_are_refused(run, message):
     with pytest.raises(ValueError, match=message):
         sf.find_modes(sf.Problem(SYSTEM, run(), FREE))
-
-
-def test_durations_without_any_room_are_refused():
-    with pytest.raises(ValueError, match="leaves no room"):
-        sf.find_modes(make_problem(), min_duration=9.0)
 
 
 def test_a_hidden_switch_is_refused():

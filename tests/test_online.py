@@ -1,5 +1,7 @@
 """Online estimation: against batch fits, closed forms and brute force."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -84,17 +86,6 @@ def test_the_estimate_is_that_of_the_batch(log):
             count = len(now.mode_sequence) - 1
             batch = sf.estimate(vehicle(log[:k], MODES[: count + 1], SWITCHES[:count], **fine), tolerance=1e-11)
             np.testing.assert_allclose(online.estimate(tolerance=1e-11).theta, batch.theta, rtol=1e-9)
-
-
-def test_a_window_loses_little(problem, log, batch):
-    online = sf.OnlineEstimator(problem, window=4.0)
-    last = feed_all(online, log)[-1]
-    error = float(batch.standard_errors[-1])
-    assert abs(float(last.parameters["mu"]) - batch.parameters["mu"]) < 0.05 * error
-    assert abs(last.transition_times[1] - batch.transition_times[0][1]) < 0.05 * batch.standard_errors[1]
-    assert abs(float(last.standard_errors["mu"]) / error - 1) < 0.01
-    again = online.estimate()
-    assert abs(again.parameters["mu"] - batch.parameters["mu"]) < 0.05 * error
 
 
 def test_a_window_is_exact_for_a_linear_model():
@@ -541,18 +532,11 @@ def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
     rng = np.random.default_rng(0)
     drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))
 
-    class Said:
-        status, statistic = sf.OnlineStatus.TRACKING, 0.0
+    def update(t, y=None):
+        return SimpleNamespace(status=sf.OnlineStatus.TRACKING, statistic=next(drawn))
 
-    def build(online, problem, threshold):
-        def update(t, y=None):
-            said = Said()
-            said.statistic = next(drawn)
-            return said
-
-        return type("Quiet", (), {"reset": lambda self: None, "update": staticmethod(update)})()
-
-    monkeypatch.setattr(sf.OnlineEstimator, "build_like", build)
+    quiet = SimpleNamespace(reset=lambda: None, update=update)
+    monkeypatch.setattr(sf.OnlineEstimator, "build_like", lambda online, problem, threshold: quiet)
     monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
     found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
     assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor

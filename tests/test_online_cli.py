@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_cli import run
+from test_cli import catch_settings, run
 from test_cli_modes import PROBLEM, TIMES, fill, simulate, write_log
 from typer.testing import CliRunner
 
@@ -149,13 +149,7 @@ def test_dates(tmp_path):
 
 
 def test_options_are_those_of_the_estimator_and_come_before_the_file(tmp_path, monkeypatch):
-    given = {}
-
-    def build(problem, **settings):
-        given.update(settings)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(sf, "OnlineEstimator", build)
+    given = catch_settings(monkeypatch, "OnlineEstimator")
     fill(tmp_path, PROBLEM + '[online]\nwindow = 3.0\nrenews = { rise = "a" }\ndrift = { c = 0.1 }\n')
     run("online", tmp_path / "problem.toml")
     assert (given["window"], given["renews"], given["drift"]) == (3.0, {"rise": ["a"]}, {"c": 0.1})

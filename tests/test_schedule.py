@@ -29,6 +29,7 @@ from switchfit.strategy.library import Library, build_library
 
 
 def make_library(modes="abc", successions=None, most=8, durations=None, first=None, last=None):
+    """Return the library of modes that may follow each other freely, unless `successions` says otherwise."""
     names = tuple(modes)
     followers = {m: tuple(n for n in names if n != m) for m in names} if successions is None else successions
     followers = {m: tuple(followers.get(m, ())) for m in names}

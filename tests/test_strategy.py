@@ -234,21 +234,26 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
     np.testing.assert_allclose(found.theta, [1.0, 0.5], atol=0.02)
 
 
+def count_seconds(monkeypatch, owner, name):
+    """Return a clock on which each call of a method, an evaluation, takes a second, and nothing else takes time."""
+    clock, call = [0.0], getattr(owner, name)
+
+    def timed(self, *given, **settings):
+        clock[0] += 1.0
+        return call(self, *given, **settings)
+
+    monkeypatch.setattr(owner, name, timed)
+    monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
+    return clock
+
+
 @pytest.mark.parametrize(
     ("build", "start", "budget", "strategy"),
     [(valve, 1, 5.0, choice.BEAM), pytest.param(dry, 4, 200.0, choice.STARTS, marks=pytest.mark.slow)],
 )
 def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
-    """Models with corners, on a clock of evaluations: each of J takes a second."""
-    clock, solve = [0.0], SplitEngine._solve
-
-    def timed(self, *given):
-        clock[0] += 1.0
-        return solve(self, *given)
-
-    monkeypatch.setattr(SplitEngine, "_solve", timed)
-    monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
-    case = build()
+    """Of models with corners."""
+    clock, case = count_seconds(monkeypatch, SplitEngine, "_solve"), build()
     problem, theta = case.build_problem(), case.draw_starts(5)[start]
     sf.estimate(problem, strategy="local", start=theta)
     local, clock[0] = clock[0], 0.0
@@ -575,16 +580,8 @@ def test_a_callback_ends_a_search_within_one_evaluation(strategy):
 
 
 def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypatch):
-    """On a clock of evaluations: each of J takes a second."""
-    clock, evaluate = [0.0], Evaluator.__call__
-
-    def timed(self, *given, **settings):
-        clock[0] += 1.0
-        return evaluate(self, *given, **settings)
-
     problem, _ = CASES["nothing more"]()
-    monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
-    monkeypatch.setattr(Evaluator, "__call__", timed)
+    clock = count_seconds(monkeypatch, Evaluator, "__call__")
     monkeypatch.setattr(choice, "find_times", lambda problem, theta, is_enough: End(theta, np.inf, 0))
     for module, name in ((choice, "is_enough"), (starts, "_is_enough"), (choice, "is_explained")):
         monkeypatch.setattr(module, name, lambda *given: False)
