@@ -18,7 +18,6 @@ from switchfit.io.problem_file import load_problem, read_experiments
 from switchfit.problem.functions import use_float64
 from switchfit.report.html.curves import collect_curves
 from switchfit.report.text import write_experiments
-from switchfit.strategy.known_order import find_times
 
 DOSES = np.array([0.0, 8.0, 16.0, 24.0])
 AMOUNT = 100.0
@@ -179,11 +178,6 @@ def test_a_collapsed_mode_with_a_jump_inside_is_not_idle():
     theta = np.array([8.0, 8.0, 0.2, 8.0])
     assert idle_unknowns(make([]), theta, False).any()
     assert not idle_unknowns(make(sf.Jump(8.0, dose)), theta, False).any()
-
-
-def test_a_beam_passes_jumps():
-    problem = make_changing(simulate_changing(13.3), guess=9.0)
-    np.testing.assert_allclose(find_times(problem, problem.initial_theta).theta, [13.3, 0.13, 11.0], rtol=1e-4)
 
 
 def test_with_a_free_final_time():
