@@ -432,20 +432,15 @@ def test_wrong_settings_are_refused(arguments, message):
         sf.find_modes(make_problem(), **arguments)
 
 
-COST = sf.RunningCost(lambda t, x, p: x[0] ** 2)
-BOUNDED = {"mode_sequence": ("rise", "fall"), "transition_times": (sf.Parameter(3.0, lower=1.0),)}
-
-
-@pytest.mark.parametrize(
-    ("run", "message"),
-    [
-        (lambda: sf.Experiment(COST, ("rise", "fall"), (1.0,), 0.0, 2.0), r"is no likelihood\. Give switch_cost"),
-        (lambda: replace(make_run(), **BOUNDED), "transition time 1 of run1 is fixed, or has bounds"),
-    ],
-)
-def test_problems_that_cannot_be_searched_are_refused(run, message):
-    with pytest.raises(ValueError, match=message):
-        sf.find_modes(sf.Problem(SYSTEM, run(), FREE))
+def test_problems_that_cannot_be_searched_are_refused():
+    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("rise", "fall"), (1.0,), 0.0, 2.0)
+    bounded = replace(make_run(), mode_sequence=("rise", "fall"), transition_times=(sf.Parameter(3.0, lower=1.0),))
+    for run, message in (
+        (cost, r"is no likelihood\. Give switch_cost"),
+        (bounded, "transition time 1 of run1 is fixed, or has bounds"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sf.find_modes(sf.Problem(SYSTEM, run, FREE))
 
 
 def test_a_hidden_switch_is_refused():

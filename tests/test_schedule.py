@@ -60,10 +60,8 @@ def test_equal_neighbours_become_one():
     [(0, ("bca", [4.0, 7.0])), (1, ("aca", [3.0, 7.0])), (2, ("aba", [2.0, 5.5])), (3, ("abc", [2.0, 4.0]))],
 )
 def test_a_removed_mode_gives_its_time_to_its_neighbours(i, expected):
+    """Which become one if they are equal."""
     assert show(remove_segments(schedule("abca", 2, 4, 7), i)) == expected
-
-
-def test_removal_between_two_equal_modes_joins_them():
     assert show(remove_segments(schedule("abac", 2, 4, 7), 1)) == ("ac", [7.0])
 
 

@@ -6,6 +6,7 @@ import pytest
 import scipy.integrate
 import scipy.signal
 import scipy.stats
+from models import approach
 
 import switchfit as sf
 from switchfit.io.command_line import summarize_validation
@@ -131,8 +132,7 @@ def test_residuals_are_tested_without_the_error_of_the_parameters_that_they_shar
 def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay():
     fit = sf.estimate(heater_problem())
     times = np.linspace(0.25, 5.0, 20)
-    exact = 25 * (1 - np.exp(-0.4 * np.minimum(times, 1.4))) * np.exp(-0.4 * np.maximum(times - 1.4, 0))
-    y = exact + 0.2 * np.random.default_rng(4).normal(size=20)
+    y = approach(times, [1.4], (0.4, 0.4), (25.0, 0.0), start=0.0) + 0.2 * np.random.default_rng(4).normal(size=20)
     found = fit.validate(sf.Measurements(times, y))
     assert found.theta_names == ("tau_1", "k")
     assert found.theta[1] == fit.theta[1]
