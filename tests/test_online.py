@@ -10,7 +10,7 @@ from models import decay
 import switchfit as sf
 from switchfit.engine.protocol import Hypotheses
 from switchfit.models import skid_steer
-from switchfit.online.tracker import Past, Start, forget, invert
+from switchfit.online.tracker import Past, Start, forget
 
 SIGMA = 0.05
 TIMES = 0.1 * np.arange(1, 131)
@@ -505,10 +505,6 @@ def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
         value = found.cost + found.gradient @ there + 0.5 * there @ found.matrix @ there
         assert value == pytest.approx(cost, rel=1e-9)
         np.testing.assert_allclose(np.append(d[:2], d[3]) @ turn, e, atol=1e-9)
-
-
-def test_what_is_not_known_has_an_infinite_variance():
-    np.testing.assert_array_equal(np.diag(invert(np.diag([4.0, 0.0]))), [0.25, np.inf])
 
 
 def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
