@@ -7,6 +7,7 @@ else: nonlinear systems with every kind of cost, and the functions inside the pa
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -109,6 +110,17 @@ def temperature(t, tau, power, k, *, start=0.2):
     """x(t) of `heated_room` whose heater goes off at tau, in closed form."""
     on = power / k + (start - power / k) * np.exp(-k * np.minimum(t, tau))
     return np.where(t <= tau, on, on * np.exp(-k * np.maximum(t - tau, 0.0)))
+
+
+def approach(times, switches, rates, levels, start=0.2):
+    """x(t) of ``x' = rate (level - x)``, whose rates and levels alternate between two at the switches."""
+    edges, found, x = np.array([0.0, *switches, np.inf]), np.zeros(len(times)), start
+    for i, (begin, end) in enumerate(pairwise(edges.tolist())):
+        rate, level = rates[i % 2], levels[i % 2]
+        inside = (times >= begin) & (times < end)
+        found[inside] = level + (x - level) * np.exp(-rate * (times[inside] - begin))
+        x = level + (x - level) * np.exp(-rate * (end - begin))
+    return found
 
 
 # Switching-time optimisation

@@ -4,10 +4,10 @@ import inspect
 import json
 import signal
 import tomllib
-from itertools import pairwise
 
 import numpy as np
 import pytest
+from models import approach
 from test_cli import catch_settings, run
 
 import switchfit as sf
@@ -74,15 +74,9 @@ fall = "rise"
 """
 
 
-def simulate(times, knots, start=0.5, sigma=0.02, seed=0):
+def simulate(times, knots, sigma=0.02, seed=0):
     """Rise and fall in turn, with a = 0.7 and b = 0.4."""
-    edges = [0.0, *knots, np.inf]
-    values, state = np.zeros(len(times)), start
-    for k, (begin, end) in enumerate(pairwise(edges)):
-        rate, level = ((0.7, 3.0), (0.4, 0.0))[k % 2]
-        inside = (times >= begin) & (times < end)
-        values[inside] = level + (state - level) * np.exp(-rate * (times[inside] - begin))
-        state = level + (state - level) * np.exp(-rate * (end - begin))
+    values = approach(times, knots, (0.7, 0.4), (3.0, 0.0), start=0.5)
     return values + sigma * np.random.default_rng(seed).normal(size=len(times))
 
 
@@ -92,8 +86,12 @@ TIMES = np.linspace(0.05, 7.95, 60)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A log of rise -> fall -> rise."""
-    folder = tmp_path_factory.mktemp("modes")
-    (folder / "problem.toml").write_text(PROBLEM)
+    return fill(tmp_path_factory.mktemp("modes"))
+
+
+def fill(folder, text=PROBLEM):
+    """Write a problem, its model and its log into a folder, and return it."""
+    (folder / "problem.toml").write_text(text)
     (folder / "model.py").write_text(MODEL)
     write_log(folder / "log.csv", simulate(TIMES, (2.5, 5.5)))
     return folder

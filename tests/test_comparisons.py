@@ -19,8 +19,7 @@ def make_problem(mode, observe=None, parameter_map=None, **others):
 
 
 FOUND = {
-    "where": lambda t, x, p: jnp.where(t < p["a"], x, -x) * p["b"],
-    "computed": lambda t, x, p: jnp.where(t < 2.0 * p["a"] + 1.0, x, -x) * p["b"],
+    "where": lambda t, x, p: jnp.where(t < 2.0 * p["a"] + 1.0, x, -x) * p["b"],
     "modulo": lambda t, x, p: jnp.where(t % p["a"] < 0.5, x, -x) * p["b"],
     "branch": lambda t, x, p: jax.lax.cond(t < p["a"], lambda y: y * p["b"], lambda y: y, x),
     "in a branch": lambda t, x, p: jax.lax.cond(t < 0.5, lambda y: y * (t > p["a"]), lambda y: y, x) * p["b"],

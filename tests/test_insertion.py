@@ -298,16 +298,6 @@ def test_two_experiments_with_shared_parameters():
     np.testing.assert_allclose(ends[4].schedules[1].times, [1.5, 3.0], atol=1e-3)
 
 
-def test_a_pulse_with_a_reset_map_is_not_proposed():
-    modes = {"a": lambda t, x, p: -x, "b": lambda t, x, p: jnp.ones_like(x), "c": lambda t, x, p: -3.0 * x}
-    system = sf.HybridSystem(modes, [2.0], {("b", "a"): lambda t, x, p: 0.1 * x})
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2), ("a",), (), 0.0, 4.0)
-    given = sf.Problem(system, run, max_transitions=4)
-    found = pulses(given, [Schedule(("a",), NONE, 0.0, 4.0)], max_switches=4)
-    assert found
-    assert all("b" not in each.sequence for _, [each] in found)
-
-
 # Text and figure
 
 

@@ -1,5 +1,7 @@
 """Online estimation: against batch fits, closed forms and brute force."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,30 +10,34 @@ from models import decay
 import switchfit as sf
 from switchfit.engine.protocol import Hypotheses
 from switchfit.models import skid_steer
-from switchfit.online.tracker import Past, Start, forget, invert
+from switchfit.online.tracker import Past, Start, forget
 
 SIGMA = 0.05
 TIMES = 0.1 * np.arange(1, 131)
 MODES, SWITCHES = ("stick", "slip", "stick"), (6.0, 10.0)
 
 
-def drive(mu: float = 0.7, seed: int = 0, times: np.ndarray = TIMES) -> np.ndarray:
-    """Noisy positions and headings of the simulated vehicle."""
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), MODES, SWITCHES, 0.0, 15.0)
-    clean = sf.simulate(sf.Problem(skid_steer(), run, {"mu": mu}), times=times).states[:, :3]
-    return clean + SIGMA * np.random.default_rng(seed).standard_normal(clean.shape)
+def simulate(modes=MODES, taus=SWITCHES, times=TIMES) -> np.ndarray:
+    """States of the vehicle, mu being 0.7."""
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), modes, taus, 0.0, 15.0)
+    return sf.simulate(sf.Problem(skid_steer(), run, {"mu": 0.7}), times=times).states
 
 
-def vehicle(values: np.ndarray, modes: tuple[str, ...] = ("stick",), taus: tuple = (), **settings) -> sf.Problem:
+def measure(states: np.ndarray, seed: int) -> np.ndarray:
+    """Noisy positions and headings."""
+    return states[:, :3] + SIGMA * np.random.default_rng(seed).standard_normal((len(states), 3))
+
+
+def vehicle(values: np.ndarray, modes: tuple[str, ...] = ("stick",), taus: tuple = ()) -> sf.Problem:
     times = TIMES[: len(values)]
     gps = sf.Measurements(times, values, lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))
     run = sf.Experiment(gps, modes, taus, 0.0, float(times[-1]))
-    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)}, **settings)
+    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
 
 
 @pytest.fixture(scope="module")
 def log() -> np.ndarray:
-    return drive()
+    return measure(simulate(), 0)
 
 
 @pytest.fixture(scope="module")
@@ -75,28 +81,6 @@ def test_the_vehicle_is_followed_and_ends_where_the_batch_fit_does(problem, log,
     assert last.mode_probability["stick"] > 0.99
 
 
-def test_the_estimate_is_that_of_the_batch(log):
-    fine = {"rtol": 1e-11}  # the mesh of a fit depends on its guess
-    online = sf.OnlineEstimator(vehicle(log, **fine))
-    for k, (t, y) in enumerate(zip(TIMES, log, strict=True), 1):
-        now = online.update(t, y)
-        if k in (20, 80, 105, 130):
-            count = len(now.mode_sequence) - 1
-            batch = sf.estimate(vehicle(log[:k], MODES[: count + 1], SWITCHES[:count], **fine), tolerance=1e-11)
-            np.testing.assert_allclose(online.estimate(tolerance=1e-11).theta, batch.theta, rtol=1e-9)
-
-
-def test_a_window_loses_little(problem, log, batch):
-    online = sf.OnlineEstimator(problem, window=4.0)
-    last = feed_all(online, log)[-1]
-    error = float(batch.standard_errors[-1])
-    assert abs(float(last.parameters["mu"]) - batch.parameters["mu"]) < 0.05 * error
-    assert abs(last.transition_times[1] - batch.transition_times[0][1]) < 0.05 * batch.standard_errors[1]
-    assert abs(float(last.standard_errors["mu"]) / error - 1) < 0.01
-    again = online.estimate()
-    assert abs(again.parameters["mu"] - batch.parameters["mu"]) < 0.05 * error
-
-
 def test_a_window_is_exact_for_a_linear_model():
     """Both parameters enter linearly, and no time is unknown: the samples that have left are a quadratic cost."""
     modes = {"on": lambda t, x, p: jnp.stack([x[1], p["a"] + p["b"] * t])}  # integrated exactly
@@ -117,12 +101,10 @@ def test_a_window_is_exact_for_a_linear_model():
 def test_a_mode_can_begin_with_a_new_value():
     """The vehicle slips on two kinds of ground; a constant mu would be between them."""
     modes, taus = ("stick", "slip", "stick", "slip"), (4.0, 7.0, 9.0)
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), modes, taus, 0.0, 13.0)
-    first = sf.simulate(sf.Problem(skid_steer(), run, {"mu": 0.7}), times=TIMES[:90]).states
-    later = sf.Experiment(run.data, ("slip",), (), 9.0, 13.0, initial_state=first[-1])
+    first = simulate(modes, taus, TIMES[:90])
+    later = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), ("slip",), (), 9.0, 13.0, initial_state=first[-1])
     second = sf.simulate(sf.Problem(skid_steer(), later, {"mu": 0.5}), times=TIMES[90:]).states
-    clean = np.vstack([first, second])[:, :3]
-    log = clean + SIGMA * np.random.default_rng(5).standard_normal(clean.shape)
+    log = measure(np.vstack([first, second]), 5)
     problem = vehicle(log)
     renewed = feed_all(sf.OnlineEstimator(problem, renews={"slip": "mu"}), log)
     before = next(now for now in renewed if now.time > 8.9)
@@ -232,8 +214,7 @@ def test_a_saved_estimator_goes_on_bit_by_bit(problem, log, tmp_path, settings):
         file.write(b'{"t": 13.1, "y": [0')  # the process was killed here
     loaded = sf.OnlineEstimator.load(tmp_path / "state", problem, **settings)
     loaded.keep_journal(tmp_path / "journal")
-    again = loaded.now
-    assert_same(again, last)
+    assert_same(loaded.now, last)
 
 
 def test_a_file_of_something_else_is_refused(problem, log, tmp_path):
@@ -334,9 +315,7 @@ def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):
     np.testing.assert_allclose(online.estimate().parameters["k"], k, rtol=1e-6)
     loaded = sf.OnlineEstimator.load(tmp_path / "state", later)
     loaded.keep_journal(tmp_path / "journal")
-    again = loaded.now
-    assert again is not None
-    assert again.parameters["k"] == now.parameters["k"]
+    assert loaded.now.parameters["k"] == now.parameters["k"]
     np.testing.assert_allclose(sf.replay(problem).now.parameters["k"], k, rtol=1e-5)  # the inputs of the problem
 
 
@@ -364,8 +343,6 @@ def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
     wrong[40:44] += [0.25, 0.25, 0.0]
     said = feed_all(online, wrong[:58])
     alarms, retracted = [now.alarm for now in said if now.alarm], [now.retracted for now in said if now.retracted]
-    assert alarms
-    assert retracted
     assert retracted[0] == alarms[0]
     assert said[-1].mode_sequence == ("stick",)
     assert next(now for now in said if now.retracted).status is sf.OnlineStatus.RETRACTED
@@ -445,8 +422,8 @@ def test_bad_samples_are_refused_and_change_nothing(problem, log, t, y, message)
 
 def test_bad_settings_are_refused(problem, log):
     for settings, message in (
-        ({"window": -1.0}, "window"),
-        ({"threshold": 1.0, "false_alarms": 1.0}, "not both"),
+        ({"window": -1.0}, "window must be positive; got -1.0"),
+        ({"threshold": 1.0, "false_alarms": 1.0}, "give threshold or false_alarms, not both: one follows from the ot"),
         ({"drift": {"mu": 0.1}}, "window="),
         ({"renews": {"slip": "nu"}}, "no free parameter"),
         ({"renews": {"skid": "mu"}}, "renews names the unknown mode 'skid'"),
@@ -530,10 +507,6 @@ def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
         np.testing.assert_allclose(np.append(d[:2], d[3]) @ turn, e, atol=1e-9)
 
 
-def test_what_is_not_known_has_an_infinite_variance():
-    np.testing.assert_array_equal(np.diag(invert(np.diag([4.0, 0.0]))), [0.25, np.inf])
-
-
 def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
     """Maxima of 20 s of alarms at the rate exp(-(h - 5) / 2) / s: for one an hour, h = 5 + 2 log(3600)."""
     from switchfit.online import state as calibration
@@ -541,18 +514,11 @@ def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
     rng = np.random.default_rng(0)
     drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))
 
-    class Said:
-        status, statistic = sf.OnlineStatus.TRACKING, 0.0
+    def update(t, y=None):
+        return SimpleNamespace(status=sf.OnlineStatus.TRACKING, statistic=next(drawn))
 
-    def build(online, problem, threshold):
-        def update(t, y=None):
-            said = Said()
-            said.statistic = next(drawn)
-            return said
-
-        return type("Quiet", (), {"reset": lambda self: None, "update": staticmethod(update)})()
-
-    monkeypatch.setattr(sf.OnlineEstimator, "build_like", build)
+    quiet = SimpleNamespace(reset=lambda: None, update=update)
+    monkeypatch.setattr(sf.OnlineEstimator, "build_like", lambda online, problem, threshold: quiet)
     monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
     found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
     assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_cli import run
-from test_cli_modes import MODEL, PROBLEM, TIMES, simulate, write_log
+from test_cli import catch_settings, run
+from test_cli_modes import PROBLEM, TIMES, fill, simulate, write_log
 from typer.testing import CliRunner
 
 import switchfit as sf
@@ -30,11 +30,7 @@ PROGRAM = "from switchfit.cli import main; main()"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A log of rise -> fall -> rise."""
-    folder = tmp_path_factory.mktemp("online")
-    (folder / "problem.toml").write_text(PROBLEM)
-    (folder / "model.py").write_text(MODEL)
-    write_log(folder / "log.csv", VALUES)
-    return folder
+    return fill(tmp_path_factory.mktemp("online"))
 
 
 def feed(folder, lines, *options):
@@ -81,12 +77,9 @@ def test_a_line_of_json_for_each_sample(replayed, folder):
     assert read(another) == lines[:30]
 
 
-def test_a_stream_needs_no_log(folder, tmp_path):
+def test_a_stream_needs_no_log(tmp_path):
     """Data and inputs of the problem file name no file, and it has no tf."""
-    (tmp_path / "model.py").write_text(MODEL)
-    text = PROBLEM.replace('file = "log.csv"\n', "").replace("tf = 8.0\n", "")
-    (tmp_path / "problem.toml").write_text(text)
-    result = feed(tmp_path, LINES)
+    result = feed(fill(tmp_path, PROBLEM.replace('file = "log.csv"\n', "").replace("tf = 8.0\n", "")), LINES)
     assert result.exit_code == 0, result.stderr
     lines = read(result)
     assert lines[-1]["mode_sequence"] == ["rise", "fall", "rise"]
@@ -131,11 +124,10 @@ def test_missing_values_and_mere_time(folder):
 
 def test_inputs_hold_from_their_sample_on(tmp_path):
     """As in the replay of the log, and without a log, where the first sample has the input alone."""
-    (tmp_path / "model.py").write_text(MODEL)
     text = PROBLEM.split("[library]")[0].replace("model.py:system", "model.py:driven").replace("c = 0.1\n", "")
     text = text.replace("tf = 8.0", 'mode_sequence = ["pushed"]')
     text += '[experiments.inputs]\nfile = "log.csv"\ntime = "t"\ncolumns = ["u"]\n'
-    (tmp_path / "problem.toml").write_text(text)
+    fill(tmp_path, text)
     times, values = np.r_[0.0, TIMES], np.r_[np.nan, VALUES]
     write_log(tmp_path / "log.csv", values, np.full(61, 3.0), times=times, names=("T", "u"))
     replayed = read(run("online", tmp_path / "problem.toml"))[20]
@@ -149,28 +141,16 @@ def test_inputs_hold_from_their_sample_on(tmp_path):
 
 
 def test_dates(tmp_path):
-    (tmp_path / "model.py").write_text(MODEL)
-    text = PROBLEM.replace("t0 = 0.0", "origin = 2024-05-01T12:00:00Z\nt0 = 0.0")
-    (tmp_path / "problem.toml").write_text(text)
-    write_log(tmp_path / "log.csv", VALUES)
+    fill(tmp_path, PROBLEM.replace("t0 = 0.0", "origin = 2024-05-01T12:00:00Z\nt0 = 0.0"))
     result = feed(tmp_path, ['{"t": "2024-05-01T12:00:00.5Z", "y": [0.9]}', '{"t": 0.6, "y": [1.0]}'])
     assert result.exit_code == 0, result.stderr
     assert [(line["t"], line["date"][17:23]) for line in read(result)] == [(0.5, "00.500"), (0.6, "00.600")]
     assert "a number or a date" in feed(tmp_path, ['{"t": "tomorrow"}']).stderr
 
 
-def test_options_are_those_of_the_estimator_and_come_before_the_file(folder, tmp_path, monkeypatch):
-    given = {}
-
-    def build(problem, **settings):
-        given.update(settings)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(sf, "OnlineEstimator", build)
-    for name in ("model.py", "log.csv"):
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    online = '[online]\nwindow = 3.0\nrenews = { rise = "a" }\ndrift = { c = 0.1 }\n'
-    (tmp_path / "problem.toml").write_text(PROBLEM + online)
+def test_options_are_those_of_the_estimator_and_come_before_the_file(tmp_path, monkeypatch):
+    given = catch_settings(monkeypatch, "OnlineEstimator")
+    fill(tmp_path, PROBLEM + '[online]\nwindow = 3.0\nrenews = { rise = "a" }\ndrift = { c = 0.1 }\n')
     run("online", tmp_path / "problem.toml")
     assert (given["window"], given["renews"], given["drift"]) == (3.0, {"rise": ["a"]}, {"c": 0.1})
     options = ("--window", 2, "--threshold", 9, "--max-switches", 3, "--budget", 0.1)
@@ -179,11 +159,9 @@ def test_options_are_those_of_the_estimator_and_come_before_the_file(folder, tmp
     assert given.items() >= {"window": 2.0, "threshold": 9.0, "max_switches": 3, "budget": 0.1}.items()
 
 
-def test_modes_that_the_library_leaves_out_never_follow(folder, tmp_path):
-    (tmp_path / "model.py").write_text(MODEL)
+def test_modes_that_the_library_leaves_out_never_follow(tmp_path):
     text = PROBLEM.split("[library]")[0].replace('file = "log.csv"\n', "")
-    (tmp_path / "problem.toml").write_text(f'{text}[library]\nmodes = ["rise"]\n')
-    result = feed(tmp_path, LINES[:45])
+    result = feed(fill(tmp_path, f'{text}[library]\nmodes = ["rise"]\n'), LINES[:45])
     assert {line["mode"] for line in read(result)} == {"rise"}
     assert result.exit_code == 1, "the model does not follow the samples"
     assert result.stderr.startswith("switchfit: the samples are not what the model predicts")
@@ -204,9 +182,7 @@ def test_the_threshold_for_a_rate_of_false_alarms_is_named(folder, monkeypatch):
     ("options", "message"),
     [
         (("--stdin", "--replay", "log.csv"), "--replay and --stdin contradict each other; give one of them."),
-        (("--threshold", 5, "--false-alarms", 1), "give threshold or false_alarms, not both: one follows from the ot"),
         (("--stdin",), "there were no samples."),
-        (("--window", -1), "window must be positive; got -1.0."),
         (("--live", 99999), "the page cannot be served on port 99999: "),
         (("--replay", "missing.csv"), "missing.csv"),
     ],

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from models import approach
 
 import switchfit as sf
 
@@ -11,8 +12,7 @@ import switchfit as sf
 def make_problem(**settings):
     """A temperature that rises and falls, sampled every 0.1 s, with a change at 2 s; two rates that are unknown."""
     times = np.arange(0.1, 5.0, 0.1)
-    rise = 3.0 * (1 - np.exp(-0.7 * np.minimum(times, 2.0)))
-    values = rise * np.exp(-0.4 * np.maximum(times - 2.0, 0.0))
+    values = approach(times, [2.0], (0.7, 0.4), (3.0, 0.0), start=0.0)
     values += 0.02 * np.random.default_rng(0).normal(size=len(times))
     system = sf.HybridSystem(
         {"heat": lambda t, x, p: p["rate"][0] * (3.0 - x), "cool": lambda t, x, p: -p["rate"][1] * x}, [0.0]

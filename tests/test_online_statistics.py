@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from test_online import MODES, SIGMA, SWITCHES, TIMES, drive, vehicle
+from test_online import MODES, SWITCHES, TIMES, measure, simulate, vehicle
 
 import switchfit as sf
 from switchfit.models import skid_steer
@@ -64,14 +64,12 @@ def test_errors_of_a_drive_are_those_that_are_said(window):
     """Of transition times and friction together, and of each entry of the state; 200 drives, of which a few end with a
     change that a later sample would have refuted.
     """
-    end = len(drive()) * 0.1
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), ("stick", "slip", "stick"), SWITCHES, 0.0, 15.0)
-    state = sf.simulate(sf.Problem(skid_steer(), run, {"mu": 0.7}), times=[end]).states[0]
-    online = sf.OnlineEstimator(vehicle(drive()), window=window)
+    states = simulate()
+    online = sf.OnlineEstimator(vehicle(measure(states, 0)), window=window)
     joint, apart, late, others = [], [], [], 0
     for seed in range(200):
         online.reset()
-        said = [online.update(0.1 * k, y) for k, y in enumerate(drive(seed=seed), 1)]
+        said = [online.update(t, y) for t, y in zip(TIMES, measure(states, seed), strict=True)]
         now, alarms = said[-1], [each.alarm for each in said if each.alarm]
         others += len(alarms) - 2
         late.append([min(a.time - t for a in alarms if a.mode == mode and a.time > t)
@@ -81,7 +79,7 @@ def test_errors_of_a_drive_are_those_that_are_said(window):
         of = np.r_[now.best.times, now.best.parameters["mu"]]
         away = np.array([*now.transition_times, now.parameters["mu"]]) - [*SWITCHES, 0.7]
         joint.append(away[-len(of) :] @ np.linalg.inv(invert(now.best.matrix)[np.ix_(of, of)]) @ away[-len(of) :])
-        apart.append((now.state - state) ** 2 / np.diag(now.covariance))
+        apart.append((now.state - states[-1]) ** 2 / np.diag(now.covariance))
     print(f"window {window}: known after {np.median(late, 0)} s, at most {np.max(late, 0)} s; other alarms: {others}")
     assert len(joint) >= 190
     require_chi_square("times and friction", joint, len(joint) * len(of))
@@ -103,11 +101,9 @@ def test_a_window_loses_little_of_what_all_samples_say(modes, taus, largest):
     The fit begins where an estimator without a window ends. From the truth it may end in a neighbouring interval of
     samples: in one of the ten drives with two changes, with a J that is lower by 0.08.
     """
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), modes, taus, 0.0, 15.0)
-    clean = sf.simulate(sf.Problem(skid_steer(), run, {"mu": 0.7}), times=TIMES).states[:, :3]
-    away, ratios = [], []
+    states, away, ratios = simulate(modes, taus), [], []
     for seed in range(10):
-        log = clean + SIGMA * np.random.default_rng(seed).standard_normal(clean.shape)
+        log = measure(states, seed)
         online, whole = (sf.OnlineEstimator(vehicle(log), window=window) for window in (4.0, None))
         now = [online.update(t, y) for t, y in zip(TIMES, log, strict=True) if whole.update(t, y)][-1]
         batch = whole.estimate()

@@ -29,6 +29,7 @@ from switchfit.strategy.library import Library, build_library
 
 
 def make_library(modes="abc", successions=None, most=8, durations=None, first=None, last=None):
+    """Return the library of modes that may follow each other freely, unless `successions` says otherwise."""
     names = tuple(modes)
     followers = {m: tuple(n for n in names if n != m) for m in names} if successions is None else successions
     followers = {m: tuple(followers.get(m, ())) for m in names}
@@ -59,10 +60,8 @@ def test_equal_neighbours_become_one():
     [(0, ("bca", [4.0, 7.0])), (1, ("aca", [3.0, 7.0])), (2, ("aba", [2.0, 5.5])), (3, ("abc", [2.0, 4.0]))],
 )
 def test_a_removed_mode_gives_its_time_to_its_neighbours(i, expected):
+    """Which become one if they are equal."""
     assert show(remove_segments(schedule("abca", 2, 4, 7), i)) == expected
-
-
-def test_removal_between_two_equal_modes_joins_them():
     assert show(remove_segments(schedule("abac", 2, 4, 7), 1)) == ("ac", [7.0])
 
 
