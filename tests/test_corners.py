@@ -630,6 +630,8 @@ def test_fits_from_guesses_that_are_far_off(name):
     fit = fit_of(mode, start, truth, {q: factor * value for q, value in truth.items()}, tf, count, sigma)
     assert fit.success, fit.message
     assert fit.verdict.level != "bad", str(fit)
+    assert fit.reason is None
+    assert not any(each.strategy == "many starts" for each in fit.steps)
     errors = (fit.theta - list(truth.values())) / fit.standard_errors
     assert np.abs(errors).max() < 4.0
     assert 0.6 < 2.0 * fit.cost / count < 1.5

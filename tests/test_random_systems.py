@@ -610,14 +610,6 @@ def used_once():
     jax.clear_caches()
 
 
-@pytest.mark.fuzz
-@pytest.mark.usefixtures("used_once")
-@pytest.mark.parametrize("seed", range(SYSTEMS))
-def test_derivatives_of_random_systems(seed):
-    """Machine code, or JAX where there is none."""
-    assert not differences(System(seed), ())
-
-
 @pytest.mark.parametrize("seed", [pytest.param(v, marks=[pytest.mark.slow] * (v > 1)) for v in range(SYSTEMS)])
 @pytest.mark.usefixtures("used_once")
 def test_derivatives_of_random_systems_with_both_kinds_of_steps(seed):
@@ -627,11 +619,11 @@ def test_derivatives_of_random_systems_with_both_kinds_of_steps(seed):
     assert not differences(system, (), "native", implicit=tuple(names[seed % 2 :: 2]))
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.usefixtures("used_once")
 @pytest.mark.parametrize("seed", range(SYSTEMS))
-def test_derivatives_of_random_systems_by_the_other_methods(seed):
-    """Each of them in turn, which JAX takes 20 s to compile; in each tenth JAX does what machine code could do."""
+def test_derivatives_of_random_systems_by_each_method(seed):
+    """In machine code, and by one of the others, which JAX takes 20 s to compile; in each tenth JAX does it all."""
     assert not differences(System(seed), (METHODS[seed % len(METHODS)],), "jax" if seed % 10 == 0 else "auto")
 
 
