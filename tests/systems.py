@@ -35,20 +35,13 @@ def mode_a(t, x, p):
     return jnp.array([x[1] * jnp.cos(t) + 0.2 * x[0] * x[1], -p["a"] * x[0] + 0.3 * x[1] ** 2 * jnp.sin(t)])
 
 
-def mode_b(t, x, p):
-    return jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * t) * x[1], -x[0] * jnp.exp(-p["a"] * t)])
-
-
-def mode_c(t, x, p):
-    return jnp.array([p["a"] * t - x[0] * x[1], p["b"] * jnp.sin(x[0] * t)])
-
-
 def driven_a(t, x, p, u):
     return mode_a(t, x, p) + u * jnp.array([x[1], 0.3 * p["b"]])
 
 
 def driven_b(t, x, p, u):
-    return mode_b(t, x, p) + u**2 * jnp.array([p["a"], x[0]])
+    slope = [p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * t) * x[1], -x[0] * jnp.exp(-p["a"] * t)]
+    return jnp.array(slope) + u**2 * jnp.array([p["a"], x[0]])
 
 
 def stiff_b(t, x, p):
@@ -88,7 +81,6 @@ SAMPLE_TIMES = NODES[[0, 2, 5, 9, 10, 14, 17, 20]]
 P0 = np.array([0.8, 1.2])
 
 SYSTEMS = {
-    "plain": (HybridSystem({"A": mode_a, "B": mode_b, "C": mode_c}, [0.7, 0.9]), ("A", "B", "C"), NODES[[6, 13]]),
     "resets": (
         HybridSystem({"A": driven_a, "B": driven_b}, initial_state, {("A", "B"): reset}),
         ("A", "B", "A", "B"),
@@ -163,8 +155,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 class Case:
     """A problem, and all ways to evaluate and differentiate its cost, each compiled once.
 
-    All return `Derivatives`: `paper` by the paper's adjoint equations; `discrete` and `forward` of the discretised cost,
-    with a gradient backward and a Hessian forward over it, or both forward.
+    Each returns `Derivatives`: `paper` by the paper's adjoint equations; `discrete` and `forward` of the discretised
+    cost, with a gradient backward and a Hessian forward over it, or both forward.
     """
 
     def __init__(self, problem: Problem, implicit: tuple[bool, ...] | None = None) -> None:

@@ -27,11 +27,10 @@ from switchfit.discretization.mesh import build_arguments
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
-VARIATIONS = [(name, kind) for name in ("plain", "resets") for kind in reversed(KINDS)]
+VARIATIONS = [("resets", kind) for kind in reversed(KINDS)]
 VARIATIONS += [(name, kind) for name in ("stiff", "mixed") for kind in SMOOTH_KINDS]
 
-INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
-INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
+INSIDE = {"resets": [0.413, 0.791, 1.336], "stiff": [0.6187, 1.2812], "mixed": [0.6187, 1.2812]}
 """Transition times that are not nodes."""
 
 

@@ -592,13 +592,12 @@ def test_derivatives_of_random_systems_in_machine_code(seed, name):
     [
         (1, {"guards": True, "constraints": True, "priors": True, "transitions": 1, "states": 1}),
         (3, {"guards": True, "constraints": True, "late": True, "samples": 1, "solver": "stiff", "states": 3}),
-        pytest.param(2, {"late": True, "samples": 1, "transitions": 1, "states": 1}, marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_of_random_systems_in_each_engine(seed, given, engine):
-    """Guards and terminal constraints with priors, and a delay that is estimated."""
+    """Guards and terminal constraints, with priors or a delay that is estimated."""
     system = System(2000 + seed, **{**PLAIN, **given})
-    assert bool(system.problem.constraint_names) == given.get("guards", False)
+    assert system.problem.constraint_names
     assert not differences(system, (), engine)
 
 
