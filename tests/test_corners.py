@@ -770,13 +770,12 @@ def test_a_branch_that_only_jax_evaluates_takes_an_input_too():
 
 ROOTS = {
     "maximum": lambda x: jnp.sqrt(jnp.maximum(x, 0.0)),
-    "where": lambda x: jnp.where(x > 0.0, jnp.sqrt(x), 0.0),
     "a small number in place of zero": lambda x: jnp.sqrt(jnp.maximum(x, 1e-9)),
 }
 
 
 @pytest.mark.parametrize("start", [1.0, 0.0])
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "where")) for name in ROOTS])
+@pytest.mark.parametrize("name", ROOTS)
 def test_a_tank_that_is_or_ran_empty_is_filled_again(name, start):
     """sqrt(x) is not defined below zero, and its slope at zero is infinite: rows begin and end there all the same."""
     root, modes = ROOTS[name], ("drain", "fill") if start else ("fill", "drain")
