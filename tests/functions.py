@@ -51,7 +51,6 @@ ARITHMETIC: dict[str, Function] = {
     "power 0": lambda x: x**0 + x,
     "power of a negative": lambda x: x ** x[1],
     "mod": lambda x: x % 0.4,
-    "mod of a negative": lambda x: (-x) % 0.4,
     "remainder": lambda x: jnp.remainder(x, x[::-1] + 2.0),
     "overflow": lambda x: jnp.exp(800 * x),
 }

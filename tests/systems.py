@@ -1,7 +1,6 @@
 """Test systems: nonlinear, time-dependent, with parameters in several modes and every kind of cost at once.
 
-The weight of each kind of cost and whether two modes are equal are fixed parameters, that is arguments: one compiled
-program serves all of these variations.
+The weight of each kind of cost is a fixed parameter, that is an argument: one compiled program serves all of them.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import numpy as np
 
 from switchfit.discretization.mesh import Arguments, Mesh, build_arguments
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.engine.jax import derivatives
 from switchfit.paper_adjoint import compute_paper_derivatives
 from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
@@ -37,24 +35,13 @@ def mode_a(t, x, p):
     return jnp.array([x[1] * jnp.cos(t) + 0.2 * x[0] * x[1], -p["a"] * x[0] + 0.3 * x[1] ** 2 * jnp.sin(t)])
 
 
-def mode_b_alone(t, x, p):
-    return jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * t) * x[1], -x[0] * jnp.exp(-p["a"] * t)])
-
-
-def mode_b(t, x, p):
-    return (1 - p["equal"]) * mode_b_alone(t, x, p) + p["equal"] * mode_a(t, x, p)
-
-
-def mode_c(t, x, p):
-    return jnp.array([p["a"] * t - x[0] * x[1], p["b"] * jnp.sin(x[0] * t)])
-
-
 def driven_a(t, x, p, u):
     return mode_a(t, x, p) + u * jnp.array([x[1], 0.3 * p["b"]])
 
 
 def driven_b(t, x, p, u):
-    return mode_b_alone(t, x, p) + u**2 * jnp.array([p["a"], x[0]])
+    slope = [p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * t) * x[1], -x[0] * jnp.exp(-p["a"] * t)]
+    return jnp.array(slope) + u**2 * jnp.array([p["a"], x[0]])
 
 
 def stiff_b(t, x, p):
@@ -94,7 +81,6 @@ SAMPLE_TIMES = NODES[[0, 2, 5, 9, 10, 14, 17, 20]]
 P0 = np.array([0.8, 1.2])
 
 SYSTEMS = {
-    "plain": (HybridSystem({"A": mode_a, "B": mode_b, "C": mode_c}, [0.7, 0.9]), ("A", "B", "C"), NODES[[6, 13]]),
     "resets": (
         HybridSystem({"A": driven_a, "B": driven_b}, initial_state, {("A", "B"): reset}),
         ("A", "B", "A", "B"),
@@ -125,8 +111,8 @@ def problem_of(name: str) -> Problem:
     inputs = Input(KNOTS, np.cos(KNOTS), kind="linear") if name == "resets" else None
     experiment = Experiment(data, sequence, tau, 0.0, 2.0, inputs=inputs)
     weights = {q: Parameter(1.0, fixed=True) for q in ("w_running", "w_terminal")}
-    parameters = {"a": P0[0], "b": P0[1], "equal": Parameter(0.0, fixed=True)}
-    return Problem(system, experiment, parameters | weights, solver="stiff" if name == "stiff" else "explicit")
+    parameters = {"a": P0[0], "b": P0[1], **weights}
+    return Problem(system, experiment, parameters, solver="stiff" if name == "stiff" else "explicit")
 
 
 def padded_mesh(times: np.ndarray, cells: int = CELLS) -> Mesh:
@@ -134,10 +120,10 @@ def padded_mesh(times: np.ndarray, cells: int = CELLS) -> Mesh:
     return Mesh(np.concatenate([times, np.full(cells + 1 - len(times), times[-1])]), len(times) - 1)
 
 
-def weighted(structure: Structure, arguments: Arguments, kind: str, equal: float = 0.0) -> Arguments:
-    """Arguments of `problem_of` that leave one kind of cost, or all; `equal` = 1 makes mode B equal to mode A."""
+def weighted(structure: Structure, arguments: Arguments, kind: str) -> Arguments:
+    """Arguments of `problem_of` that leave one kind of cost, or all."""
     on = {name: float(kind in (name, "all")) for name in KINDS}
-    values = {"equal": equal, "w_running": on["running"], "w_terminal": on["terminal"]}
+    values = {"w_running": on["running"], "w_terminal": on["terminal"]}
     names = [name for name, _, read in structure.parameters if not read]
     with use_float64():
         return arguments._replace(
@@ -169,8 +155,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 class Case:
     """A problem, and all ways to evaluate and differentiate its cost, each compiled once.
 
-    `cost` is the simulated cost. The others return `Derivatives`: `paper` by the paper's adjoint equations; `discrete`
-    and `forward` of the discretised cost, with a gradient backward and a Hessian forward over it, or both forward.
+    Each returns `Derivatives`: `paper` by the paper's adjoint equations; `discrete` and `forward` of the discretised
+    cost, with a gradient backward and a Hessian forward over it, or both forward.
     """
 
     def __init__(self, problem: Problem, implicit: tuple[bool, ...] | None = None) -> None:
@@ -179,26 +165,21 @@ class Case:
         self.structure = structure if implicit is None else replace(structure, implicit=implicit)
         self.tau = problem.experiments[0].initial_times
         self.N = len(self.tau)
-        self.cost = compiled(self._simulate)
-        self.paper = compiled(lambda given, *at: Derivatives(*compute_paper_derivatives(self._model(given), *at)))
+        self.paper = compiled(self._compute_by_the_paper)
         self.discrete, self.forward = map(self._differentiate, ("discrete-adjoint", "forward"))
 
-    def arguments(self, kind: str = "all", *, halvings: int = 0, equal: float = 0.0) -> Arguments:
+    def arguments(self, kind: str = "all", *, halvings: int = 0) -> Arguments:
         """Arguments of one of `SYSTEMS`, on the mesh of `NODES` with each cell halved some times."""
         times = np.unique(LAYERED) if any(self.structure.implicit) else NODES
         for _ in range(halvings):
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
-        return weighted(self.structure, build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
+        return weighted(self.structure, build_arguments(self.problem, 0, padded_mesh(times)), kind)
 
-    def _model(self, arguments: Arguments) -> Model:
-        return Model(self.structure, arguments)
+    def _compute_by_the_paper(self, arguments: Arguments, *at: Any) -> Derivatives:
+        return Derivatives(*compute_paper_derivatives(Model(self.structure, arguments), *at))
 
     def _differentiate(self, method: Any) -> Callable[..., Any]:
         return compiled(lambda *at: Derivatives(*derivatives(*at, structure=self.structure, method=method)))
-
-    def _simulate(self, arguments: Arguments, tau: Any, p: Any, side: int) -> Any:
-        model = self._model(arguments)
-        return compute_path_cost(model, propagate(model, tau, p, side), p)
 
 
 @cache

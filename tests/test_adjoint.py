@@ -16,7 +16,6 @@ from systems import (
     KINDS,
     NODES,
     P0,
-    Derivatives,
     Parameter,
     case,
     closed_form,
@@ -28,11 +27,10 @@ from switchfit.discretization.mesh import build_arguments
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
-VARIATIONS = [(name, kind) for name in ("plain", "resets") for kind in reversed(KINDS)]
+VARIATIONS = [("resets", kind) for kind in reversed(KINDS)]
 VARIATIONS += [(name, kind) for name in ("stiff", "mixed") for kind in SMOOTH_KINDS]
 
-INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
-INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
+INSIDE = {"resets": [0.413, 0.791, 1.336], "stiff": [0.6187, 1.2812], "mixed": [0.6187, 1.2812]}
 """Transition times that are not nodes."""
 
 
@@ -80,33 +78,6 @@ def test_gap_closes_at_the_order_of_the_integrator(name: str, kind: str, block: 
     assert fine < ROUNDING.get(name, 0.0) or np.log2(coarse / fine) > at_least, f"{block}: {coarse:.1e} to {fine:.1e}"
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", [pytest.param("plain", marks=pytest.mark.slow), "resets"])
-def test_p_block_is_symmetric_without_symmetrising(name: str, kind: str) -> None:
-    this = case(name)
-    asymmetry = []
-    for halvings in (1, 3):
-        H = this.paper(this.arguments(kind, halvings=halvings), this.tau, P0).hessian[this.N :, this.N :]
-        asymmetry.append(np.abs(H - H.T).max() / np.abs(H).max())
-    assert asymmetry[1] < 1e-10
-    assert asymmetry[1] < asymmetry[0] / 2**8
-
-
-@pytest.mark.parametrize(
-    ("method", "tau", "atol"),
-    [
-        pytest.param("paper", NODES[[6, 13]], (1e-13, 1e-12), marks=pytest.mark.slow),
-        ("discrete", INSIDE["plain"], (1e-7, 1e-4)),  # where tau_1 stands moves a step of the integrator
-    ],
-)
-def test_equal_neighbouring_modes_give_zero_rows(method: str, tau: list[float], atol: tuple[float, float]) -> None:
-    this = case("plain")
-    found = getattr(this, method)(this.arguments(equal=1.0, halvings=3), tau, P0)
-    assert np.abs(found.hessian[1:, 1:]).max() > 1.0
-    np.testing.assert_allclose(found.gradient[0], 0.0, atol=atol[0])
-    np.testing.assert_allclose([found.hessian[0], found.hessian[:, 0]], 0.0, atol=atol[1])
-
-
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("nodes", [[4, 9, 14], [4, 4, 13]], ids=["at a sample", "coinciding"])
 def test_derivatives_converge_from_both_sides(nodes: list[int], side: int) -> None:
@@ -151,38 +122,3 @@ def test_adjoint_and_forward_agree_to_rounding(name: str, kind: str) -> None:
     relative = 1e-9 if any(this.structure.implicit) else 2e-12
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-def test_side_is_the_limit_from_that_side(side: int) -> None:
-    this = case("resets")
-    tau = NODES[[5, 9, 14]]
-
-    def at(tau: np.ndarray, side: int) -> Derivatives:
-        return this.discrete(this.arguments(halvings=2), tau, P0, side)
-
-    on, beside = at(tau, side), at(tau + side * 1e-9, side)
-    np.testing.assert_allclose(on.gradient, beside.gradient, atol=1e-6)
-    np.testing.assert_allclose(on.hessian, beside.hessian, atol=1e-4)
-    assert np.abs(on.gradient - at(tau, -side).gradient).max() > 0.1
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    "name", [*("resets", "mixed"), *(pytest.param(v, marks=pytest.mark.slow) for v in ("plain", "stiff"))]
-)
-def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
-    this = case(name)
-    arguments = this.arguments(kind)
-    tau = np.array(INSIDE[name])
-    direction = np.array([*[1.0, -0.7, 0.8][: this.N], 0.9, -1.1])
-    direction *= (0.0002 if any(this.structure.implicit) else 0.01) / np.abs(direction).max()
-    at = this.discrete(arguments, tau, P0)
-
-    def remainders(step: float) -> list[float]:
-        d = step * direction
-        change = this.cost(arguments, tau + d[: this.N], P0 + d[this.N :]) - at.cost
-        return [change, change - at.gradient @ d, change - at.gradient @ d - 0.5 * d @ at.hessian @ d]
-
-    coarse, fine = np.abs(remainders(0.5)), np.abs(remainders(0.25))
-    np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)

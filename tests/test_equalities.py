@@ -54,12 +54,6 @@ ON_CIRCLE = lambda x: [x[0] ** 2 + x[1] ** 2 - 2]  # noqa: E731
 # Hock and Schittkowski, Test Examples for Nonlinear Programming Codes, Springer 1981: number, cost, constraints, start,
 # lowest cost.
 PUBLISHED = {
-    39: (
-        lambda x: -x[0],
-        lambda x: [x[1] - x[0] ** 3 - x[2] ** 2, x[0] ** 2 - x[1] - x[3] ** 2],
-        [2.0, 2.0, 2.0, 2.0],
-        -1.0,
-    ),
     40: (
         lambda x: -x[0] * x[1] * x[2] * x[3],
         lambda x: [x[0] ** 3 + x[1] ** 2 - 1, x[0] ** 2 * x[3] - x[2], x[3] ** 2 - x[1]],

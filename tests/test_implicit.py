@@ -46,9 +46,9 @@ def friction(v, p):
     return p["mu"] * G * v / jnp.sqrt(v**2 + SLOW**2)
 
 
-def one_mode(mode, start, parameters, tf, data=SQUARE, **settings):
+def one_mode(mode, start, parameters, tf, data=SQUARE, *, solver="stiff", **settings):
     run = sf.Experiment(data, ("m",), (), 0.0, tf)
-    return sf.Problem(sf.HybridSystem({"m": mode}, start), run, parameters, solver="stiff", **settings)
+    return sf.Problem(sf.HybridSystem({"m": mode}, start), run, parameters, solver=solver, **settings)
 
 
 def block(**settings):

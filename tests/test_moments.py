@@ -216,30 +216,3 @@ def test_an_integration_error_that_stays_large_for_another_reason_accuses_no_fun
     found = sf.estimate(problem, start=[1.0])
     assert found.cost < 1e-15 or found.certificate.integration_error > 1e-4
     assert found.reason is None
-
-
-def slide_on_spring(t, x, p):
-    return jnp.stack([x[1], -p["k"] * x[0] - p["c"] * jnp.sign(x[1])])
-
-
-def swing(times, k=4.0, c=0.3):
-    """Closed form of a mass on a spring with dry friction, from x = 1 at rest: cosines about ± c / k, half by half."""
-    half = np.floor(times * np.sqrt(k) / np.pi)
-    return (-1) ** half * (c / k + (1 - (2 * half + 1) * c / k) * np.cos(np.sqrt(k) * times - half * np.pi))
-
-
-@pytest.mark.parametrize("sigma", [1e-3, None])
-@pytest.mark.parametrize("seed", range(5))
-def test_dry_friction_is_fitted_and_nobody_is_accused(seed, sigma):
-    """J jumps a little where steps pass a reversal: some of these fits end at such a jump, at the optimum for all that
-    the data can show.
-    """
-    times = np.linspace(0.05, 4.0, 80)
-    values = swing(times) + 1e-3 * np.random.default_rng(seed).normal(size=80)
-    data = sf.Measurements(times, values, sigma=sigma, observe=models.first_state)
-    system = sf.HybridSystem({"slide": slide_on_spring}, [1.0, 0.0])
-    found = sf.estimate(sf.Problem(system, sf.Experiment(data, ("slide",), (), 0.0, 4.0), {"k": 5.0, "c": 0.2}))
-    assert found.success
-    assert found.reason is None
-    assert (np.abs(found.theta - [4.0, 0.3]) < 4.0 * np.sqrt(np.diag(found.covariance))).all()
-    assert not any(step.strategy == "many starts" for step in found.steps)

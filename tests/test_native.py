@@ -205,7 +205,7 @@ def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
     monkeypatch.setattr(llvm, "wait", wait_seen)
     threading.Thread(target=press_ctrl_c).start()
     with pytest.raises(KeyboardInterrupt):
-        Evaluator(problem_of("plain"))
+        Evaluator(problem_of("resets"))
     assert not done, "not heard before the code was there"
     release.set()
     drop_programs()

@@ -178,9 +178,7 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data):
     assert not any(compiled[1:]), "a sequence needs a program of its own"
 
 
-def test_room_for_fewer_transitions_than_there_are_and_two_costs_at_one_are_refused():
-    with pytest.raises(ValueError, match="max_transitions is 1, but a mode_sequence has 2 transitions"):
-        problem(samples(), max_transitions=1)
+def test_two_costs_at_one_transition_are_refused():
     costs = [sf.TransitionCost(lambda t, x, p: x[0]), sf.TransitionCost(lambda t, x, p: t, before="swing")]
     with pytest.raises(ValueError, match="2 TransitionCosts count at a transition from 'swing' to"):
         problem([samples(), *costs])

@@ -571,16 +571,12 @@ SHORT = {
     "two runs with a map": {"runs": 2, "running": True, "states": 1, "initial": "unknown"},
     "ten states": {"states": 10, "modes": 1, "transitions": 1, "samples": 1},
     "implicit steps": {"solver": "stiff", "resets": True, "input": "linear", "running": True, "initial": "unknown"},
-    "four transitions": {"transitions": 4, "states": 1, "modes": 3, "terminal": True, "initial": "function"},
 }
 
 
 @pytest.mark.parametrize(
     ("seed", "name"),
-    [
-        pytest.param(*v, marks=[pytest.mark.slow] * (v[1] in ("ten states", "four transitions")))
-        for v in enumerate(SHORT)
-    ],
+    [pytest.param(*v, marks=[pytest.mark.slow] * (v[1] == "ten states")) for v in enumerate(SHORT)],
 )
 def test_derivatives_of_random_systems_in_machine_code(seed, name):
     assert not differences(System(1000 + seed, **{**PLAIN, **SHORT[name]}), ())
@@ -592,13 +588,12 @@ def test_derivatives_of_random_systems_in_machine_code(seed, name):
     [
         (1, {"guards": True, "constraints": True, "priors": True, "transitions": 1, "states": 1}),
         (3, {"guards": True, "constraints": True, "late": True, "samples": 1, "solver": "stiff", "states": 3}),
-        pytest.param(2, {"late": True, "samples": 1, "transitions": 1, "states": 1}, marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_of_random_systems_in_each_engine(seed, given, engine):
-    """Guards and terminal constraints with priors, and a delay that is estimated."""
+    """Guards and terminal constraints, with priors or a delay that is estimated."""
     system = System(2000 + seed, **{**PLAIN, **given})
-    assert bool(system.problem.constraint_names) == given.get("guards", False)
+    assert system.problem.constraint_names
     assert not differences(system, (), engine)
 
 
@@ -610,14 +605,6 @@ def used_once():
     jax.clear_caches()
 
 
-@pytest.mark.fuzz
-@pytest.mark.usefixtures("used_once")
-@pytest.mark.parametrize("seed", range(SYSTEMS))
-def test_derivatives_of_random_systems(seed):
-    """Machine code, or JAX where there is none."""
-    assert not differences(System(seed), ())
-
-
 @pytest.mark.parametrize("seed", [pytest.param(v, marks=[pytest.mark.slow] * (v > 1)) for v in range(SYSTEMS)])
 @pytest.mark.usefixtures("used_once")
 def test_derivatives_of_random_systems_with_both_kinds_of_steps(seed):
@@ -627,11 +614,11 @@ def test_derivatives_of_random_systems_with_both_kinds_of_steps(seed):
     assert not differences(system, (), "native", implicit=tuple(names[seed % 2 :: 2]))
 
 
-@pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.usefixtures("used_once")
 @pytest.mark.parametrize("seed", range(SYSTEMS))
-def test_derivatives_of_random_systems_by_the_other_methods(seed):
-    """Each of them in turn, which JAX takes 20 s to compile; in each tenth JAX does what machine code could do."""
+def test_derivatives_of_random_systems_by_each_method(seed):
+    """In machine code, and by one of the others, which JAX takes 20 s to compile; in each tenth JAX does it all."""
     assert not differences(System(seed), (METHODS[seed % len(METHODS)],), "jax" if seed % 10 == 0 else "auto")
 
 

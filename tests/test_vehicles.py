@@ -278,14 +278,9 @@ WRONG = [
     (skid_steer, {"m_w": sf.Parameter(2.5)}, "m_w must be a number; got Parameter"),
     (skid_steer, {"initial_state": [0.0] * 5}, "initial_state must have 6 entries, X, dX, Y, dY, theta, d"),
     (bicycle, {"initial_state": [0.0] * 6}, "initial_state must have a positive v_x, "),
-    (differential_drive, {"track": -0.5}, "track must be positive; got -0.5"),
     (differential_drive, {"delay": 0.1}, "delay is that of speeds='commanded', or else"),
-    (differential_drive, {"speeds": "commanded", "delay": -1.0}, "delay must be 0 or more; got -1.0"),
     (differential_drive, {"y_l": 0.4, "y_r": 0.4}, "y_l, on the left, must be larger than y_r; got 0"),
     (differential_drive, {"turn_slip": 2.0}, "turn_slip must be from 0 to 1; got 2.0"),
-    (rolling_body, {"radius": None}, "radius must be a number; got None"),
-    (lugre, {"sigma_1": -1}, "sigma_1 must be 0 or more; got -1"),
-    (magic_formula, {"height": -0.1}, "height must be 0 or more; got -0.1"),
 ]
 
 
