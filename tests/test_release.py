@@ -47,12 +47,6 @@ def test_versions_agree():
     assert next(heading for heading in headings if heading != "Unreleased") == version
 
 
-def test_classifiers_name_the_versions_that_are_supported():
-    named = [entry.rpartition(" ")[2] for entry in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", entry)]
-    assert named == [f"3.{minor}" for minor in range(int(OLDEST[2:]), int(NEWEST[2:]) + 1)]
-    assert PROJECT["requires-python"] == f">={OLDEST}"
-
-
 def read_lowest():
     """Return a pip constraint for the lowest supported version of each dependency."""
     bounds = {re.match(r"[\w-]+", entry)[0]: re.search(r">=([\d.]+)", entry) for entry in PROJECT["dependencies"]}

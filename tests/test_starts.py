@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ import switchfit as sf
 from benchmarks.starts import command, methods, study, table
 from benchmarks.starts.end import judge
 from benchmarks.starts.problems import PROBLEMS, build_case
-from benchmarks.starts.study import Outcomes
 
 SLOW = ("tosses", "runs", "paper-reference", "friction")
 NO_TIMES = {"seconds": 0, "fitting": 0, "optimizing": 0}
@@ -82,24 +80,6 @@ def test_an_error_is_counted_and_ends_nothing(monkeypatch, run):
     row = dict(zip(table.HEADER, [cell.strip() for cell in out.splitlines()[2].split("|")[1:-1]], strict=True))
     assert [row[name] for name in ("right", "errors", "wrong, claims success")] == ["0 of 3", "1", "0 of 2"]
     assert "1 times FloatingPointError: made to fail" in out
-
-
-def test_outcomes_of_another_problem_or_start_do_not_count(tmp_path):
-    case = build_case("ball")
-    moved = replace(case, starts=case.starts + 1e-6)
-    assert case.identity == moved.identity
-    assert case.digest(0) != moved.digest(0)
-    outcomes = Outcomes(tmp_path / "starts-x.jsonl")
-    base = {"case": case.identity, "method": "exact", "start": 0, "digest": "", "violation": 0.0, "problem": "ball"}
-    others = {"cost": 3.0, "violation": 0.1, "start": 1}, {"cost": 1.0, "problem": "ball-guards"}
-    for different in (
-        {"cost": 5.0},
-        *others,
-        {"error": "x", "start": 2},
-        {"cost": 2.0, "case": "others", "digest": "-"},
-    ):
-        outcomes.add(base | different)
-    assert table.find_best("ball", case, [outcomes.path]) == 5.0
 
 
 @pytest.mark.slow
