@@ -207,7 +207,7 @@ def tabulate() -> Iterator[str]:
         yield f"| {name} | NUTS (NumPyro) on its Laplace approximation, which has no kinks | | {rate} | | | | | |"
         for label, run in SAMPLERS.items():
             done = run(posterior, starts, jax.random.key(0))
-            table = posterior.to_arviz(done.theta)
+            table = arviz.from_dict({name: done.theta[..., k] for k, name in enumerate(posterior.names)})
             ess = min(float(arviz.ess(table)[unknown]) for unknown in posterior.names)
             rhat = max(float(arviz.rhat(table)[unknown]) for unknown in posterior.names)
             flat = np.reshape(done.theta, (-1, len(sd)))

@@ -49,6 +49,26 @@ ROUNDING = {"stiff": 1e-10, "mixed": 1e-10}
 """Relative gaps that need not close any further; the Jacobian of the stiff mode amplifies rounding."""
 
 
+TAYLOR = {"resets": ([0.413, 0.791, 1.336], 0.01), "mixed": ([0.6187, 1.2812], 2e-4)}
+"""Transition times that are no nodes, and a step."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", TAYLOR)
+def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
+    this, (tau, size) = case(name), TAYLOR[name]
+    arguments, direction = this.arguments(kind), np.array([*[1.0, -0.7, 0.8][: this.N], 0.9, -1.1])
+    at = this.discrete(arguments, np.array(tau), P0)
+
+    def remainders(step: float) -> list[float]:
+        d = step * direction
+        change = this.discrete(arguments, tau + d[: this.N], P0 + d[this.N :]).cost - at.cost
+        return [change, change - at.gradient @ d, change - at.gradient @ d - 0.5 * d @ at.hessian @ d]
+
+    coarse, fine = np.abs(remainders(size / 2)), np.abs(remainders(size / 4))
+    np.testing.assert_allclose(np.log2(coarse / fine), [1.0, 2.0, 3.0], atol=0.2)
+
+
 @cache
 def gaps(name: str, kind: str) -> list[dict[str, float]]:
     """Gap of each block, relative to the largest entry, on meshes that are halved again and again."""

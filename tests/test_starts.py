@@ -4,12 +4,10 @@ import json
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-import switchfit as sf
 from benchmarks.starts import command, methods, study, table
 from benchmarks.starts.end import judge
 from benchmarks.starts.problems import PROBLEMS, build_case
@@ -80,13 +78,3 @@ def test_an_error_is_counted_and_ends_nothing(monkeypatch, run):
     row = dict(zip(table.HEADER, [cell.strip() for cell in out.splitlines()[2].split("|")[1:-1]], strict=True))
     assert [row[name] for name in ("right", "errors", "wrong, claims success")] == ["0 of 3", "1", "0 of 2"]
     assert "1 times FloatingPointError: made to fail" in out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["fishing", "linear", "paper-reference", "thermostat"])
-def test_none_of_many_starts_fails_that_would_not_fail_again(name):
-    problem = build_case(name).problem
-    study = sf.multistart(problem, 60, seed=1)
-    again = [sf.estimate(problem, start=study.theta[k]).success for k in np.flatnonzero(~study.success)]
-    assert not any(again)
-    assert study.failures == []
