@@ -561,6 +561,7 @@ ASSUMED_NOISE = 0.01
 """Noise where sigma is unknown, as a part of the variation of the data."""
 
 
+@keep_with_problem
 def measure_variation(problem: Problem) -> FloatArray:
     """Return J of data that are met by their means alone, one for each experiment: (E,).
 
