@@ -79,7 +79,7 @@ TOGETHER = ("test_adjoint", "test_native", "test_prediction")
 """Files that share the programs of `systems.case`, which are most of what they take: one process runs them all."""
 
 BEGIN_FIRST = (
-    "batch docs real_logs protocol runs final_time paper html zero_times_nan beam insertion modes sampling inputs "
+    "batch docs real_logs protocol runs final_time paper html zero_times_nan beam insertion modes inputs "
     "stiffness first_ten_minutes jumps cli strategy files docstrings starts closed_form random_systems batch_intervals "
     "guards known_answers units bootstrap examples estimate vehicles plots verdict dates cli_modes"
 )

@@ -33,7 +33,7 @@ OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
 }
 
 NAMES = {
-    "batch": "batch sampling batch_intervals bootstrap many_logs verdict_many starts",
+    "batch": "batch batch_intervals bootstrap many_logs verdict_many starts",
     "cli": "cli cli_modes saved_problem design online_cli init interrupt many_logs",
     "discretization": "mesh moments implicit random_systems stiffness protocol",
     "engine": "corners mesh stiffness following protocol native",

@@ -10,7 +10,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import jax
 import matplotlib
 import pytest
 from functions import FALLS_BACK
@@ -28,7 +27,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("example
 
 #: Pages that take a second or more.
 HEAVY = (
-    "figures report sampling command-line how-many-switches uncertainty validation terrain many-runs guards design "
+    "figures report command-line how-many-switches uncertainty validation terrain many-runs guards design "
     "online convergence what-now vehicles real-logs dates fishing husky sharp"
 )
 
@@ -66,9 +65,7 @@ def clone(tmp_path, monkeypatch):
     """A folder that has the examples, as a clone has, to work in."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.chdir(tmp_path)
-    before = jax.config.read("jax_enable_x64")  # a page on samplers turns it on
-    yield tmp_path
-    jax.config.update("jax_enable_x64", before)
+    return tmp_path
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

@@ -274,7 +274,6 @@ def list_doors():
         "predict": door(sf.predict, estimate=fit, times=TIMES),
         "Estimate.validate": door(fit.validate, other=GOOD),
         "compare": door(sf.compare, estimates=[fit, fit], names=["one", "two"]),
-        "log_posterior": door(sf.log_posterior, problem=GOOD),
         "profile": door(sf.profile, estimate=fit, name="k", callback=lambda done, total: done > 1),
         "Estimate.plot": door(fit.plot, bands=False),
         "Estimate.save": door(fit.save, path="fit.json"),
@@ -392,7 +391,7 @@ def test_the_doors_are_all_that_is_public(doors):
     made_by_switchfit = {
         "ActiveConstraint", "Alarm", "Bootstrap", "Calibration", "Certificate", "ChannelResiduals", "Comparison",
         "DerivativeCheck", "Design", "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation",
-        "Identifiability", "InputCorrelation", "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModeEnding",
+        "Identifiability", "InputCorrelation", "Insertion", "Issue", "Kink", "Log", "ModeEnding",
         "ModeFit", "ModeSearch", "ModeStatus", "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Now",
         "OnlineLog", "OnlineStatus", "Prediction", "Profile", "ResidualDiagnostics", "SearchProgress", "Status",
         "Step", "Stiffness", "Termination", "Trajectory", "Validation", "Verdict",

@@ -23,7 +23,7 @@ LOGS = {"runtime", "problem.validation", "problem.dates"}
 """Rooms and modules of other rooms that `io.logs` may import: it knows no model, no fit and no report."""
 
 OPTIONAL = {
-    "arviz", "blackjax", "gpxpy", "h5py", "numpyro", "pandas", "polars", "pyarrow", "pymap3d", "pynmea2", "rosbags",
+    "gpxpy", "h5py", "pandas", "polars", "pyarrow", "pymap3d", "pynmea2", "rosbags",
     "xarray",
 }  # fmt: skip
 """Libraries of the extras, which are imported where they are needed."""

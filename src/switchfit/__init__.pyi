@@ -1,8 +1,6 @@
 """Public names for type checkers; `__init__.py` has the same names in its table."""
 
 from switchfit.batch.fits import Fits as Fits
-from switchfit.batch.posterior import LogPosterior as LogPosterior
-from switchfit.batch.posterior import log_posterior as log_posterior
 from switchfit.batch.simulated import Bootstrap as Bootstrap
 from switchfit.batch.simulated import MonteCarlo as MonteCarlo
 from switchfit.batch.simulated import bootstrap as bootstrap

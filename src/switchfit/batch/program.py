@@ -98,7 +98,7 @@ def choose_chunk_size(problem: Problem) -> int:
     return choose_layout(evaluator_of(problem)).size if has_gpu() else CHUNK
 
 
-def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = (), *, on_gpu: bool = False) -> Layout:
+def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = ()) -> Layout:
     """Return the layout of a program that evaluates a problem on given meshes, with its own numbers.
 
     Parameters
@@ -107,11 +107,9 @@ def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = (), *, on_gpu
         With the problem and the meshes.
     varying : tuple of int
         Leaves of the arguments that differ from fit to fit.
-    on_gpu : bool
-        Whether the program must run there: it then has no machine code.
     """
     problem, structures = evaluator.problem, evaluator.structures
-    natively = not on_gpu and problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
+    natively = problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
     return Layout(
         tuple(structure.library for structure in structures) if natively else structures,
         tuple(tuple(int(k) for k in places) for places in problem.places),

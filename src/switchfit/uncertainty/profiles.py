@@ -33,7 +33,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,53 +81,30 @@ ITERATIONS = 100
 """Largest number of iterations of one fit along the profile."""
 
 
-class Limits(NamedTuple):
-    """What limits each unknown.
-
-    Attributes
-    ----------
-    before : (d,) int
-        Of a transition time, or a free tf, the index in theta of the time before it; -1 if that is fixed, or t0, and
-        for all other unknowns.
-    gap : (d,)
-        Shortest time between the two.
-    low : (d,)
-        Lower bound, so that all times before it find room.
-    high : (d,)
-        Upper bound, so that all times after it find room.
-    """
-
-    before: NDArray[np.intp]
-    gap: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-def limit_unknowns(problem: Problem) -> Limits:
-    """Return the limits of all unknowns.
+def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and the upper bounds of all unknowns, (d,) and (d,), with room for all times before and after.
 
     Parameters
     ----------
     problem : Problem
     """
-    unknowns, d = problem.unknowns, len(problem.theta_names)
-    found = Limits(np.full(d, -1), np.zeros(d), unknowns.lower.copy(), unknowns.upper.copy())
+    unknowns = problem.unknowns
+    low, high = unknowns.lower.copy(), unknowns.upper.copy()
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         times, places = experiment.initial_times, where.tolist()
         gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
         latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
         for i in reversed(range(len(places))):
-            latest = min(latest, times[i] if places[i] < 0 else found.high[places[i]])
+            latest = min(latest, times[i] if places[i] < 0 else high[places[i]])
             if places[i] >= 0:
-                found.high[places[i]] = latest
+                high[places[i]] = latest
             latest -= gaps[i]
-        before, earliest = -1, experiment.t0
+        earliest = experiment.t0
         for i, place in enumerate(places):
-            earliest = max(earliest + gaps[i], times[i] if place < 0 else found.low[place])
+            earliest = max(earliest + gaps[i], times[i] if place < 0 else low[place])
             if place >= 0:
-                found.before[place], found.gap[place], found.low[place] = before, gaps[i], earliest
-            before = place
-    return found
+                low[place] = earliest
+    return low, high
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +178,9 @@ class Profile(Tabular, Displayed):
         self._starts = {side: self._describe(fit.theta, self._follower(fit.theta, side), True) for side in (-1, 1)}
         self._centre = self._starts[1]
         self.points, self.fits = [self._centre], 0
-        limits = limit_unknowns(evaluator.problem)
+        low, high = limit_unknowns(evaluator.problem)
         # The estimate is feasible: rounding must not put a limit on the wrong side of it.
-        self.limits = {-1: float(min(limits.low[k], self.value)), 1: float(max(limits.high[k], self.value))}
+        self.limits = {-1: float(min(low[k], self.value)), 1: float(max(high[k], self.value))}
         self.jumps: list[float] = []
         self._ends: dict[int, End] = {-1: "stopped", 1: "stopped"}
         self._interrupted = False
