@@ -432,7 +432,7 @@ def _list_visits(model: Model, p: Any, simulation: Simulation) -> Iterator[_Visi
     modes = np.array(structure.mode_of_segment)[segment]
     for mode in dict.fromkeys(modes.tolist()):
         own = np.where(modes == mode, np.arange(len(modes)), np.argmax(modes == mode))
-        stages = _list_stages(model, p, simulation, mode, own, own - segment[own])
+        stages = _list_stages(model, p, simulation, mode, own)
         yield from visit(structure.modes[mode], *stages)
     for k, row in enumerate(own.stop - 1 for own in rows[:-1]):
         for functions in (structure.guards, structure.transition_costs, structure.reset_maps):
@@ -449,8 +449,8 @@ def _list_visits(model: Model, p: Any, simulation: Simulation) -> Iterator[_Visi
         yield from visit(function, states[-1:])
 
 
-def _list_stages(model: Model, p: Any, simulation: Simulation, mode: int, rows: Any, cells: Any) -> list[FloatArray]:
-    """Return times, states and inputs at which some rows, in some cells, evaluate their mode, in the order of time.
+def _list_stages(model: Model, p: Any, simulation: Simulation, mode: int, rows: Any) -> list[FloatArray]:
+    """Return times, states and inputs at which some rows evaluate their mode, in the order of time.
 
     Those of implicit steps are taken to be the start and the end of the row.
     """
@@ -465,9 +465,11 @@ def _list_stages(model: Model, p: Any, simulation: Simulation, mode: int, rows: 
         return [jnp.stack(each) for each in zip(*points, strict=True)]
 
     given = (simulation.start, simulation.end, simulation.before, simulation.after)
-    signals = np.asarray(model.arguments.nodes)[cells], np.asarray(model.arguments.signals)[cells]
+    nodes, signals = (np.asarray(each) for each in (model.arguments.nodes, model.arguments.signals))
+    # Where corners are crossed there are more rows than the mesh has cells.
+    cells = np.minimum(np.searchsorted(nodes, simulation.start[rows], "right"), len(signals)) - 1
     with use_float64():
-        found = jax.jit(jax.vmap(evaluate))(*(values[rows] for values in given), *signals)
+        found = jax.jit(jax.vmap(evaluate))(*(values[rows] for values in given), nodes[cells], signals[cells])
     return [np.asarray(each).reshape(-1, *each.shape[2:]) for each in found]
 
 

@@ -62,7 +62,7 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
     steps : sequence of Step
         The fit from the first guess, and the searches since.
     """
-    if fit.status is Status.INTERRUPTED or _is_model_at_fault(fit) or is_confirmed(problem, fit):
+    if fit.status is Status.INTERRUPTED or _is_model_at_fault(problem, fit) or is_confirmed(problem, fit):
         return True
     if not fit.status.successful:
         return False
@@ -80,17 +80,18 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
     return steps[-1].cost == steps[-2].cost and not steps[-1].ended and not is_blind
 
 
-def _is_model_at_fault(fit: Estimate) -> bool:
+def _is_model_at_fault(problem: Problem, fit: Estimate) -> bool:
     """Return whether what ended a fit is how a function is written, from wherever the fit begins.
 
-    Derivatives leave a switch out; and where J has a value at the start, but no derivatives, other starts have as few.
+    Derivatives leave a switch out; and where there are none in the initial state, other starts have as few.
     """
     if fit.reason is None:
         return False
     if fit.reason.kind == "switch":
         return True
-    underivable = fit.reason.kind == "undefined" and fit.reason.figures["valued"] == 1.0
-    return fit.status is Status.NONFINITE_START and underivable
+    is_known = fit.reason.kind == "undefined" and fit.reason.figures["valued"] == 1.0
+    begins = [run.t0 for run in problem.experiments]
+    return fit.status is Status.NONFINITE_START and is_known and fit.reason.figures.get("t", begins[0]) in begins
 
 
 def is_confirmed(problem: Problem, fit: Estimate) -> bool:
@@ -362,12 +363,12 @@ class Search:
 
     @property
     def lowest(self) -> float:
-        """The lowest J so far; infinite before the first fit, and where it means nothing: constraints are violated, or
-        a fit that has not converged has gone down into the integration error.
+        """The lowest J so far; infinite before the first fit, and where it means nothing: it is no number, constraints
+        are violated, or a fit that has not converged has gone down into the integration error.
         """
         best = self.best
         is_coarse = best is not None and not best.status.successful and best.integration_error > LARGE_INTEGRATION_ERROR
-        return np.inf if best is None or best.violated or is_coarse else best.cost
+        return np.inf if best is None or best.violated or is_coarse or np.isnan(best.cost) else best.cost
 
     def finish(self) -> Estimate:
         """Return the best fit with the record of the whole search."""
