@@ -285,6 +285,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             CORNERS, "found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))"
         ),
         "corners that are one": swap(CORNERS, "tuple(sorted(pair))", "pair"),
+        "corners of two states that are not one": swap(CORNERS, '"argument", k, i', '"argument", k, 0'),
         "the margin of a steep corner": swap(CORNERS, "if sides[k] == side:", "if False:"),
         "rates at a steep corner": swap(COURSE, "if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:"),
         "passed by an error of the solver": swap(

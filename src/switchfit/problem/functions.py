@@ -361,16 +361,6 @@ def _describe_content(closed: Any) -> _Text:
     return text
 
 
-def describe_outputs(closed: Any) -> list[str]:
-    """Return a text for each output of a jaxpr: equal for outputs that are computed in the same way."""
-    texts = []
-    for k in range(len(closed.jaxpr.outvars)):
-        needed = [k == other for other in range(len(closed.jaxpr.outvars))]
-        one, _ = partial_eval.dce_jaxpr(closed.jaxpr, needed, instantiate=True)
-        texts.append("\n".join(_Text(type(closed)(one, closed.consts)).lines))
-    return texts
-
-
 def _differentiate_twice(closed: Any) -> Any:
     """Return the jaxpr of the first and second derivatives along all arguments, in which custom rules are applied."""
 
