@@ -158,10 +158,6 @@ class Mesh:
         cuts = np.unique(np.concatenate([self.times, transition_times]))
         return self.insert(0.5 * (cuts[:-1] + cuts[1:]))
 
-    def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
-        """Return the index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
-        return np.searchsorted(self.times, times) - 1
-
 
 def _count_steps(solutions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return times (K,) and the number of solver steps up to each, (K,), linear in between, from the step times of
@@ -317,9 +313,11 @@ def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
 def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Arguments:
     """Return the arguments of an experiment on a mesh, from those that suit any mesh."""
     measurements = select_kind(experiment.data, Measurements)
+    # Of each sample the index of the cell that ends at it; -1 for t0.
+    cells = (np.searchsorted(mesh.times, item.seen_times) - 1 for item in measurements)
     samples = tuple(
-        padded._replace(cell=_pad_with_last(mesh.cell_ending_at(item.seen_times), len(padded.time), 0))  # type: ignore[arg-type]
-        for item, padded in zip(measurements, common.samples, strict=True)
+        padded._replace(cell=_pad_with_last(cell, len(padded.time), 0))  # type: ignore[arg-type]  # made jax arrays
+        for cell, padded in zip(cells, common.samples, strict=True)
     )
     # Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S).
     split = [split_by_cell(signal, mesh) for signal in experiment.signals]

@@ -66,10 +66,8 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
             return [0.0 * r for r in found] if structure.is_rest(mode) else found
 
         points = path.stages, path.after, path.layout.end, p
-        cost, tracked = (
-            propagation.compute_path_cost(model, path, p),
-            propagation.map_stages(model, path, track, path.stages),
-        )
+        cost = propagation.compute_path_cost(model, path, p)
+        tracked = propagation.map_stages(model, path, track, path.stages)
         return (cost, residuals, log_sigmas, tracked, points), (cost, path, points, information)
 
     derivatives, (cost, path, points, information) = jax.jacfwd(simulate, has_aux=True)(theta)
@@ -98,17 +96,13 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
 
 def sum_other_costs(model: Model, path: propagation.Path, weights: Array, p: Array) -> Array:
     """Return the running costs, with weights of the stages (R, s), and the costs at transitions and at the end."""
-    if not model.structure.running:
-        return propagation.add_point_costs(model, path, p)
 
     def ell(mode: int, piece: Piece, t: Array, x: Array) -> Array:
         rates = [jnp.asarray(ell(t, x, model.parameters(p))).reshape(()) for ell in model.structure.running]
         return jnp.zeros(()) if model.structure.is_rest(mode) else sum(rates, jnp.zeros(()))
 
-    return (
-        propagation.add_point_costs(model, path, p)
-        + (weights * propagation.map_stages(model, path, ell, path.stages)).sum()
-    )
+    along_the_way = (weights * propagation.map_stages(model, path, ell, path.stages)).sum()
+    return propagation.add_point_costs(model, path, p) + along_the_way
 
 
 Method = Literal["forward", "discrete-adjoint"]
@@ -203,9 +197,8 @@ def differentiate_in_states(
 
     def lagrangian(nudges: Array) -> tuple[Array, Array]:
         path = propagation.propagate(model, tau, p, jnp.ones(()), nudges)
-        return propagation.compute_path_cost(model, path, p) + multipliers @ propagation.compute_path_constraints(
-            model, path, p
-        ), path.before
+        J, c = propagation.compute_path_cost(model, path, p), propagation.compute_path_constraints(model, path, p)
+        return J + multipliers @ c, path.before
 
     rows = arguments.nodes.shape[0] - 1 + structure.N
     found = _try_backward(lagrangian, jnp.zeros((rows, structure.n)))

@@ -150,7 +150,9 @@ class Kernels:
         states = [x + combine(row, k) for row in STIFF.a]
         found = [field(j, X) for j, X in enumerate(states)]
         slopes, jacobians = zip(*found, strict=True)
-        corrected = rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
+        right = [h * slope - own for slope, own in zip(slopes, k, strict=True)]
+        changes = eliminate(STIFF.a, h, jacobians).solve(right)
+        corrected = [own + change for own, change in zip(k, changes, strict=True)]
         after = np.concatenate([x + combine(row, corrected) for row in STIFF.a])
         change = xp.abs(after - np.concatenate(states))
         size = xp.abs(after) + xp.abs(np.concatenate([x] * len(k)))
@@ -227,7 +229,7 @@ class Kernels:
             stores += self._add_to_row(graph, stage, tableau, found, along, costs)
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
-            stores.append(("J", 0, graph.load("J", 0) + rows.cost_of_row(tableau, h, densities)))
+            stores.append(("J", 0, graph.load("J", 0) + h * combine(tableau.b, densities)))
         if checked:
             stores += graph.check()
         self.module.write_straight_line(name, stores)
