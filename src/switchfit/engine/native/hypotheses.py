@@ -16,7 +16,6 @@ to g and its Gauss-Newton matrix to H at once, without a costate. Further pointe
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -318,9 +317,7 @@ class HypothesisWriter(Writer):
             self.store(self.get("double", row, 1), row)
             self.put((part + 1 >= parts).choose(end, inside), row, 1)
             for k in self.cases(mode, len(self.library.modes)):
-                if self.library.implicit[k]:
-                    program.solve_stages(self, f"newton_{k}", found)
-                self.call(f"step_{k}", found)
+                self.take_step(k, "step", found)
                 program.add_curvature(self, curvatures[k], found, moving=False)
         return self.end()
 
@@ -546,18 +543,15 @@ class NativeHypotheses:
     def __init__(
         self, code: Program, sizes: Sizes, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
     ) -> None:
-        self._program, self._sizes, self._at = code, sizes, divide_record(sizes)
+        self._program, self._at = code, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
         self._shape = sizes.n, sizes.D, sizes.width
-        # Row 0 is zero: the derivative of a time that does not move.
-        units = np.zeros((sizes.D + 1, sizes.width))
-        units[1:, : sizes.D] = np.eye(sizes.D)
         nodes = np.arange(self._cells + 2)
         self._arrays: dict[str, Any] = {
             "nodes": np.array(times),
             "signals": np.ascontiguousarray(np.asarray(arguments.signals)[: self._cells]),
             "c": np.concatenate([*constants_of(arguments), np.zeros(1)], axis=None),
-            "units": units,
+            "units": np.eye(sizes.D + 1, sizes.width, -1),  # row 0 is zero: the derivative of a time that does not move
             "tolerances": np.zeros(3),
             **{name: np.zeros(sizes.D) for name in ("low", "high", "most")},
             "jump_first": np.searchsorted([node for node, _ in jumps], nodes).astype(np.int64),
@@ -571,9 +565,9 @@ class NativeHypotheses:
             self._set_samples(k, first, *values)
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
-        prefix, kind = program.PREFIX[Order.GAUSS_NEWTON], ctypes.c_int64  # of numbers, and of addresses
-        self._propagate = code.function(f"{prefix}propagate", *[kind] * 13)
-        self._follow_order = code.function(f"{prefix}follow_order", *[kind] * 14)
+        prefix = program.PREFIX[Order.GAUSS_NEWTON]
+        self._propagate = code.function(f"{prefix}propagate", 13)
+        self._follow_order = code.function(f"{prefix}follow_order", 14)
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
         self._arrays |= {f"{name} {k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}

@@ -515,11 +515,11 @@ class Kernels:
         for x in graph.loads("x", n):
             # 0 times infinity or NaN is NaN: the sum is 0, or NaN if any factor is not finite. LARGE takes large ones
             # there too.
-            total = total + graph.certain_product(0.0, x * LARGE)
+            total = total + graph.find_failure(x * LARGE)
         if self.with_tangents:
             for k in range(n):
                 for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
-                    total = total + graph.certain_product(0.0, Z)
+                    total = total + graph.find_failure(Z)
         self.module.write_straight_line("check_state", [(CHECKED, 0, total)])
 
     def outputs(self) -> None:

@@ -158,6 +158,14 @@ class Writer(Lines):
         """Emit the call of a straight-line function with its pointers."""
         self.invoke(name, *(given[key] for key in self.module.pointers[name]))
 
+    def take_step(self, mode: int, name: str, given: Pointers, newton: str = "newton") -> None:
+        """Emit the call of a step in a mode, behind that of `write_newton` which finds the increments of an implicit
+        one.
+        """
+        if self.library.implicit[mode]:
+            self.call(f"solve_{newton}_{mode}", given)
+        self.call(f"{name}_{mode}", given)
+
     def cases(self, which: Value, count: int) -> Iterator[int]:
         """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
         name = self.name_block()
@@ -253,6 +261,7 @@ def write_newton(writer: Writer, name: str) -> str:
     """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
     count, names = len(STIFF.b) * writer.sizes.n, (*writer.module.pointers[name], "J")
     parameters = writer.begin(f"void @solve_{name}({', '.join(f'ptr %{key}' for key in names)})")
+    writer.module.pointers[f"solve_{name}"] = names
     given = dict(zip(names, parameters, strict=True))
     # k = 0 is X_j = x, so that the first iteration is a linearly implicit step.
     writer.zero(given["increments"], count)
@@ -264,11 +273,6 @@ def write_newton(writer: Writer, name: str) -> str:
     for pointer in (given["J"], *(writer.at(given["increments"], k) for k in range(count))):
         writer.store(float("nan"), pointer)
     return writer.end()
-
-
-def solve_stages(writer: Writer, name: str, given: Pointers) -> None:
-    """Emit the call that computes the increments of an implicit row by the iterations of `write_newton`."""
-    writer.invoke(f"solve_{name}", *(given[key] for key in (*writer.module.pointers[name], "J")))
 
 
 def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
@@ -331,9 +335,7 @@ def write_forward(writer: Writer) -> str:
         # The first row begins behind the reset map, whose state is not among those of the rows.
         given |= {name: given["first"].choose(start[name], given[name]) for name in ("x", "Z")}
         for k, kind in row_cases(writer, case):
-            if writer.library.implicit[k]:
-                solve_stages(writer, f"newton_{k}", given)
-            writer.call(f"forward_{kind}_{k}", given)
+            writer.take_step(k, f"forward_{kind}", given)
         for level, name in enumerate(("error", "jump") if writer.order > Order.COST else ()):
             for k in writer.cases((flag > level).choose(mode, -1), modes):
                 writer.call(f"{name}_{k}", given)
@@ -429,9 +431,7 @@ def _write_late_row(writer: Writer, k: int, found: Pointers, sample: Value) -> t
     writer.call(f"late_time_{k}", given)
     mode = writer.get("i64", found["modes"], segment)
     for m in writer.cases(mode, len(writer.library.modes)):
-        if writer.library.implicit[m]:
-            solve_stages(writer, f"newton_{m}", given)
-        writer.call(f"forward_late_{m}", given)
+        writer.take_step(m, "forward_late", given)
     return given, mode
 
 
@@ -652,7 +652,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
 
     It ends at the end time, after `most` accepted steps, or when the solver is stuck.
     """
-    n, is_implicit = writer.sizes.n, writer.library.implicit[mode]
+    n = writer.sizes.n
     given = "i64 %cells, ptr %state, ptr %y, ptr %rows, i64 %most, ptr %count"
     _, cells, state, y, rows, most, count = writer.begin(f"void @adaptive_{mode}_steps(ptr %table, {given})")
     found = writer.pointers() | {"state": state, "y": y}
@@ -664,12 +664,10 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
         t, end, stuck, step = (writer.get("double", state, k) for k in (AT.t, AT.end, AT.stuck, AT.step))
         # Go on while t < end, not stuck, and with room for accepted times.
         leave(((t < end) & stuck.equals(0.0) & (writer.load("i64", count) < most)).equals(False))
-        for j, c in enumerate(TIMES[is_implicit]):
+        for j, c in enumerate(TIMES[writer.library.implicit[mode]]):
             found[f"moment{j}"] = writer.allocate("double", 2)
             found[f"signal{j}"] = _store_moment(writer, found, cells, t + step * c, found[f"moment{j}"])
-        if is_implicit:
-            solve_stages(writer, f"newton_step_{mode}", found)
-        writer.call(f"step_{mode}", found)
+        writer.take_step(mode, "step", found, "newton_step")
         with writer.when(writer.get("double", state, AT.refused).equals(0.0)):
             accepted = writer.load("i64", count)
             row = writer.at(rows, accepted, 2 + n)

@@ -336,15 +336,15 @@ class Graph:
                     self.presumed[each.index] = each
             pending += [a for a in each.args if isinstance(a, Node)]
 
-    def certain_product(self, factor: float, node: Node) -> Node:
-        """Return the product of a number with a node, without simplification."""
-        return self._node("mul", (self.constant(factor), node), node.vector)
+    def find_failure(self, node: Node) -> Node:
+        """Return 0 where a node is finite, else NaN: its product with zero, without simplification."""
+        return self._node("mul", (self.constant(0.0), node), node.vector)
 
     def check(self) -> list[tuple[str, int, Node]]:
         """Return the store that makes `CHECKED` NaN if a presumption is wrong; an empty list without presumptions."""
         total = self.load(CHECKED, 0)
         for node in self.presumed.values():
-            total = total + self.certain_product(0.0, node)
+            total = total + self.find_failure(node)
         return [(CHECKED, 0, total)] if self.presumed else []
 
     def _simplify(self, op: str, args: tuple[Node, ...]) -> Node | None:
