@@ -221,15 +221,6 @@ class Rows(NamedTuple):
     first_cell: Any
 
 
-def count_passed(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Any:
-    """Return how many nodes each of tau (N,) is past: (N,); a node at tau_i counts if its side, () or (N,), is +1."""
-    several = getattr(side, "ndim", 0) > 0
-    right = (side[:, None] if several else side) > 0
-    passed = xp.where(right, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
-    # Of two equal times with different sides, the later one must not begin in an earlier cell.
-    return xp.maximum.accumulate(passed) if several and tau.shape[0] else passed
-
-
 def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
@@ -238,7 +229,12 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     are those of `xp`, JAX or NumPy.
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
-    passed = count_passed(nodes, tau, side, xp)
+    several = getattr(side, "ndim", 0) > 0
+    right = (side[:, None] if several else side) > 0
+    # How many nodes each of tau is past.
+    passed = xp.where(right, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    if several and N:  # of two equal times with different sides, the later one must not begin in an earlier cell
+        passed = xp.maximum.accumulate(passed)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
     first_cell = xp.concatenate([xp.zeros(1, passed.dtype), xp.clip(passed - 1, 0, real_cells - 1)])
     # Row = cell + segment: each transition cuts one cell in two, so that segment i begins at row first_cell_i + i. R =

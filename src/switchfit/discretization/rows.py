@@ -314,14 +314,12 @@ class Adjoint(NamedTuple):
 
     Attributes
     ----------
-    slopes : s arrays w_j (n,), in the slopes of the stages
     states : s arrays mu_j (n,), in the states of the stages
     before : (n,), in the state before the row
     times : s entries (), of ``w_j . f + h b_j ell`` in t_j
     parameters : (M,), the sum of the same in p
     """
 
-    slopes: list[Array]
     states: list[Array]
     before: Array
     times: list[Array]
@@ -357,7 +355,7 @@ def adjoint(
             w[j] = h * (b[j] * psi + later)
         times[j], mu[j], in_p = pull(j, w[j], h * b[j])
         parameters = parameters + in_p
-    return Adjoint(w, mu, psi + sum(mu[1:], mu[0]), times, parameters)
+    return Adjoint(mu, psi + sum(mu[1:], mu[0]), times, parameters)
 
 
 def length_factor(

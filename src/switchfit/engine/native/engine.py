@@ -430,7 +430,7 @@ class NativeExperiment:
         nodes = self.times[1:-1]
         # A time on a node is past it on its right side, and not yet on its left.
         begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
-        if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
+        if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `build_rows`
             jumps = list(self.structure.jumps)
             begins[jumps] = nodes.searchsorted(tau[jumps], "right")
             begins = np.maximum.accumulate(begins)

@@ -103,23 +103,16 @@ class HypothesisKernels(Kernels):
     """Writes the straight-line functions of hypotheses; the order of derivatives is that of Gauss-Newton."""
 
     adjoint = False
-
-    def step(self, mode: int, stage: Template, costs: bool) -> list[tuple[int, int]]:
-        """Write a step in a mode: state, tangents, running costs and the estimate of the error.
-
-        Its ends do not move: births change Z by `move` and `hold`, between steps. Return which second derivatives of
-        the running costs are stored for each stage, as `Kernels.backward_row`.
-        """
-        self._chosen: list[tuple[int, int]] = []
-        if self.library.implicit[mode]:
-            self.newton(f"newton_{mode}", stage)
-        self.forward_row(f"step_{mode}", stage, False, costs, self.tableau(mode))
-        return self._chosen
+    chosen: Sequence[tuple[int, int]] = ()
+    """Which second derivatives of the running costs the last step stores for each stage, as `backward_row`."""
 
     def _add_to_row(
         self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
     ) -> list[Store]:
-        """Return stores of the largest error so far, and of what the running costs add to g and H."""
+        """Return stores of the largest error so far, and of what the running costs add to g and H.
+
+        The ends of a step do not move: births change Z by `move` and `hold`, between steps.
+        """
         at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
         if tableau.coupled:
             slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
@@ -144,7 +137,7 @@ class HypothesisKernels(Kernels):
             g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
             second.append(list_entries(S, with_time=False))
             stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
-        self._chosen, entries = self._store_entries(graph, tableau, second)
+        self.chosen, entries = self._store_entries(graph, tableau, second)
         return [*stores, ("g", 0, as_vector(graph, g)), *entries]
 
     def move(self, name: str, sign: float, costs: bool) -> None:
@@ -476,8 +469,10 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     curvatures = []
     for mode in range(len(library.modes)):
         stage = kernels.templates.stage(mode, running=costs)
-        chosen = kernels.step(mode, stage, costs)
-        curvatures.append(kernels.share_curvature(f"curvature_{mode}", chosen, kernels.tableau(mode)))
+        if library.implicit[mode]:
+            kernels.newton(f"newton_{mode}", stage)
+        kernels.forward_row(f"step_{mode}", stage, False, costs, kernels.tableau(mode))
+        curvatures.append(kernels.curvature(f"curvature_{mode}", kernels.chosen, kernels.tableau(mode)))
         program.write_slope(kernels, mode, stage)
     kernels.shift()
     kernels.move("move", 1.0, costs)

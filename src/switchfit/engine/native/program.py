@@ -793,7 +793,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         factors = kernels.forward_row(f"forward_{name}", template, moving, costs, tableau)
         if order > Order.COST:
             chosen = kernels.backward_row(f"backward_{name}", template, moving, costs, tableau, factors, is_late)
-            curvatures[kind] = kernels.share_curvature(f"curvature_{name}", chosen, tableau)
+            curvatures[kind] = kernels.curvature(f"curvature_{name}", chosen, tableau)
     # The same for all modes: written once.
     if order == Order.HESSIAN and mode == 0:
         kernels.length()
