@@ -496,18 +496,13 @@ def judge_error(
 
 
 def first_step(
-    slope: Callable[[float, FloatArray], FloatArray],
-    t: float,
-    y: FloatArray,
-    K: FloatArray,
-    end: float,
-    tolerances: Tolerances,
-    exponent: float = EXPONENT,
+    slope: Callable[..., FloatArray], t: float, y: FloatArray, end: float, tolerances: Tolerances, exponent: float
 ) -> float:
-    """Choose the size of the first step from the slope K (n,) at y (n,), and one more slope (Hairer et al. I, II.4).
+    """Choose the size of the first step from ``slope(t, y)`` at y (n,), and one more slope (Hairer et al. I, II.4).
 
     NaN if a slope is not finite.
     """
+    K = slope(t, y)
     with np.errstate(all="ignore"):
         if not np.isfinite(K).all():
             return np.nan

@@ -159,7 +159,7 @@ class _NativeSteps:
         self._native, self._mode, self._p, self._end = native, mode, p, stretch.end
         self.y, (start, end) = np.append(stretch.x, 0.0), stretch[1:3]
         exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
-        step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
+        step = first_step(self.slope, start, self.y, end, given, exponent)
         self._state = np.zeros(len(AT))
         self._state[[AT.t, AT.step, AT.end, AT.rtol, AT.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.

@@ -23,17 +23,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization import rows
 from switchfit.discretization.mesh import Arguments
-from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine
+from switchfit.discretization.rows import STIFF
 from switchfit.engine.native import program
-from switchfit.engine.native.arrays import eliminate
 from switchfit.engine.native.engine import count_samples, get_address
-from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, as_vector, list_entries, store_all
+from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, store_all
 from switchfit.engine.native.llvm import Module, Program, Value, Variable
 from switchfit.engine.native.program import Pointers, Writer
-from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
-from switchfit.engine.native.templates import COST_TO_GO, F_X, F, Order, Sizes, constants_of
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects
+from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -103,42 +101,6 @@ class HypothesisKernels(Kernels):
     """Writes the straight-line functions of hypotheses; the order of derivatives is that of Gauss-Newton."""
 
     adjoint = False
-    chosen: Sequence[tuple[int, int]] = ()
-    """Which second derivatives of the running costs the last step stores for each stage, as `backward_row`."""
-
-    def _add_to_row(
-        self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
-    ) -> list[Store]:
-        """Return stores of the largest error so far, and of what the running costs add to g and H.
-
-        The ends of a step do not move: births change Z by `move` and `hold`, between steps.
-        """
-        at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
-        if tableau.coupled:
-            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
-            error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
-        else:
-            error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
-        # The larger of the error so far and that of this step, relative to rtol (smallest + |x|).
-        (rtol, smallest), xp, largest = graph.loads("tolerances", 2), Namespace(graph), graph.load("error", 0)
-        for relative in xp.abs(error) / (rtol * (smallest + xp.abs(x))):
-            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
-        stores = [("error", 0, largest)]
-        if not costs:
-            return stores
-        g, second = graph.load("g", 0, vector=True), []
-        for j, (weight, t, X, X_d) in enumerate(zip(tableau.b.tolist(), *found[:2], along.states, strict=True)):
-            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
-            # J.
-            given = at(t, X, hb=h * weight)
-            g_x, g_p, S = stage(graph, *given, only=COST_TO_GO[1:], checked=True)
-            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
-            # future.
-            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
-            second.append(list_entries(S, with_time=False))
-            stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
-        self.chosen, entries = self._store_entries(graph, tableau, second)
-        return [*stores, ("g", 0, as_vector(graph, g)), *entries]
 
     def move(self, name: str, sign: float, costs: bool) -> None:
         """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.

@@ -117,6 +117,7 @@ class Kernels:
         self.templates = Templates(library, sizes, order)
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
+        self.chosen: list[tuple[int, int]] = []
         self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
 
     def tableau(self, mode: int) -> Tableau:
@@ -226,7 +227,7 @@ class Kernels:
             vectors = along.states + (along.slopes if k and moving else [])
             stores += keep("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
-            stores += self._add_to_row(graph, stage, tableau, found, along, costs)
+            stores += () if self.adjoint else self._add_to_step(graph, stage, tableau, found, along, costs)
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
             stores.append(("J", 0, graph.load("J", 0) + h * combine(tableau.b, densities)))
@@ -235,11 +236,40 @@ class Kernels:
         self.module.write_straight_line(name, stores)
         return factors
 
-    def _add_to_row(
+    def _add_to_step(
         self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
     ) -> list[Store]:
-        """Return what else a step with derivatives stores: nothing, if a backward one follows it."""
-        return []
+        """Return what a step without a backward one stores: the largest error so far, and what running costs add to g
+        and H.
+
+        The ends of such a step do not move. `chosen` becomes which second derivatives are stored for each stage.
+        """
+        at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
+        if tableau.coupled:
+            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
+            error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
+        else:
+            error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
+        # The larger of the error so far and that of this step, relative to rtol (smallest + |x|).
+        (rtol, smallest), xp, largest = graph.loads("tolerances", 2), Namespace(graph), graph.load("error", 0)
+        for relative in xp.abs(error) / (rtol * (smallest + xp.abs(x))):
+            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
+        stores = [("error", 0, largest)]
+        if not costs:
+            return stores
+        g, second = graph.load("g", 0, vector=True), []
+        for j, (weight, t, X, X_d) in enumerate(zip(tableau.b.tolist(), *found[:2], along.states, strict=True)):
+            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
+            # J.
+            given = at(t, X, hb=h * weight)
+            g_x, g_p, S = stage(graph, *given, only=COST_TO_GO[1:], checked=True)
+            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
+            # future.
+            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
+            second.append(list_entries(S, with_time=False))
+            stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
+        self.chosen, entries = self._store_entries(graph, tableau, second)
+        return [*stores, ("g", 0, as_vector(graph, g)), *entries]
 
     def judge_row(self, mode: int, stage: Template, tableau: Tableau) -> None:
         """Write what a row that was computed adds to the largest errors: its own one; and a jump inside, which counts
