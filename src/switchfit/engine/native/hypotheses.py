@@ -577,10 +577,9 @@ class NativeHypotheses:
 
         The samples at the first node are those of the parents; the births come after them.
         """
-        times, counts = np.empty((len(children), 1)), np.empty((len(children), 3), dtype=np.int64)
         parent, before, after, slot = children.T[: Column.SLOT + 1]
-        times[:] = self._arrays["nodes"][first]
-        counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
+        times = np.full((len(children), 1), self._arrays["nodes"][first])
+        counts = np.stack([slot >= 0, np.where(slot >= 0, before, after), parent], axis=1)
         return self._go_on(parents.records, (children, times, counts), (first, last, False))
 
     def follow_order(

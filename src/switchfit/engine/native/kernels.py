@@ -49,6 +49,9 @@ STAGES = len(EXPLICIT.b)
 """Stages of a row, or stages and slopes of an implicit one, that have memory."""
 
 Store = tuple[str, int, Node]
+Places = list[tuple[int, int]]
+Second = dict[tuple[int, int], Node]
+"""Entries of a second derivative along (t, x, p), by their places: the lower half, or less."""
 Factors = Elimination | Routine | None
 """Those of the coupled equations of an implicit row; None for an explicit one."""
 Along = list[tuple[Any, list[Node]]]
@@ -117,7 +120,7 @@ class Kernels:
         self.templates = Templates(library, sizes, order)
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
-        self.chosen: list[tuple[int, int]] = []
+        self.chosen: Places = []
         self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
 
     def tableau(self, mode: int) -> Tableau:
@@ -322,7 +325,7 @@ class Kernels:
 
     def backward_row(
         self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, factors: Factors, late: bool
-    ) -> list[tuple[int, int]]:
+    ) -> Places:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
         Return which entries of the second derivative along (t, x, p) are stored for each stage. If time is among them,
@@ -344,7 +347,7 @@ class Kernels:
         if self.has_jumps and not late:
             psi = psi + graph.loads("jump", n)
         # Filled by `pull`: second derivatives of w_j . f + h b_j ell, and f, ell and their first derivatives for V.
-        second: list[dict[tuple[int, int], Node]] = [{}] * count
+        second: list[Second] = [{}] * count
         slopes: list[list[Objects]] = [[]] * count
 
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
@@ -395,9 +398,7 @@ class Kernels:
         self.module.write_straight_line(name, stores + entries + graph.check())
         return chosen
 
-    def _store_entries(
-        self, graph: Graph, tableau: Tableau, second: Sequence[dict[tuple[int, int], Node]]
-    ) -> tuple[list[tuple[int, int]], list[Store]]:
+    def _store_entries(self, graph: Graph, tableau: Tableau, second: Sequence[Second]) -> tuple[Places, list[Store]]:
         """Return which entries of the second derivatives at the stages of a row are stored, and the stores."""
         # One list of entries for all stages: what is a structural zero at each is neither stored nor multiplied.
         chosen, stores = sorted({key for each in second for key, node in each.items() if node.number != 0.0}), []
@@ -405,7 +406,7 @@ class Kernels:
             stores += [each[key] for key in chosen] + [graph.constant(c_j)] * _has_time(chosen)
         return chosen, store_all("entries", 0, stores)
 
-    def curvature(self, name: str, chosen: Sequence[tuple[int, int]], tableau: Tableau) -> Curvature:
+    def curvature(self, name: str, chosen: Places, tableau: Tableau) -> Curvature:
         """Return the function ``H += Z' S Z`` at all stages of a row or at one, for entries of S from `backward_row`;
         write it unless an earlier row has the same entries.
 
@@ -660,9 +661,7 @@ class Kernels:
             for k in range(first, first + count)
         ]
 
-    def _add_curvature(
-        self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: Along
-    ) -> list[Node]:
+    def _add_curvature(self, graph: Graph, H: list[Node], second: Second, along: Along) -> list[Node]:
         """Add ``Z' S Z`` to the rows of H, S given by its lower half along (t, x, p); `along` is Z of t and x."""
         n, T = self.sizes.n, self.sizes.T
         # H_d += Z_kd (S_km Z_m), summed over k and m along (t, x, p). S is symmetric and given by its lower half: each
@@ -685,7 +684,7 @@ class Kernels:
         return rows
 
 
-def list_entries(second: Objects, with_time: bool) -> dict[tuple[int, int], Node]:
+def list_entries(second: Objects, with_time: bool) -> Second:
     """Return the lower half of a second derivative along (t, x, p), all of it or that along (x, p)."""
     first = 0 if with_time else 1
     return {(k, m): second[k, m] for k in range(first, len(second)) for m in range(first, k + 1)}
