@@ -185,8 +185,8 @@ class HypothesisWriter(Writer):
             begin, end = (self.get("i64", found["jump_first"], at) for at in (node, node + 1))
             with self.loop(begin, end) as place:
                 # Jumps come after the samples: a sample at the time of a jump sees the state before it.
-                for k in self.cases(self.get("i64", found["jump_map"], place), len(self.library.reset_maps)):
-                    self.call(f"reset_{k}", found)
+                which = self.get("i64", found["jump_map"], place)
+                self.call_one_of(which, len(self.library.reset_maps), found, "reset_{}")
         return self.end()
 
     def write_score(self) -> str:
@@ -241,9 +241,7 @@ class HypothesisWriter(Writer):
 
         def call(column: Column, functions: Sequence[Any], *names: str) -> None:
             """Emit the calls of the functions of what is in a column of the child."""
-            for k in self.cases(self.get("i64", child, column), len(functions)):
-                for name in names:
-                    self.call(name.format(k), found)
+            self.call_one_of(self.get("i64", child, column), len(functions), found, *names)
 
         # Z += f_before dtau: from here to "hold", Z and g are those at the time of the birth, which moves.
         call(Column.BEFORE, library.modes, "slope_{}", "move")

@@ -177,6 +177,12 @@ class Writer(Lines):
             self.go_to(f"{name}_end")
         self.label(f"{name}_end")
 
+    def call_one_of(self, which: Value, count: int, given: Pointers, *names: str) -> None:
+        """Emit the calls of those of `count` functions that have a number, {} in their names; of none for -1."""
+        for k in self.cases(which, count):
+            for name in names:
+                self.call(name.format(k), given)
+
     def zero(self, pointer: Value, count: Operand) -> None:
         """Write zeros to `count` doubles."""
         self.module.declare("llvm.memset.p0.i64", "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)")
@@ -324,8 +330,7 @@ def write_forward(writer: Writer) -> str:
     start = writer.at_row(found, first + segment, "x", "Z")
     if writer.library.reset_maps:
         which, given = find_reset(writer, found, segment, segment > 0)
-        for k in writer.cases(which, len(writer.library.reset_maps)):
-            writer.call(f"reset_{k}", found | start | given)
+        writer.call_one_of(which, len(writer.library.reset_maps), found | start | given, "reset_{}")
         start = choose_state(which, given, start)
     # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
     flag = writer.get("i64", found["modes"], writer.sizes.N + 1)
@@ -336,9 +341,8 @@ def write_forward(writer: Writer) -> str:
         given |= {name: given["first"].choose(start[name], given[name]) for name in ("x", "Z")}
         for k, kind in row_cases(writer, case):
             writer.take_step(k, f"forward_{kind}", given)
-        for level, name in enumerate(("error", "jump") if writer.order > Order.COST else ()):
-            for k in writer.cases((flag > level).choose(mode, -1), modes):
-                writer.call(f"{name}_{k}", given)
+        for level, name in enumerate(("error_{}", "jump_{}") if writer.order > Order.COST else ()):
+            writer.call_one_of((flag > level).choose(mode, -1), modes, given, name)
     after = last + segment + 1
     given = found | writer.at_row(found, after, "x", "Z")
     # Once per segment: what is not finite stays so to its end.
@@ -361,8 +365,7 @@ def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, 
         count = len(getattr(writer.library, kind))
         if kind == "guards" and count:
             given |= constraint_pointers(writer, found, segment)
-        for k in writer.cases(writer.get("i64", found[kind], segment), count):
-            writer.call(f"{kind}_{k}", given)
+        writer.call_one_of(writer.get("i64", found[kind], segment), count, given, f"{kind}_{{}}")
 
 
 def constraint_pointers(writer: Writer, found: Pointers, row: Operand) -> Pointers:
@@ -389,10 +392,8 @@ def write_backward(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -
     if writer.library.reset_maps:
         state = writer.at_row(found, first + segment, "x", "Z")
         which, given = find_reset(writer, found, segment, segment > 0)
-        for k in writer.cases(which, len(writer.library.reset_maps)):
-            # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
-            # before.
-            writer.call(f"reset_{k}_back", found | state | given)
+        # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one before.
+        writer.call_one_of(which, len(writer.library.reset_maps), found | state | given, "reset_{}_back")
     return writer.end()
 
 
