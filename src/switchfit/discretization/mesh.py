@@ -195,12 +195,6 @@ def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, p
     return np.interp(cut + turn / pieces[cut], position, times)
 
 
-def merge_stiffness(*found: Sequence[Stiffness]) -> tuple[Stiffness, ...]:
-    """Return the stiff modes of several meshes of one experiment, each of them once: as it was found first."""
-    by_mode = {each.mode: each for stiffness in reversed(found) for each in stiffness}
-    return tuple(by_mode.values())
-
-
 class Rows(NamedTuple):
     """The rows of a mesh at given transition times: R = cells + N of them, in the order of time, in JAX or NumPy.
 

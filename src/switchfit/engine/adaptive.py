@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
+from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.rows import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine import branches
@@ -525,17 +525,17 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     """
     runs = [runs_of(problem)[e] for problem in problems]
     solutions: list[FloatArray] = []
-    stiffness: tuple[Stiffness, ...] = ()
+    stiffness: dict[str, Stiffness] = {}
     for run in runs:
         with suppress(NotIntegrableError):
             found, stiff = _solve_at(run, (run.problem.initial_theta,), Choice())
             solutions += found
-            stiffness = merge_stiffness(stiffness, stiff)
+            stiffness = {each.mode: each for each in stiff} | stiffness  # as it was found first
     if not solutions:
-        solutions, stiffness = _solve_at(runs[0], (runs[0].problem.initial_theta,), Choice())  # it raises
+        _solve_at(runs[0], (runs[0].problem.initial_theta,), Choice())  # it raises
     fewest = min(map(len, solutions))
     kept = [steps for steps in solutions if len(steps) <= MOST_TIMES * fewest + PACE]
-    return runs[0].coarse.refine(kept, stiffness)
+    return runs[0].coarse.refine(kept, tuple(stiffness.values()))
 
 
 def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:

@@ -144,7 +144,7 @@ class NativeExperiment:
         self.order, self.times, self.row_work = order, times, [*program.modules.values()][-1].row_work
         self._program, self._module = program, program.modules[order]
         N, cells = sizes.N, len(times) - 1
-        self._cells = cells
+        self._inner_nodes, self._cells = times[1:-1], cells
         self._channels = sum(channels for _, channels in structure.outputs)
         self._counts = [count_samples(samples) for samples in arguments.samples]
         self._function = self._find("evaluate", 1 + len(self._counts))
@@ -427,7 +427,7 @@ class NativeExperiment:
 
     def _find_first_cells(self, tau: FloatArray, side: float) -> None:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.build_rows`."""
-        nodes = self.times[1:-1]
+        nodes = self._inner_nodes
         # A time on a node is past it on its right side, and not yet on its left.
         begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
         if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `build_rows`
