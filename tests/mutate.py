@@ -145,7 +145,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "a transposed in the adjoint": swap(ROWS, "combine(a[:, j], costs)", "combine(a[j], costs)"),
         "the transposed equations": swap(ROWS, ".solve(right, transposed=True)", ".solve(right)"),
         "f in the error of a row": swap(
-            ROWS, "damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)"
+            ROWS, "DAMPING * (h * slope + combine(STIFF_ERROR, k))", "DAMPING * combine(STIFF_ERROR, k)"
         ),
         "the factors of the last row": swap(
             SEGMENTS, '"x", "Z", *OF_STAGES)', '"x", "Z", "X", "XZ") | writer.at_row(found, 0, "kept")'

@@ -58,13 +58,14 @@ def machine_code_of(template, count):
     nodes = np.concatenate([output.reshape(-1) for output in outputs])
     module = llvm.Module(4)
     stores = [("y", k, node) for k, node in enumerate(nodes)] + graph.check()
-    module.write_straight_line("f", stores, ("x", "w", "y", CHECKED))
+    module.write_straight_line("f", stores)
+    names = module.pointers["f"]
     program = llvm.compile_modules([module.take()])  # the code is gone with it
 
     def evaluate(x, w):
         y, wrong = np.full(ends[-1], 7e77), np.zeros(1)
-        arrays = (a.ctypes.data for a in (x, w, y, wrong))
-        program.function("f", *[llvm.ctypes.c_void_p] * 4)(*arrays)
+        arrays = {"x": x, "w": w, "y": y, CHECKED: wrong}
+        program.function("f", len(names))(*(arrays[name].ctypes.data for name in names))
         parts = np.split(y, ends[:-1])
         return [part.reshape(output.shape) for part, output in zip(parts, outputs, strict=True)], wrong[0] != 0.0
 

@@ -1,6 +1,5 @@
 """Implicit rows in machine code: JAX's results, Newton's method, elimination, errors of rows, adaptive steps."""
 
-import ctypes
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -334,7 +333,7 @@ def compile_solve(filled, kind):
     x = np.concatenate(factors.solve(right, transposed=kind == "transposed"))
     module.write_straight_line("run", [("x", k, node) for k, node in enumerate(x)])
     program = llvm.compile_modules([module.take()])
-    run = program.function("run", *[ctypes.c_void_p] * 3)
+    run = program.function("run", 3)
 
     def solve(f_x, right):
         assert program.key  # its code is freed with it

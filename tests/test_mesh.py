@@ -120,7 +120,6 @@ def test_mesh_of_times_in_any_order(times):
     assert mesh.times.tolist() == sorted({t / 7.0 for t in times})
     assert len(mesh.nodes) == pad_length(mesh.cells) + 1
     assert np.all(mesh.nodes[mesh.cells :] == mesh.times[-1])
-    np.testing.assert_array_equal(mesh.cell_ending_at(mesh.times), np.arange(-1, mesh.cells))
 
 
 # The nodes of a problem

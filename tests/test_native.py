@@ -69,7 +69,7 @@ def test_machine_code_is_kept_and_read_again(tmp_path, monkeypatch):
         monkeypatch.setattr(llvm.llvm, "parse_assembly", parse)
         x = np.array([2.0, 0.0])
         program = llvm.compile_modules([text])
-        program.function("f", llvm.ctypes.c_void_p)(x.ctypes.data)
+        program.function("f", 1)(x.ctypes.data)
         return x[1]
 
     def parse_nothing(text):

@@ -1,6 +1,5 @@
 """The table of operations: value, code and JAX's primitive agree, at random points and where something happens."""
 
-import ctypes
 from itertools import product
 
 import jax
@@ -22,7 +21,7 @@ def points_of(operation):
     """Arrays of operands: (count, K)."""
     if operation.name == "select":
         return np.array([[c, a, b] for c in (0.0, 1.0) for a, b in product(SPECIAL, repeat=2)]).T
-    if operation.takes_truth:
+    if operation.of_truth:
         return np.array(list(product([0.0, 1.0], repeat=operation.operands))).T
     random = np.random.default_rng(0)
     drawn = [scale * random.normal(size=(operation.operands, 40)) for scale in (0.5, 1.0, 30.0)]
@@ -31,7 +30,7 @@ def points_of(operation):
 
 def is_truth(operation, k):
     """Whether the k-th operand is a truth value."""
-    return operation.takes_truth or (operation.name == "select" and k == 0)
+    return operation.of_truth or (operation.name == "select" and k == 0)
 
 
 def applied(graph, operation, operands):
@@ -45,10 +44,10 @@ def by_machine_code(operation, points):
     operands = [graph.load("x", k) for k in range(operation.operands)]
     operands = [graph.apply("ne", x, 0.0) if is_truth(operation, k) else x for k, x in enumerate(operands)]
     module = llvm.Module(1)
-    module.write_straight_line("f", [("y", 0, applied(graph, operation, operands))], ("x", "y"))
+    module.write_straight_line("f", [("y", 0, applied(graph, operation, operands))])
     assert graph.nodes[-1].op in (operation.name, "select"), "simplified away"
     program = llvm.compile_modules([module.take()])
-    function, y = program.function("f", ctypes.c_void_p, ctypes.c_void_p), np.zeros(1)
+    function, y = program.function("f", 2), np.zeros(1)
     found = []
     for x in np.ascontiguousarray(points.T):
         function(x.ctypes.data, y.ctypes.data)
@@ -88,9 +87,9 @@ def test_value_code_and_what_the_table_says_agree(name):
         assert operation.commutes == np.array_equal(expected, by_numpy(operation, points[::-1]), equal_nan=True)
     finite = expected[np.isfinite(expected)]
     whole = np.array_equal(finite, np.round(finite))
-    assert operation.gives_integer == (whole and not (operation.takes_truth or operation.gives_truth))
+    assert operation.gives_integer == (whole and not (operation.of_truth or operation.gives_truth))
     tame = np.isfinite(points).all(0) & (np.abs(points) < 1e100).all(0)  # sums and products overflow
-    if not operation.takes_truth:
+    if not operation.of_truth:
         assert (name in MAY_FAIL) == (not np.isfinite(expected[tame]).all())
 
 

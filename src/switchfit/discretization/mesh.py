@@ -158,10 +158,6 @@ class Mesh:
         cuts = np.unique(np.concatenate([self.times, transition_times]))
         return self.insert(0.5 * (cuts[:-1] + cuts[1:]))
 
-    def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
-        """Return the index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
-        return np.searchsorted(self.times, times) - 1
-
 
 def _count_steps(solutions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return times (K,) and the number of solver steps up to each, (K,), linear in between, from the step times of
@@ -199,12 +195,6 @@ def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, p
     return np.interp(cut + turn / pieces[cut], position, times)
 
 
-def merge_stiffness(*found: Sequence[Stiffness]) -> tuple[Stiffness, ...]:
-    """Return the stiff modes of several meshes of one experiment, each of them once: as it was found first."""
-    by_mode = {each.mode: each for stiffness in reversed(found) for each in stiffness}
-    return tuple(by_mode.values())
-
-
 class Rows(NamedTuple):
     """The rows of a mesh at given transition times: R = cells + N of them, in the order of time, in JAX or NumPy.
 
@@ -225,15 +215,6 @@ class Rows(NamedTuple):
     first_cell: Any
 
 
-def count_passed(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Any:
-    """Return how many nodes each of tau (N,) is past: (N,); a node at tau_i counts if its side, () or (N,), is +1."""
-    several = getattr(side, "ndim", 0) > 0
-    right = (side[:, None] if several else side) > 0
-    passed = xp.where(right, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
-    # Of two equal times with different sides, the later one must not begin in an earlier cell.
-    return xp.maximum.accumulate(passed) if several and tau.shape[0] else passed
-
-
 def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
@@ -242,7 +223,12 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     are those of `xp`, JAX or NumPy.
     """
     cells, N = nodes.shape[0] - 1, tau.shape[0]
-    passed = count_passed(nodes, tau, side, xp)
+    several = getattr(side, "ndim", 0) > 0
+    right = (side[:, None] if several else side) > 0
+    # How many nodes each of tau is past.
+    passed = xp.where(right, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    if several and N:  # of two equal times with different sides, the later one must not begin in an earlier cell
+        passed = xp.maximum.accumulate(passed)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
     first_cell = xp.concatenate([xp.zeros(1, passed.dtype), xp.clip(passed - 1, 0, real_cells - 1)])
     # Row = cell + segment: each transition cuts one cell in two, so that segment i begins at row first_cell_i + i. R =
@@ -317,9 +303,11 @@ def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
 def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Arguments:
     """Return the arguments of an experiment on a mesh, from those that suit any mesh."""
     measurements = select_kind(experiment.data, Measurements)
+    # Of each sample the index of the cell that ends at it; -1 for t0.
+    cells = (np.searchsorted(mesh.times, item.seen_times) - 1 for item in measurements)
     samples = tuple(
-        padded._replace(cell=_pad_with_last(mesh.cell_ending_at(item.seen_times), len(padded.time), 0))  # type: ignore[arg-type]
-        for item, padded in zip(measurements, common.samples, strict=True)
+        padded._replace(cell=_pad_with_last(cell, len(padded.time), 0))  # type: ignore[arg-type]  # made jax arrays
+        for cell, padded in zip(cells, common.samples, strict=True)
     )
     # Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S).
     split = [split_by_cell(signal, mesh) for signal in experiment.signals]

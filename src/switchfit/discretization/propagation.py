@@ -23,6 +23,9 @@ from switchfit.discretization.rows import EXPLICIT, STIFF_BESIDE_EXPLICIT, Table
 
 Array = jax.Array
 
+Slope = Callable[[Array, Array], Array]
+"""``f(t, x) -> (n,)``: a vector field at one p."""
+
 
 NEWTON_ITERATIONS = 12
 
@@ -31,9 +34,7 @@ CONVERGED = 1e-8
 is NaN. Where the slope jumps within a row, as where friction stops a body, the method may jump from side to side."""
 
 
-def compute_stages(
-    tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array
-) -> rows.Stages:
+def compute_stages(tableau: Tableau, f: Slope, start: Array, end: Array, x: Array) -> rows.Stages:
     """Compute the stages of a row as arrays (s,), (s, n), (s, n); those of an explicit method in a loop.
 
     The vector field is then once in the program, not once per stage: with second derivatives, a program compiles in a
@@ -54,9 +55,7 @@ def compute_stages(
     return rows.Stages(times, states, slopes)
 
 
-def _solve_stages(
-    tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, h: Array, x: Array
-) -> rows.Stages:
+def _solve_stages(tableau: Tableau, f: Slope, start: Array, h: Array, x: Array) -> rows.Stages:
     """Compute the stages of an implicit row by Newton's method in ``Z = X - x``.
 
     `jax.lax.custom_root` supplies the derivatives of the solution by the implicit function theorem, to any order.

@@ -143,19 +143,14 @@ ADAPTIVE_ERROR = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 33920
 length 1; its order is 4, its signs are those of SciPy."""
 
 
-def radau_error() -> tuple[float, float, float, float]:
-    """Return g, then weights e_j, of the estimate ``g (h f + sum_j e_j k_j)`` of the error of `STIFF`, of order 4.
+STIFF_DAMPING = 1 / (3 + 3 ** (2 / 3) - 3 ** (1 / 3))
+# Weights of Z_j = X_j - x in the book; Z = a k turns them into weights of the increments.
+STIFF_ERROR = np.array([-13 - 7 * np.sqrt(6.0), -13 + 7 * np.sqrt(6.0), -1]) / 3 @ STIFF.a
+"""g, and weights e_j, of the estimate ``g (h f + sum_j e_j k_j)`` of the error of `STIFF`, of order 4.
 
-    Hairer and Wanner II, section IV.8: 1 / g is the real eigenvalue of a^-1; k_j are the increments ``h K_j``, f is the
-    slope before the row.
-    """
-    # Their weights e are those of Z_j = X_j - x; Z = a k turns them into weights of the increments.
-    of_stages = np.array([-13 - 7 * np.sqrt(6.0), -13 + 7 * np.sqrt(6.0), -1]) / 3 @ STIFF.a
-    first, second, third = of_stages.tolist()
-    return 1 / (3 + 3 ** (2 / 3) - 3 ** (1 / 3)), first, second, third
-
-
-STIFF_ERROR = radau_error()
+Hairer and Wanner II, section IV.8: 1 / g is the real eigenvalue of a^-1; k_j are the increments ``h K_j``, f is the
+slope before the row.
+"""
 STIFF_BEND = np.array([1.0 / np.prod([c - d for d in STIFF.c if d != c]) for c in STIFF.c])
 STIFF_BEND /= np.abs(STIFF_BEND).max()
 """Second divided difference of the slopes at the stages of `STIFF`, whose largest weight is 1."""
@@ -208,11 +203,6 @@ def stages(
     return found
 
 
-def cost_of_row(tableau: Tableau, h: Array, densities: Sequence[Array]) -> Array:
-    """Return the running cost of a row, ``h sum_j b_j ell_j``: ()."""
-    return h * combine(tableau.b, densities)
-
-
 SHORT = 1e-3
 """Length of a row, in times of the fastest component of f, below which its slopes are f at the stages."""
 
@@ -236,19 +226,6 @@ def couple(a: Array, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
         [(unit if j == m else 0.0 * unit) - (h * a_jm) * f_x[j] for m, a_jm in enumerate(row)]
         for j, row in enumerate(a.tolist())
     ]
-
-
-def correct_increments(
-    tableau: Tableau, h: Array, k: Sequence[Array], slopes: Sequence[Array], f_x: Sequence[Array], factorize: Factorize
-) -> list[Array]:
-    """Return the increments k (s arrays (n,)) after one iteration of Newton's method.
-
-    Parameters
-    ----------
-    slopes, f_x : s arrays (n,) and (n, n), f and D_1 f at the stages ``x + sum_l a_jl k_l``
-    """
-    right = [h * slope - own for slope, own in zip(slopes, k, strict=True)]
-    return [own + change for own, change in zip(k, factorize(tableau.a, h, f_x).solve(right), strict=True)]
 
 
 def choose_slopes(h: Array, k: Sequence[Array], f_X: Sequence[Array], f_x: Array, xp: Any) -> list[Array]:
@@ -275,9 +252,8 @@ def estimate_error(h: Array, k: Sequence[Array], slope: Array, f_x: Array, facto
 
     ``(I - h g D_1 f)^-1 g (h f + sum_j e_j k_j)``, of order 4, with f (n,) and D_1 f (n, n) at the start of the row.
     """
-    damping, *weights = STIFF_ERROR
-    right = damping * (h * slope + combine(weights, k))
-    (error,) = factorize(np.array([[damping]]), h, [f_x]).solve([right])
+    right = STIFF_DAMPING * (h * slope + combine(STIFF_ERROR, k))
+    (error,) = factorize(np.array([[STIFF_DAMPING]]), h, [f_x]).solve([right])
     return error
 
 
@@ -338,14 +314,12 @@ class Adjoint(NamedTuple):
 
     Attributes
     ----------
-    slopes : s arrays w_j (n,), in the slopes of the stages
     states : s arrays mu_j (n,), in the states of the stages
     before : (n,), in the state before the row
     times : s entries (), of ``w_j . f + h b_j ell`` in t_j
     parameters : (M,), the sum of the same in p
     """
 
-    slopes: list[Array]
     states: list[Array]
     before: Array
     times: list[Array]
@@ -381,7 +355,7 @@ def adjoint(
             w[j] = h * (b[j] * psi + later)
         times[j], mu[j], in_p = pull(j, w[j], h * b[j])
         parameters = parameters + in_p
-    return Adjoint(w, mu, psi + sum(mu[1:], mu[0]), times, parameters)
+    return Adjoint(mu, psi + sum(mu[1:], mu[0]), times, parameters)
 
 
 def length_factor(
@@ -522,18 +496,13 @@ def judge_error(
 
 
 def first_step(
-    slope: Callable[[float, FloatArray], FloatArray],
-    t: float,
-    y: FloatArray,
-    K: FloatArray,
-    end: float,
-    tolerances: Tolerances,
-    exponent: float = EXPONENT,
+    slope: Callable[..., FloatArray], t: float, y: FloatArray, end: float, tolerances: Tolerances, exponent: float
 ) -> float:
-    """Choose the size of the first step from the slope K (n,) at y (n,), and one more slope (Hairer et al. I, II.4).
+    """Choose the size of the first step from ``slope(t, y)`` at y (n,), and one more slope (Hairer et al. I, II.4).
 
     NaN if a slope is not finite.
     """
+    K = slope(t, y)
     with np.errstate(all="ignore"):
         if not np.isfinite(K).all():
             return np.nan

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
+from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.rows import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine import branches
@@ -159,7 +159,7 @@ class _NativeSteps:
         self._native, self._mode, self._p, self._end = native, mode, p, stretch.end
         self.y, (start, end) = np.append(stretch.x, 0.0), stretch[1:3]
         exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
-        step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
+        step = first_step(self.slope, start, self.y, end, given, exponent)
         self._state = np.zeros(len(AT))
         self._state[[AT.t, AT.step, AT.end, AT.rtol, AT.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
@@ -525,17 +525,17 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     """
     runs = [runs_of(problem)[e] for problem in problems]
     solutions: list[FloatArray] = []
-    stiffness: tuple[Stiffness, ...] = ()
+    stiffness: dict[str, Stiffness] = {}
     for run in runs:
         with suppress(NotIntegrableError):
             found, stiff = _solve_at(run, (run.problem.initial_theta,), Choice())
             solutions += found
-            stiffness = merge_stiffness(stiffness, stiff)
+            stiffness = {each.mode: each for each in stiff} | stiffness  # as it was found first
     if not solutions:
-        solutions, stiffness = _solve_at(runs[0], (runs[0].problem.initial_theta,), Choice())  # it raises
+        _solve_at(runs[0], (runs[0].problem.initial_theta,), Choice())  # it raises
     fewest = min(map(len, solutions))
     kept = [steps for steps in solutions if len(steps) <= MOST_TIMES * fewest + PACE]
-    return runs[0].coarse.refine(kept, stiffness)
+    return runs[0].coarse.refine(kept, tuple(stiffness.values()))
 
 
 def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:

@@ -371,10 +371,6 @@ class Course:
         with np.errstate(all="ignore"):
             return bool(np.isfinite(self.evaluate(self.corners.beyond(sides, k), t, x, inside)).all())
 
-    def evaluate_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
-        return self.evaluate(self.branches.corners[mode].ends(sides), t, x, np.nextafter(t, -np.inf))
-
     def list_ends(self, mode: int, sides: Sides) -> tuple[list[int], NDArray[np.bool_]]:
         """Return the corners of the ends of a branch, and which of them it slides along."""
         of_end = [k for k, _ in self.branches.corners[mode].list_ends(sides)]

@@ -338,7 +338,8 @@ class SplitEngine:
         for (mode, sides), here in rows.items():
             if here and sides:
                 of_end, slides = course.list_ends(mode, sides)
-                values = course.evaluate_ends(mode, sides, found.end[here], found.after[here])
+                ends, at = self._branches.corners[mode].ends(sides), found.end[here]
+                values = course.evaluate(ends, at, found.after[here], np.nextafter(at, -np.inf))
                 np.maximum.at(scales[mode], of_end, np.where(slides, 0.0, np.abs(values).max(axis=0)))
                 seen.append((mode, sides, np.array(here), values))
         for mode, sides, own, values in seen:

@@ -66,22 +66,24 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
             return [0.0 * r for r in found] if structure.is_rest(mode) else found
 
         points = path.stages, path.after, path.layout.end, p
-        cost, tracked = (
-            propagation.compute_path_cost(model, path, p),
-            propagation.map_stages(model, path, track, path.stages),
-        )
+        cost = propagation.compute_path_cost(model, path, p)
+        tracked = propagation.map_stages(model, path, track, path.stages)
         return (cost, residuals, log_sigmas, tracked, points), (cost, path, points, information)
 
     derivatives, (cost, path, points, information) = jax.jacfwd(simulate, has_aux=True)(theta)
     gradient, residuals_d, log_sigmas_d, tracked_d, points_d = derivatives
+
+    # Without the references, which are residuals.
+    others = Model(replace(structure, references=()), model.arguments._replace(weights=()))
 
     # The second derivative of a cost at theta + e whose points move linearly in e: D^2 cost along the tangents, without
     # the second derivatives of the trajectory.
     def add_other_costs(e: Array) -> Array:
         """Return the costs without residuals at theta + e, to first order in the points."""
         stages, after, end, p = jax.tree.map(lambda value, slope: value + slope @ e, points, points_d)
-        moved = path._replace(stages=stages, after=after, layout=path.layout._replace(end=end))
-        return sum_other_costs(model, moved, propagation.weigh_stages(model, path.layout), p)
+        moved = path._replace(stages=stages, after=after)  # weights of stages stay, times of transitions do not
+        at_points = moved._replace(layout=path.layout._replace(end=end))
+        return propagation.integrate_running_cost(others, moved, p) + propagation.add_point_costs(model, at_points, p)
 
     H = jax.hessian(add_other_costs)(jnp.zeros_like(theta))
     for r_d, weight in zip(residuals_d, information, strict=True):
@@ -94,21 +96,6 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
         at_stages = r_d.reshape(-1, *r_d.shape[2:])
         H = H + jnp.einsum("sqd,s,sqe->de", at_stages, hb, jax.vmap(partial(apply_weights, W))(at_stages))
     return cost, gradient, H
-
-
-def sum_other_costs(model: Model, path: propagation.Path, weights: Array, p: Array) -> Array:
-    """Return the running costs, with weights of the stages (R, s), and the costs at transitions and at the end."""
-    if not model.structure.running:
-        return propagation.add_point_costs(model, path, p)
-
-    def ell(mode: int, piece: Piece, t: Array, x: Array) -> Array:
-        rates = [jnp.asarray(ell(t, x, model.parameters(p))).reshape(()) for ell in model.structure.running]
-        return jnp.zeros(()) if model.structure.is_rest(mode) else sum(rates, jnp.zeros(()))
-
-    return (
-        propagation.add_point_costs(model, path, p)
-        + (weights * propagation.map_stages(model, path, ell, path.stages)).sum()
-    )
 
 
 Method = Literal["forward", "discrete-adjoint"]
@@ -203,9 +190,8 @@ def differentiate_in_states(
 
     def lagrangian(nudges: Array) -> tuple[Array, Array]:
         path = propagation.propagate(model, tau, p, jnp.ones(()), nudges)
-        return propagation.compute_path_cost(model, path, p) + multipliers @ propagation.compute_path_constraints(
-            model, path, p
-        ), path.before
+        J, c = propagation.compute_path_cost(model, path, p), propagation.compute_path_constraints(model, path, p)
+        return J + multipliers @ c, path.before
 
     rows = arguments.nodes.shape[0] - 1 + structure.N
     found = _try_backward(lagrangian, jnp.zeros((rows, structure.n)))

@@ -60,8 +60,6 @@ class Engine:
         return f"Evaluated in machine code{f', with implicit steps in {modes}' if modes else ''}."
 
 
-NO_CONSTRAINTS: FloatArray = np.zeros(0)
-NO_JACOBIAN: FloatArray = np.zeros((0, 0))
 H_co = TypeVar("H_co", covariant=True)
 
 
@@ -106,8 +104,8 @@ class Evaluation(Generic[H_co]):
     cost: float
     gradient: FloatArray
     hessian: H_co
-    constraints: FloatArray = field(default_factory=lambda: NO_CONSTRAINTS)
-    jacobian: FloatArray = field(default_factory=lambda: NO_JACOBIAN)
+    constraints: FloatArray = field(default_factory=lambda: np.zeros(0))
+    jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     row_errors: tuple[float, ...] = ()
     stiffness: tuple[Stiffness, ...] = ()
 

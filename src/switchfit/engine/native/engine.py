@@ -152,18 +152,17 @@ class NativeExperiment:
         self._rows = layout.constraint_rows
         self._lengths = {name: fixed + each * (cells + N) for name, (fixed, each) in layout.memory.items()}
         self._size = sum(self._lengths.values())
-        # All transition times at tf, and all segments but the first in the last cell, until `_run` writes those of a
-        # call.
+        places = places_in_library(structure)
         given: dict[str, Any] = {
             "nodes": times,
             "signals": np.asarray(arguments.signals)[:cells],
             "c": np.concatenate([*constants_of(arguments), np.zeros(1)], axis=None),
             "p": np.zeros(max(sizes.M, 1)),
-            "bounds": np.concatenate([times[:1], np.full(N + 1, times[-1])]),
-            "first_cell": np.array([0, *[cells - 1] * (N + 1)]),
+            "bounds": np.full(N + 2, times[0]),
+            "first_cell": np.zeros(N + 2, dtype=np.int64),
             "multipliers": np.zeros(max(self._rows["count"], 1)),
             "units": _find_own_directions(sizes, structure.N, structure.jumps)[0],
-        } | places_in_library(structure)
+        } | places
         for k, (samples, count) in enumerate(zip(arguments.samples, self._counts, strict=True)):
             given |= {f"{name} {k}": np.asarray(values)[:count] for name, values in samples._asdict().items()}
             is_late = structure.measurements[k].delay is not None
@@ -185,14 +184,12 @@ class NativeExperiment:
         self._size_of_states: FloatArray | None = None
         self._judged = -1
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
-        self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
-        self._signals = self._named["signals"].reshape(cells, 4 * sizes.signals)
         self._g = self._named["g"][: sizes.D]
         self._H, self._jacobian = (
             self._named[each].reshape(-1, sizes.width)[:, : sizes.D] for each in ("H", "jacobian")
         )
-        self._set_sequence(structure)
+        self.assign_sequence(structure, places)
 
     def assign_sequence(self, structure: Structure, places: dict[str, NDArray[np.int64]]) -> None:
         """Evaluate another sequence of the same library from now on; its transition times are the next call's.
@@ -204,16 +201,14 @@ class NativeExperiment:
         places : dict
             Its `places_in_library`.
         """
+        N, rows, self.structure = structure.N, self._rows, structure
+        # All transition times at tf, and all segments but the first in the last cell, until `_evaluate` writes those of
+        # a call.
         self._named["bounds"][1:] = self.times[-1]
         self._named["first_cell"][1:] = self._cells - 1
-        self._set_sequence(structure)
         for name, which in places.items():
             self._named[name][:] = which
         self._named["modes"][-1] = self._judged
-
-    def _set_sequence(self, structure: Structure) -> None:
-        N, rows = structure.N, self._rows
-        self.structure = structure
         _, self._places, self._there = _find_own_directions(self.sizes, N, structure.jumps)
         # No jumps and no idle transitions: the unknowns of the program are those of the experiment, in their order.
         self._has_all = len(self._places) == self.sizes.D
@@ -253,7 +248,7 @@ class NativeExperiment:
             is_known = (largest > 0.0) & np.isfinite(largest)
             # Fixed at the first point: errors of later ones are compared with the same sizes.
             self._size_of_states = np.where(is_known, largest, np.finfo(float).max)  # a state that stays 0 has no error
-        return (max((self._errors / self._size_of_states).tolist()),)
+        return (max((self._named["errors"] / self._size_of_states).tolist()),)
 
     def _spread(self, values: FloatArray) -> FloatArray:
         """Return a copy of derivatives along the last axis, in the experiment's times and parameters.
@@ -327,7 +322,8 @@ class NativeExperiment:
         if cells is None:
             cells = np.clip(self.times.searchsorted(times, "right") - 1, 0, self._cells - 1)
         slopes = np.zeros(y.shape)
-        given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
+        signals = self._named["signals"].reshape(self._cells, 4 * self.sizes.signals)[cells]
+        given = {"moment": np.column_stack([times, self.times[cells]]), "signal": signals}
         checks = self._call(f"slope_{mode}", given | {"y": y, "K": slopes}, p, len(times))
         return slopes + checks[:, None]
 
@@ -382,7 +378,7 @@ class NativeExperiment:
 
     def _find(self, name: str, count: int) -> Any:
         """Return a function of the driver with a number of arguments: integers and addresses."""
-        return self._program.function(f"{self._module.prefix}{name}", *[ctypes.c_int64] * count)
+        return self._program.function(f"{self._module.prefix}{name}", count)
 
     def _call(self, name: str, given: Mapping[str, FloatArray], p: FloatArray, count: int = 1) -> FloatArray:
         """Call a straight-line function at `count` points, with an array for each pointer that is not an argument.
@@ -434,7 +430,7 @@ class NativeExperiment:
         nodes = self._inner_nodes
         # A time on a node is past it on its right side, and not yet on its left.
         begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
-        if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
+        if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `build_rows`
             jumps = list(self.structure.jumps)
             begins[jumps] = nodes.searchsorted(tau[jumps], "right")
             begins = np.maximum.accumulate(begins)
@@ -595,7 +591,7 @@ def _register(library: Structure, sizes: Sizes) -> str:
     name = f"switchfit_{program.key[:32]}"
     with _one_at_a_time:
         if name not in _registered:
-            handler = jax.ffi.pycapsule(program.function("xla_handler", ctypes.c_void_p))
+            handler = jax.ffi.pycapsule(program.function("xla_handler", 1))
             jax.ffi.register_ffi_target(name, handler, platform="cpu")
             _registered[name] = program
     return name

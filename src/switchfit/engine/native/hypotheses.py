@@ -16,7 +16,6 @@ to g and its Gauss-Newton matrix to H at once, without a costate. Further pointe
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -24,17 +23,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization import rows
 from switchfit.discretization.mesh import Arguments
-from switchfit.discretization.rows import STIFF, Stages, Tableau, Tangent, combine
+from switchfit.discretization.rows import STIFF
 from switchfit.engine.native import program
-from switchfit.engine.native.arrays import eliminate
 from switchfit.engine.native.engine import count_samples, get_address
-from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, as_vector, list_entries, store_all
+from switchfit.engine.native.kernels import STAGES, Curvature, Kernels, Store, store_all
 from switchfit.engine.native.llvm import Module, Program, Value, Variable
 from switchfit.engine.native.program import Pointers, Writer
-from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
-from switchfit.engine.native.templates import COST_TO_GO, F_X, F, Order, Sizes, constants_of
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects
+from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -104,49 +101,6 @@ class HypothesisKernels(Kernels):
     """Writes the straight-line functions of hypotheses; the order of derivatives is that of Gauss-Newton."""
 
     adjoint = False
-
-    def step(self, mode: int, stage: Template, costs: bool) -> list[tuple[int, int]]:
-        """Write a step in a mode: state, tangents, running costs and the estimate of the error.
-
-        Its ends do not move: births change Z by `move` and `hold`, between steps. Return which second derivatives of
-        the running costs are stored for each stage, as `Kernels.backward_row`.
-        """
-        self._chosen: list[tuple[int, int]] = []
-        if self.library.implicit[mode]:
-            self.newton(f"newton_{mode}", stage)
-        self.forward_row(f"step_{mode}", stage, False, costs, self.tableau(mode))
-        return self._chosen
-
-    def _add_to_row(
-        self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
-    ) -> list[Store]:
-        """Return stores of the largest error so far, and of what the running costs add to g and H."""
-        at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
-        if tableau.coupled:
-            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
-            error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
-        else:
-            error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
-        # The larger of the error so far and that of this step, relative to rtol (smallest + |x|).
-        (rtol, smallest), xp, largest = graph.loads("tolerances", 2), Namespace(graph), graph.load("error", 0)
-        for relative in xp.abs(error) / (rtol * (smallest + xp.abs(x))):
-            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
-        stores = [("error", 0, largest)]
-        if not costs:
-            return stores
-        g, second = graph.load("g", 0, vector=True), []
-        for j, (weight, t, X, X_d) in enumerate(zip(tableau.b.tolist(), *found[:2], along.states, strict=True)):
-            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
-            # J.
-            given = at(t, X, hb=h * weight)
-            g_x, g_p, S = stage(graph, *given, only=COST_TO_GO[1:], checked=True)
-            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
-            # future.
-            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
-            second.append(list_entries(S, with_time=False))
-            stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
-        self._chosen, entries = self._store_entries(graph, tableau, second)
-        return [*stores, ("g", 0, as_vector(graph, g)), *entries]
 
     def move(self, name: str, sign: float, costs: bool) -> None:
         """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.
@@ -231,8 +185,8 @@ class HypothesisWriter(Writer):
             begin, end = (self.get("i64", found["jump_first"], at) for at in (node, node + 1))
             with self.loop(begin, end) as place:
                 # Jumps come after the samples: a sample at the time of a jump sees the state before it.
-                for k in self.cases(self.get("i64", found["jump_map"], place), len(self.library.reset_maps)):
-                    self.call(f"reset_{k}", found)
+                which = self.get("i64", found["jump_map"], place)
+                self.call_one_of(which, len(self.library.reset_maps), found, "reset_{}")
         return self.end()
 
     def write_score(self) -> str:
@@ -287,9 +241,7 @@ class HypothesisWriter(Writer):
 
         def call(column: Column, functions: Sequence[Any], *names: str) -> None:
             """Emit the calls of the functions of what is in a column of the child."""
-            for k in self.cases(self.get("i64", child, column), len(functions)):
-                for name in names:
-                    self.call(name.format(k), found)
+            self.call_one_of(self.get("i64", child, column), len(functions), found, *names)
 
         # Z += f_before dtau: from here to "hold", Z and g are those at the time of the birth, which moves.
         call(Column.BEFORE, library.modes, "slope_{}", "move")
@@ -318,9 +270,7 @@ class HypothesisWriter(Writer):
             self.store(self.get("double", row, 1), row)
             self.put((part + 1 >= parts).choose(end, inside), row, 1)
             for k in self.cases(mode, len(self.library.modes)):
-                if self.library.implicit[k]:
-                    program.solve_stages(self, f"newton_{k}", found)
-                self.call(f"step_{k}", found)
+                self.take_step(k, "step", found)
                 program.add_curvature(self, curvatures[k], found, moving=False)
         return self.end()
 
@@ -479,8 +429,10 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     curvatures = []
     for mode in range(len(library.modes)):
         stage = kernels.templates.stage(mode, running=costs)
-        chosen = kernels.step(mode, stage, costs)
-        curvatures.append(kernels.share_curvature(f"curvature_{mode}", chosen, kernels.tableau(mode)))
+        if library.implicit[mode]:
+            kernels.newton(f"newton_{mode}", stage)
+        kernels.forward_row(f"step_{mode}", stage, False, costs, kernels.tableau(mode))
+        curvatures.append(kernels.curvature(f"curvature_{mode}", kernels.chosen, kernels.tableau(mode)))
         program.write_slope(kernels, mode, stage)
     kernels.shift()
     kernels.move("move", 1.0, costs)
@@ -546,18 +498,15 @@ class NativeHypotheses:
     def __init__(
         self, code: Program, sizes: Sizes, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
     ) -> None:
-        self._program, self._sizes, self._at = code, sizes, divide_record(sizes)
+        self._program, self._at = code, divide_record(sizes)
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
         self._shape = sizes.n, sizes.D, sizes.width
-        # Row 0 is zero: the derivative of a time that does not move.
-        units = np.zeros((sizes.D + 1, sizes.width))
-        units[1:, : sizes.D] = np.eye(sizes.D)
         nodes = np.arange(self._cells + 2)
         self._arrays: dict[str, Any] = {
             "nodes": np.array(times),
             "signals": np.ascontiguousarray(np.asarray(arguments.signals)[: self._cells]),
             "c": np.concatenate([*constants_of(arguments), np.zeros(1)], axis=None),
-            "units": units,
+            "units": np.eye(sizes.D + 1, sizes.width, -1),  # row 0 is zero: the derivative of a time that does not move
             "tolerances": np.zeros(3),
             **{name: np.zeros(sizes.D) for name in ("low", "high", "most")},
             "jump_first": np.searchsorted([node for node, _ in jumps], nodes).astype(np.int64),
@@ -571,9 +520,9 @@ class NativeHypotheses:
             self._set_samples(k, first, *values)
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
-        prefix, kind = program.PREFIX[Order.GAUSS_NEWTON], ctypes.c_int64  # of numbers, and of addresses
-        self._propagate = code.function(f"{prefix}propagate", *[kind] * 13)
-        self._follow_order = code.function(f"{prefix}follow_order", *[kind] * 14)
+        prefix = program.PREFIX[Order.GAUSS_NEWTON]
+        self._propagate = code.function(f"{prefix}propagate", 13)
+        self._follow_order = code.function(f"{prefix}follow_order", 14)
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
         self._arrays |= {f"{name} {k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
@@ -626,10 +575,9 @@ class NativeHypotheses:
 
         The samples at the first node are those of the parents; the births come after them.
         """
-        times, counts = np.empty((len(children), 1)), np.empty((len(children), 3), dtype=np.int64)
         parent, before, after, slot = children.T[: Column.SLOT + 1]
-        times[:] = self._arrays["nodes"][first]
-        counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
+        times = np.full((len(children), 1), self._arrays["nodes"][first])
+        counts = np.stack([slot >= 0, np.where(slot >= 0, before, after), parent], axis=1)
         return self._go_on(parents.records, (children, times, counts), (first, last, False))
 
     def follow_order(

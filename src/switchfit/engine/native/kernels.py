@@ -49,6 +49,9 @@ STAGES = len(EXPLICIT.b)
 """Stages of a row, or stages and slopes of an implicit one, that have memory."""
 
 Store = tuple[str, int, Node]
+Places = list[tuple[int, int]]
+Second = dict[tuple[int, int], Node]
+"""Entries of a second derivative along (t, x, p), by their places: the lower half, or less."""
 Factors = Elimination | Routine | None
 """Those of the coupled equations of an implicit row; None for an explicit one."""
 Along = list[tuple[Any, list[Node]]]
@@ -117,6 +120,7 @@ class Kernels:
         self.templates = Templates(library, sizes, order)
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
+        self.chosen: Places = []
         self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
 
     def tableau(self, mode: int) -> Tableau:
@@ -150,7 +154,9 @@ class Kernels:
         states = [x + combine(row, k) for row in STIFF.a]
         found = [field(j, X) for j, X in enumerate(states)]
         slopes, jacobians = zip(*found, strict=True)
-        corrected = rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
+        right = [h * slope - own for slope, own in zip(slopes, k, strict=True)]
+        changes = eliminate(STIFF.a, h, jacobians).solve(right)
+        corrected = [own + change for own, change in zip(k, changes, strict=True)]
         after = np.concatenate([x + combine(row, corrected) for row in STIFF.a])
         change = xp.abs(after - np.concatenate(states))
         size = xp.abs(after) + xp.abs(np.concatenate([x] * len(k)))
@@ -224,20 +230,49 @@ class Kernels:
             vectors = along.states + (along.slopes if k and moving else [])
             stores += keep("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
-            stores += self._add_to_row(graph, stage, tableau, found, along, costs)
+            stores += () if self.adjoint else self._add_to_step(graph, stage, tableau, found, along, costs)
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
-            stores.append(("J", 0, graph.load("J", 0) + rows.cost_of_row(tableau, h, densities)))
+            stores.append(("J", 0, graph.load("J", 0) + h * combine(tableau.b, densities)))
         if checked:
             stores += graph.check()
         self.module.write_straight_line(name, stores)
         return factors
 
-    def _add_to_row(
+    def _add_to_step(
         self, graph: Graph, stage: Template, tableau: Tableau, found: Stages, along: Tangent, costs: bool
     ) -> list[Store]:
-        """Return what else a step with derivatives stores: nothing, if a backward one follows it."""
-        return []
+        """Return what a step without a backward one stores: the largest error so far, and what running costs add to g
+        and H.
+
+        The ends of such a step do not move. `chosen` becomes which second derivatives are stored for each stage.
+        """
+        at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
+        if tableau.coupled:
+            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
+            error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
+        else:
+            error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
+        # The larger of the error so far and that of this step, relative to rtol (smallest + |x|).
+        (rtol, smallest), xp, largest = graph.loads("tolerances", 2), Namespace(graph), graph.load("error", 0)
+        for relative in xp.abs(error) / (rtol * (smallest + xp.abs(x))):
+            largest = xp.where(relative <= largest, largest, relative)  # false for NaN, which then is the error
+        stores = [("error", 0, largest)]
+        if not costs:
+            return stores
+        g, second = graph.load("g", 0, vector=True), []
+        for j, (weight, t, X, X_d) in enumerate(zip(tableau.b.tolist(), *found[:2], along.states, strict=True)):
+            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
+            # J.
+            given = at(t, X, hb=h * weight)
+            g_x, g_p, S = stage(graph, *given, only=COST_TO_GO[1:], checked=True)
+            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
+            # future.
+            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
+            second.append(list_entries(S, with_time=False))
+            stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
+        self.chosen, entries = self._store_entries(graph, tableau, second)
+        return [*stores, ("g", 0, as_vector(graph, g)), *entries]
 
     def judge_row(self, mode: int, stage: Template, tableau: Tableau) -> None:
         """Write what a row that was computed adds to the largest errors: its own one; and a jump inside, which counts
@@ -290,7 +325,7 @@ class Kernels:
 
     def backward_row(
         self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, factors: Factors, late: bool
-    ) -> list[tuple[int, int]]:
+    ) -> Places:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
         Return which entries of the second derivative along (t, x, p) are stored for each stage. If time is among them,
@@ -312,7 +347,7 @@ class Kernels:
         if self.has_jumps and not late:
             psi = psi + graph.loads("jump", n)
         # Filled by `pull`: second derivatives of w_j . f + h b_j ell, and f, ell and their first derivatives for V.
-        second: list[dict[tuple[int, int], Node]] = [{}] * count
+        second: list[Second] = [{}] * count
         slopes: list[list[Objects]] = [[]] * count
 
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
@@ -363,9 +398,7 @@ class Kernels:
         self.module.write_straight_line(name, stores + entries + graph.check())
         return chosen
 
-    def _store_entries(
-        self, graph: Graph, tableau: Tableau, second: Sequence[dict[tuple[int, int], Node]]
-    ) -> tuple[list[tuple[int, int]], list[Store]]:
+    def _store_entries(self, graph: Graph, tableau: Tableau, second: Sequence[Second]) -> tuple[Places, list[Store]]:
         """Return which entries of the second derivatives at the stages of a row are stored, and the stores."""
         # One list of entries for all stages: what is a structural zero at each is neither stored nor multiplied.
         chosen, stores = sorted({key for each in second for key, node in each.items() if node.number != 0.0}), []
@@ -373,30 +406,23 @@ class Kernels:
             stores += [each[key] for key in chosen] + [graph.constant(c_j)] * _has_time(chosen)
         return chosen, store_all("entries", 0, stores)
 
-    def share_curvature(self, name: str, chosen: list[tuple[int, int]], tableau: Tableau) -> Curvature:
-        """Return the function for entries from `backward_row`; write it unless an earlier row has the same entries.
+    def curvature(self, name: str, chosen: Places, tableau: Tableau) -> Curvature:
+        """Return the function ``H += Z' S Z`` at all stages of a row or at one, for entries of S from `backward_row`;
+        write it unless an earlier row has the same entries.
 
         Rows that move with theta have the entries of the others unless the mode depends on time, and modes may have the
         same ones. These functions are the longest: shared, a program of two modes compiles in 0.7 s, not 0.9 s.
         """
         stages = len(tableau.b)
         key = stages, tuple(chosen)
-        if chosen and key not in self._curvatures:
-            at_once = self.curvature(name, chosen, tableau)
-            self._curvatures[key] = Curvature(name, len(chosen) + _has_time(chosen), range(0, stages, at_once))
-        return self._curvatures.get(key, Curvature())
-
-    def curvature(self, name: str, chosen: list[tuple[int, int]], tableau: Tableau) -> int:
-        """Write ``H += Z' S Z`` at all stages of a row or at one; `chosen` are the entries of S from `backward_row`.
-
-        Return at how many stages.
-        """
+        if key in self._curvatures or not chosen:
+            return self._curvatures.get(key, Curvature())
         graph, n, D = Graph(), self.sizes.n, self.sizes.D
         H = [graph.load("H", d, vector=True) for d in range(D)]
         sums = H
         moving = _has_time(chosen)
         # One function for all stages of a row, else for each, since it would be too long.
-        size, at_once = len(chosen) + moving, len(tableau.b) if n * D * len(self.library.modes) <= SHORT else 1
+        size, at_once = len(chosen) + moving, stages if n * D * len(self.library.modes) <= SHORT else 1
         for j in range(at_once):
             second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
             of_time = NOTHING
@@ -410,7 +436,8 @@ class Kernels:
                 of_time = start_d + c_j * (end_d - start_d), entries
             sums = self._add_curvature(graph, sums, second, [of_time, *self._directions(graph, "XZ", n, j * n)])
         self.module.write_straight_line(name, _store_changed_rows(H, sums))
-        return at_once
+        self._curvatures[key] = Curvature(name, size, range(0, stages, at_once))
+        return self._curvatures[key]
 
     def length(self) -> None:
         """Write ``H += h' x V' + V' x h'``, V' being what `backward_row` stored for a row that moves."""
@@ -513,11 +540,11 @@ class Kernels:
         for x in graph.loads("x", n):
             # 0 times infinity or NaN is NaN: the sum is 0, or NaN if any factor is not finite. LARGE takes large ones
             # there too.
-            total = total + graph.certain_product(0.0, x * LARGE)
+            total = total + graph.find_failure(x * LARGE)
         if self.with_tangents:
             for k in range(n):
                 for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
-                    total = total + graph.certain_product(0.0, Z)
+                    total = total + graph.find_failure(Z)
         self.module.write_straight_line("check_state", [(CHECKED, 0, total)])
 
     def outputs(self) -> None:
@@ -634,9 +661,7 @@ class Kernels:
             for k in range(first, first + count)
         ]
 
-    def _add_curvature(
-        self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: Along
-    ) -> list[Node]:
+    def _add_curvature(self, graph: Graph, H: list[Node], second: Second, along: Along) -> list[Node]:
         """Add ``Z' S Z`` to the rows of H, S given by its lower half along (t, x, p); `along` is Z of t and x."""
         n, T = self.sizes.n, self.sizes.T
         # H_d += Z_kd (S_km Z_m), summed over k and m along (t, x, p). S is symmetric and given by its lower half: each
@@ -659,7 +684,7 @@ class Kernels:
         return rows
 
 
-def list_entries(second: Objects, with_time: bool) -> dict[tuple[int, int], Node]:
+def list_entries(second: Objects, with_time: bool) -> Second:
     """Return the lower half of a second derivative along (t, x, p), all of it or that along (x, p)."""
     first = 0 if with_time else 1
     return {(k, m): second[k, m] for k in range(first, len(second)) for m in range(first, k + 1)}

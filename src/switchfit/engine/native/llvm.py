@@ -417,13 +417,11 @@ class Module:
         self.row_work: list[int] = []
         self.pointers: dict[str, tuple[str, ...]] = {}
 
-    def write_straight_line(
-        self, name: str, stores: Sequence[tuple[str, int, Node]], pointers: Sequence[str] = ()
-    ) -> None:
+    def write_straight_line(self, name: str, stores: Sequence[tuple[str, int, Node]]) -> None:
         """Write a function that loads, computes, and then stores each ``(pointer, offset, node)``.
 
         All loads come before the first store. Offsets count doubles, or vectors if the node is a vector. The arguments
-        are the `pointers`; by default those that it uses.
+        are the pointers that it uses.
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
@@ -433,7 +431,7 @@ class Module:
         for pointer, offset, node in stores:
             writer.used.add(pointer)
             writer.store(writer.value(node), writer.place(f"%{pointer}", offset, node))
-        self.pointers[name] = tuple(pointers or sorted(writer.used))
+        self.pointers[name] = tuple(sorted(writer.used))
         writer.begin(f"void @{self.prefix}{name}({', '.join(f'ptr %{pointer}' for pointer in self.pointers[name])})")
         self._functions.append(writer.end())
 
@@ -596,10 +594,11 @@ class Program:
         if len(self.memory) < size:
             self.memory = np.zeros(size)
 
-    def function(self, name: str, *types: Any) -> Any:
-        """Return a Python callable for a void function with arguments of these ctypes."""
+    def function(self, name: str, count: int) -> Any:
+        """Return a Python callable for a void function of so many integers and addresses."""
         if name not in self._functions:
-            self._functions[name] = ctypes.CFUNCTYPE(None, *types)(self._engine.get_function_address(name))
+            kind = ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * count)
+            self._functions[name] = kind(self._engine.get_function_address(name))
         return self._functions[name]
 
 

@@ -158,6 +158,14 @@ class Writer(Lines):
         """Emit the call of a straight-line function with its pointers."""
         self.invoke(name, *(given[key] for key in self.module.pointers[name]))
 
+    def take_step(self, mode: int, name: str, given: Pointers, newton: str = "newton") -> None:
+        """Emit the call of a step in a mode, behind that of `write_newton` which finds the increments of an implicit
+        one.
+        """
+        if self.library.implicit[mode]:
+            self.call(f"solve_{newton}_{mode}", given)
+        self.call(f"{name}_{mode}", given)
+
     def cases(self, which: Value, count: int) -> Iterator[int]:
         """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
         name = self.name_block()
@@ -168,6 +176,12 @@ class Writer(Lines):
             yield k
             self.go_to(f"{name}_end")
         self.label(f"{name}_end")
+
+    def call_one_of(self, which: Value, count: int, given: Pointers, *names: str) -> None:
+        """Emit the calls of those of `count` functions that have a number, {} in their names; of none for -1."""
+        for k in self.cases(which, count):
+            for name in names:
+                self.call(name.format(k), given)
 
     def zero(self, pointer: Value, count: Operand) -> None:
         """Write zeros to `count` doubles."""
@@ -253,6 +267,7 @@ def write_newton(writer: Writer, name: str) -> str:
     """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
     count, names = len(STIFF.b) * writer.sizes.n, (*writer.module.pointers[name], "J")
     parameters = writer.begin(f"void @solve_{name}({', '.join(f'ptr %{key}' for key in names)})")
+    writer.module.pointers[f"solve_{name}"] = names
     given = dict(zip(names, parameters, strict=True))
     # k = 0 is X_j = x, so that the first iteration is a linearly implicit step.
     writer.zero(given["increments"], count)
@@ -264,11 +279,6 @@ def write_newton(writer: Writer, name: str) -> str:
     for pointer in (given["J"], *(writer.at(given["increments"], k) for k in range(count))):
         writer.store(float("nan"), pointer)
     return writer.end()
-
-
-def solve_stages(writer: Writer, name: str, given: Pointers) -> None:
-    """Emit the call that computes the increments of an implicit row by the iterations of `write_newton`."""
-    writer.invoke(f"solve_{name}", *(given[key] for key in (*writer.module.pointers[name], "J")))
 
 
 def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
@@ -320,8 +330,7 @@ def write_forward(writer: Writer) -> str:
     start = writer.at_row(found, first + segment, "x", "Z")
     if writer.library.reset_maps:
         which, given = find_reset(writer, found, segment, segment > 0)
-        for k in writer.cases(which, len(writer.library.reset_maps)):
-            writer.call(f"reset_{k}", found | start | given)
+        writer.call_one_of(which, len(writer.library.reset_maps), found | start | given, "reset_{}")
         start = choose_state(which, given, start)
     # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
     flag = writer.get("i64", found["modes"], writer.sizes.N + 1)
@@ -331,12 +340,9 @@ def write_forward(writer: Writer) -> str:
         # The first row begins behind the reset map, whose state is not among those of the rows.
         given |= {name: given["first"].choose(start[name], given[name]) for name in ("x", "Z")}
         for k, kind in row_cases(writer, case):
-            if writer.library.implicit[k]:
-                solve_stages(writer, f"newton_{k}", given)
-            writer.call(f"forward_{kind}_{k}", given)
-        for level, name in enumerate(("error", "jump") if writer.order > Order.COST else ()):
-            for k in writer.cases((flag > level).choose(mode, -1), modes):
-                writer.call(f"{name}_{k}", given)
+            writer.take_step(k, f"forward_{kind}", given)
+        for level, name in enumerate(("error_{}", "jump_{}") if writer.order > Order.COST else ()):
+            writer.call_one_of((flag > level).choose(mode, -1), modes, given, name)
     after = last + segment + 1
     given = found | writer.at_row(found, after, "x", "Z")
     # Once per segment: what is not finite stays so to its end.
@@ -359,8 +365,7 @@ def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, 
         count = len(getattr(writer.library, kind))
         if kind == "guards" and count:
             given |= constraint_pointers(writer, found, segment)
-        for k in writer.cases(writer.get("i64", found[kind], segment), count):
-            writer.call(f"{kind}_{k}", given)
+        writer.call_one_of(writer.get("i64", found[kind], segment), count, given, f"{kind}_{{}}")
 
 
 def constraint_pointers(writer: Writer, found: Pointers, row: Operand) -> Pointers:
@@ -387,10 +392,8 @@ def write_backward(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -
     if writer.library.reset_maps:
         state = writer.at_row(found, first + segment, "x", "Z")
         which, given = find_reset(writer, found, segment, segment > 0)
-        for k in writer.cases(which, len(writer.library.reset_maps)):
-            # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
-            # before.
-            writer.call(f"reset_{k}_back", found | state | given)
+        # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one before.
+        writer.call_one_of(which, len(writer.library.reset_maps), found | state | given, "reset_{}_back")
     return writer.end()
 
 
@@ -429,9 +432,7 @@ def _write_late_row(writer: Writer, k: int, found: Pointers, sample: Value) -> t
     writer.call(f"late_time_{k}", given)
     mode = writer.get("i64", found["modes"], segment)
     for m in writer.cases(mode, len(writer.library.modes)):
-        if writer.library.implicit[m]:
-            solve_stages(writer, f"newton_{m}", given)
-        writer.call(f"forward_late_{m}", given)
+        writer.take_step(m, "forward_late", given)
     return given, mode
 
 
@@ -652,7 +653,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
 
     It ends at the end time, after `most` accepted steps, or when the solver is stuck.
     """
-    n, is_implicit = writer.sizes.n, writer.library.implicit[mode]
+    n = writer.sizes.n
     given = "i64 %cells, ptr %state, ptr %y, ptr %rows, i64 %most, ptr %count"
     _, cells, state, y, rows, most, count = writer.begin(f"void @adaptive_{mode}_steps(ptr %table, {given})")
     found = writer.pointers() | {"state": state, "y": y}
@@ -664,12 +665,10 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
         t, end, stuck, step = (writer.get("double", state, k) for k in (AT.t, AT.end, AT.stuck, AT.step))
         # Go on while t < end, not stuck, and with room for accepted times.
         leave(((t < end) & stuck.equals(0.0) & (writer.load("i64", count) < most)).equals(False))
-        for j, c in enumerate(TIMES[is_implicit]):
+        for j, c in enumerate(TIMES[writer.library.implicit[mode]]):
             found[f"moment{j}"] = writer.allocate("double", 2)
             found[f"signal{j}"] = _store_moment(writer, found, cells, t + step * c, found[f"moment{j}"])
-        if is_implicit:
-            solve_stages(writer, f"newton_step_{mode}", found)
-        writer.call(f"step_{mode}", found)
+        writer.take_step(mode, "step", found, "newton_step")
         with writer.when(writer.get("double", state, AT.refused).equals(0.0)):
             accepted = writer.load("i64", count)
             row = writer.at(rows, accepted, 2 + n)
@@ -795,7 +794,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         factors = kernels.forward_row(f"forward_{name}", template, moving, costs, tableau)
         if order > Order.COST:
             chosen = kernels.backward_row(f"backward_{name}", template, moving, costs, tableau, factors, is_late)
-            curvatures[kind] = kernels.share_curvature(f"curvature_{name}", chosen, tableau)
+            curvatures[kind] = kernels.curvature(f"curvature_{name}", chosen, tableau)
     # The same for all modes: written once.
     if order == Order.HESSIAN and mode == 0:
         kernels.length()

@@ -43,8 +43,9 @@ class Operation(NamedTuple):
         vector of doubles or a truth value.
     operands : int
         Number of operands.
-    takes_truth, gives_truth : bool
-        Whether operands, or the result, are truth values; else they are doubles. `select` is treated separately.
+    gives_truth : bool
+        Whether the result is a truth value, else it is a double; operands are truth values where there are primitives
+        `of_truth`. `select` is treated separately.
     function : str or None
         Function that its code calls: an intrinsic ("llvm.") or a function of the C library.
     primitives, of_truth : tuple of str
@@ -64,7 +65,6 @@ class Operation(NamedTuple):
     value: Callable[..., Any]
     code: str
     operands: int
-    takes_truth: bool = False
     gives_truth: bool = False
     function: str | None = None
     primitives: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ def _comparison(name: str, value: Callable[..., Any], condition: str, **more: An
 
 def _logic(name: str, value: Callable[..., Any], of_truth: tuple[str, ...], **more: Any) -> Operation:
     given: dict[str, Any] = {"operands": 2, "code": f"{name} i1 {{0}}, {{1}}", "commutes": True} | more
-    return Operation(name, value, takes_truth=True, gives_truth=True, of_truth=of_truth, **given)
+    return Operation(name, value, gives_truth=True, of_truth=of_truth, **given)
 
 
 def _call(name: str, value: Callable[..., Any], function: str = "", operands: int = 1, **more: Any) -> Operation:
@@ -336,15 +336,15 @@ class Graph:
                     self.presumed[each.index] = each
             pending += [a for a in each.args if isinstance(a, Node)]
 
-    def certain_product(self, factor: float, node: Node) -> Node:
-        """Return the product of a number with a node, without simplification."""
-        return self._node("mul", (self.constant(factor), node), node.vector)
+    def find_failure(self, node: Node) -> Node:
+        """Return 0 where a node is finite, else NaN: its product with zero, without simplification."""
+        return self._node("mul", (self.constant(0.0), node), node.vector)
 
     def check(self) -> list[tuple[str, int, Node]]:
         """Return the store that makes `CHECKED` NaN if a presumption is wrong; an empty list without presumptions."""
         total = self.load(CHECKED, 0)
         for node in self.presumed.values():
-            total = total + self.certain_product(0.0, node)
+            total = total + self.find_failure(node)
         return [(CHECKED, 0, total)] if self.presumed else []
 
     def _simplify(self, op: str, args: tuple[Node, ...]) -> Node | None:

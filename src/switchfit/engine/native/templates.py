@@ -140,7 +140,7 @@ class Templates:
 
                 return second + _differentiate_twice(cost_of_state, t, x, p)
 
-            return [*slope, value, *gradient, *self._differentiate(cost_to_go, t, x, p, gauss_newton)]
+            return [*slope, value, *gradient, *self._differentiate(cost_to_go, (t, x, p), gauss_newton)]
 
         also = " or a running cost" if running and (self.library.running or self.library.references) else ""
         shapes = (), (n,), (M,), (n,), (), (), (4, self.sizes.signals)
@@ -165,7 +165,7 @@ class Templates:
                 log_sigma = lambda t, x, p: model.log_sigma(k, given(t), p)  # noqa: E731
                 return second + _normal_matrix(log_sigma, lambda A: 2.0 * A, time, x, p)
 
-            return self._cost(lambda t, x, p: model.sample_cost(k, given(t), x, p), time, x, p, gauss_newton)
+            return self._cost(lambda t, x, p: model.sample_cost(k, given(t), x, p), (time, x, p), gauss_newton)
 
         shapes = (), (q,), (q,), (self.sizes.n,), (self.sizes.M,)
         return self._trace(sample, *shapes, name="observe of Measurements")
@@ -183,7 +183,7 @@ class Templates:
         """Trace the terminal costs."""
 
         def end(model: Model, x: Any, p: Any) -> Any:
-            return self._cost(lambda t, x, p: model.terminal(x, p), jnp.zeros(()), x, p)
+            return self._cost(lambda t, x, p: model.terminal(x, p), (jnp.zeros(()), x, p))
 
         return self._trace(end, (self.sizes.n,), (self.sizes.M,), name="a terminal cost")
 
@@ -196,8 +196,8 @@ class Templates:
         def at(model: Model, t: Any, x: Any, p: Any, weight: Any, origin: Any, coefficients: Any) -> Any:
             function = get_transition_function(model, kind, which, Piece(origin, coefficients))
             if kind == "guards":
-                return self._map(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
-            return self._cost(function, t, x, p)
+                return self._map(lambda t, x, p: function(t, x, p)[None], (t, x, p), weight)
+            return self._cost(function, (t, x, p))
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,), (), (4, self.sizes.signals)
         return self._trace(at, *shapes, name=f"one of the {kind}")
@@ -207,7 +207,7 @@ class Templates:
 
         def end(model: Model, x: Any, p: Any, weights: Any) -> Any:
             constraints = lambda t, x, p: model.terminal_constraint(x, p)  # noqa: E731
-            return self._map(constraints, jnp.zeros(()), x, p, weights)
+            return self._map(constraints, (jnp.zeros(()), x, p), weights)
 
         shapes = (self.sizes.n,), (self.sizes.M,), (self.sizes.m,)
         return self._trace(end, *shapes, name="a terminal constraint")
@@ -222,7 +222,7 @@ class Templates:
 
     def _trace_map(self, get_map: Callable[[Model], Callable[..., Any]], name: str) -> Template:
         n = self.sizes.n
-        call = lambda model, t, x, p, w: self._map(get_map(model), t, x, p, w)  # noqa: E731
+        call = lambda model, t, x, p, w: self._map(get_map(model), (t, x, p), w)  # noqa: E731
         return self._trace(call, (), (n,), (self.sizes.M,), (n,), name=name)
 
     def outputs(self) -> Template:
@@ -245,24 +245,20 @@ class Templates:
 
         return trace_scalars(call, *shapes, *self.sizes.constants, name=name)
 
-    def _cost(
-        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any] | None = None
-    ) -> list[Any]:
-        """Return a cost with the derivatives of the order."""
-        return [value(t, x, p), *self._differentiate(value, t, x, p, gauss_newton)]
+    def _cost(self, value: Callable[..., Any], at: Any, gauss_newton: Callable[[], Any] | None = None) -> list[Any]:
+        """Return a cost with the derivatives of the order at (t, x, p)."""
+        return [value(*at), *self._differentiate(value, at, gauss_newton)]
 
-    def _map(self, function: Callable[..., Any], t: Any, x: Any, p: Any, weights: Any) -> list[Any]:
+    def _map(self, function: Callable[..., Any], at: Any, weights: Any) -> list[Any]:
         """Return values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . values``."""
         if self.order == Order.COST:
-            return [function(t, x, p)]
-        jacobians = jax.jacfwd(function, argnums=(0, 1, 2))(t, x, p)
+            return [function(*at)]
+        jacobians = jax.jacfwd(function, argnums=(0, 1, 2))(*at)
         # Backward a map needs w . R alone, forward its Jacobians; a constraint needs lam . c in the same way.
-        weighted = self._differentiate(lambda *at: weights @ function(*at), t, x, p, self._no_second)
-        return [function(t, x, p), *jacobians, *weighted]
+        weighted = self._differentiate(lambda *at: weights @ function(*at), at, self._no_second)
+        return [function(*at), *jacobians, *weighted]
 
-    def _differentiate(
-        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], Any] | None
-    ) -> list[Any]:
+    def _differentiate(self, value: Callable[..., Any], at: Any, gauss_newton: Callable[[], Any] | None) -> list[Any]:
         """Return the derivatives of the order; at order GAUSS_NEWTON, second ones that are given take their place."""
         if self.order == Order.COST:
             return []
@@ -270,9 +266,9 @@ class Templates:
         if self.order == Order.GRADIENT:
             gauss_newton = self._no_second
         elif gauss_newton is None or self.order == Order.HESSIAN:
-            gauss_newton = partial(_differentiate_twice, value, t, x, p)
+            gauss_newton = partial(_differentiate_twice, value, *at)
         second = gauss_newton()
-        return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), second]
+        return [*jax.grad(value, argnums=(0, 1, 2))(*at), second]
 
     def _no_second(self) -> Any:
         return jnp.zeros((1 + self.sizes.n + self.sizes.M,) * 2)

@@ -122,7 +122,8 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
-            places = arrays.search(graph, args[0], args[1], right="lt_to" in _find_primitives(inner))
+            names = {each.primitive.name for jaxpr in list_jaxprs(inner.jaxpr) for each in jaxpr.eqns}
+            places = arrays.search(graph, args[0], args[1], right="lt_to" in names)
             if places is not None:
                 return [np.asarray(places, dtype=object)]
         return _run(graph, inner, args)
@@ -179,10 +180,6 @@ def _is_search(equation: Any) -> bool:
     table, query = (variable.aval for variable in equation.invars[:2])
     found = [(variable.aval.shape, query.dtype) for variable in equation.outvars]
     return table.ndim == 1 and table.dtype == np.float64 and found == [(query.shape, table.dtype)]
-
-
-def _find_primitives(closed: Any) -> set[str]:
-    return {equation.primitive.name for inner in list_jaxprs(closed.jaxpr) for equation in inner.eqns}
 
 
 OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
