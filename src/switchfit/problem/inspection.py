@@ -115,7 +115,7 @@ def _trace_libraries(problem: Problem) -> list[Structure]:
     if problem.max_transitions is not None:
         return list(problem.structures)
     each = zip(problem.experiments, problem.structures, strict=True)
-    return [trace_structure(problem.system, run, problem._functions, problem.solver, own.N) for run, own in each]
+    return [trace_structure(problem._sources, run, own.N) for run, own in each]
 
 
 VERBS = {

@@ -231,10 +231,12 @@ class Structure:
         return bool(self.guarded or self.terminal_constraints)
 
 
-class Functions(NamedTuple):
-    """The parameters of a problem, and the functions of its experiments that were traced, each of them once."""
+class Sources(NamedTuple):
+    """What a problem has for all its structures, and the functions that were traced, each of them once."""
 
+    system: HybridSystem
     parameters: Mapping[str, Parameter]
+    solver: Literal["auto", "explicit", "stiff"]
     traced: dict[Any, Function]
 
 
@@ -247,15 +249,15 @@ class _Tracer:
     read : dict of str to the positions of the entries that are read
     """
 
-    def __init__(self, functions: Functions, experiment: Experiment) -> None:
-        parameters, mapped = functions.parameters, experiment.parameter_map
+    def __init__(self, sources: Sources, experiment: Experiment) -> None:
+        parameters, mapped = sources.parameters, experiment.parameter_map
         order = {name: k for k, name in enumerate(parameters)}
         # The same order for every map, so that runs share a program.
         names = sorted({*parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
         self.named = {name: parameters[mapped.get(name, name)] for name in names}
         self.shapes = {name: q.shape for name, q in self.named.items()}
         self.read: dict[str, set[int]] = {}
-        self._traced, self._key = functions.traced, tuple(self.shapes.items())
+        self._traced, self._key = sources.traced, tuple(self.shapes.items())
 
     def __call__(self, *given: Any) -> Function:
         """Trace a function, given what a `Call` consists of."""
@@ -269,13 +271,7 @@ class _Tracer:
         return traced
 
 
-def trace_structure(
-    system: HybridSystem,
-    experiment: Experiment,
-    functions: Functions,
-    solver: Literal["auto", "explicit", "stiff"],
-    transitions: int | None = None,
-) -> Structure:
+def trace_structure(sources: Sources, experiment: Experiment, transitions: int | None = None) -> Structure:
     """Trace and check the functions of one experiment, and return its structure.
 
     All modes take implicit steps if the solver is "stiff", else all take explicit ones.
@@ -287,7 +283,7 @@ def trace_structure(
     ValueError
         With the name of the mode or function, what it should return and what it returned.
     """
-    trace = _Tracer(functions, experiment)
+    trace, system = _Tracer(sources, experiment), sources.system
     used = system.modes if transitions is not None else set(experiment.mode_sequence)
     names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
     x0, n, unknown = _trace_initial_state(trace, initial_state_of(system, experiment))
@@ -340,7 +336,7 @@ def trace_structure(
         guards=guards,
         terminal_constraints=tuple(_trace_terminal_constraint(trace, item, n) for item in items(TerminalConstraint)),
         input_shape=inputs,
-        implicit=(solver == "stiff",) * len(modes),
+        implicit=(sources.solver == "stiff",) * len(modes),
         transitions=len(reset_maps) if transitions is None else transitions + len(end),
         reset_library=reset_library,
         guard_library=guard_library,

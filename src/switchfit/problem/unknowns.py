@@ -238,7 +238,7 @@ class Unknowns:
 def list_unknowns(
     system: HybridSystem,
     experiments: tuple[Experiment, ...],
-    parameters: dict[str, Parameter],
+    parameters: Mapping[str, Parameter],
     durations: float | Mapping[str, float],
 ) -> Unknowns:
     """Return the unknowns of a problem in their order, with bounds, priors, scales and the order of times.
@@ -247,7 +247,7 @@ def list_unknowns(
     ----------
     system : HybridSystem
     experiments : tuple of Experiment
-    parameters : dict of str to Parameter
+    parameters : mapping of str to Parameter
     durations : float or mapping of str to float
         Shortest time a mode may last.
     """

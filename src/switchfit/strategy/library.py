@@ -191,7 +191,7 @@ def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -
     if not (has_cost or pair in problem.system.reset_maps or pair in problem.system.guards):
         return None, None, None
     alone = replace(run, mode_sequence=pair, transition_times=None, jumps=())
-    found = trace_structure(problem.system, alone, problem._functions, problem.solver, 1)
+    found = trace_structure(problem._sources, alone, 1)
     return found.reset_maps[0], found.transition_costs[0], found.guards[0]
 
 
@@ -209,7 +209,7 @@ def trace_transitions(problem: Problem, e: int, library: Library | None, births:
     else:
         pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
         steps = [(pair, (modes.index(pair[0]), modes.index(pair[1]))) for pair in pairs]
-    structure = trace_structure(problem.system, run, problem._functions, problem.solver, births)
+    structure = trace_structure(problem._sources, run, births)
     known: list[list[Any]] = [list(dict.fromkeys(structure.reset_maps[i] for i in structure.jumps)), [], []]
     size = max(len(modes), *(1 + max(place) for _, place in steps), 1)
     tables = np.full((3, size, size), -1, dtype=np.int64)
