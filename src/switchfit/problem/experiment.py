@@ -215,6 +215,8 @@ class Experiment:
     time_zone: str | None = None
     is_guess_proposed: bool = field(init=False, default=False)
     taken_from_data: tuple[str, ...] = field(init=False, default=())  # which of "t0" and "tf" were left out
+    signals: tuple[PiecewisePolynomial, ...] = field(init=False)
+    """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
 
     def __repr__(self) -> str:
         end = "free tf" if isinstance(self.tf, Parameter) else f"{self.tf:.6g}{unit_suffix(self.time_unit)}"
@@ -253,14 +255,15 @@ class Experiment:
             as_instance(self.inputs, "inputs", Input, "an sf.Input")
         if self.name is not None:
             set_fields(self, name=as_name(self.name, "name of an experiment"))
-        if self.initial_state is not None and not callable(self.initial_state):
+        if self.initial_state is not None:
             set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
         set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
         set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_times()
         self._check_data_inside()
-        if self.inputs is not None:
-            self.inputs.signal(t0, self.end)
+        inputs = () if self.inputs is None else (self.inputs.signal(t0, self.end),)
+        references = (item.signal for item in data if isinstance(item, ReferenceSignal))
+        set_fields(self, signals=(*references, *inputs))
 
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
@@ -343,12 +346,6 @@ class Experiment:
     def initial_times(self) -> FloatArray:
         """Guess of all of `times`, fixed ones included: an ``(N,)`` array."""
         return np.array([tau.value for tau in self._own_times], dtype=np.float64)
-
-    @cached_property
-    def signals(self) -> tuple[PiecewisePolynomial, ...]:
-        """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
-        inputs = () if self.inputs is None else (self.inputs.signal(self.t0, self.end),)
-        return (*(item.signal for item in self.data if isinstance(item, ReferenceSignal)), *inputs)
 
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
         """Return where each mode begins and the last one ends, (..., N + 2), for values of `times` (..., N).

@@ -247,7 +247,8 @@ class _Constants(Walk):
 
     def _check_precision(self, equation: Any, origin: Any) -> None:
         """Raise ValueError if an operation computes in less than double precision."""
-        short = [variable.aval.dtype for variable in equation.outvars if _is_short(variable)]
+        kinds = (getattr(variable.aval, "dtype", np.float64) for variable in equation.outvars)
+        short = list(filter(is_low_precision, kinds))
         if short and equation.primitive.name not in KEEPING:
             raise ValueError(
                 f"{self._what} computes in {short[0]}{_locate(origin)}, and so loses half of all digits: its arguments "
@@ -273,10 +274,6 @@ def _locate(equation: Any) -> str:
     """Return the location of an operation as the end of a sentence, " (file.py:12)"; empty if it is unknown."""
     where = find_line(equation)
     return f" ({where})" if where else ""
-
-
-def _is_short(atom: Any) -> bool:
-    return is_low_precision(getattr(atom.aval, "dtype", np.float64))
 
 
 def _list_indices(equation: Any, given: list[Any]) -> Iterator[tuple[Any, int, int]]:
