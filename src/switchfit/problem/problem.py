@@ -235,7 +235,7 @@ class Problem:
             transitions = len(run.transition_times) + len(run.jump_times)
             if most is not None and most < transitions:
                 raise ValueError(f"max_transitions is {most}, but a mode_sequence has {transitions} transitions.")
-        unknowns = list_unknowns(self.system, experiments, self.parameters, self.min_duration)
+        unknowns = list_unknowns(self.system, experiments, self.parameters, self.durations)
         set_fields(self, experiments=experiments, unknowns=unknowns)
         set_fields(self, structures=tuple(trace_structure(self._sources, run, most) for run in experiments))
 
@@ -318,6 +318,12 @@ class Problem:
                     f"{', '.join(changed)} does something else in this process than when the problem was built: what "
                     "it reads has changed. Build the problem anew before it is sent to other processes."
                 )
+
+    @cached_property
+    def durations(self) -> dict[str, float]:
+        """The shortest time each mode of the system may last: `min_duration`, 0 for a mode that it leaves out."""
+        given = self.min_duration
+        return {mode: given.get(mode, 0.0) if isinstance(given, Mapping) else given for mode in self.system.modes}
 
     @property
     def measurements(self) -> tuple[Measurements, ...]:

@@ -225,11 +225,6 @@ class Structure:
         at_transitions = self.transition_cost_library or self.guard_library
         return not (self.running or self.terminal or self.terminal_constraints or at_transitions)
 
-    @property
-    def constrained(self) -> bool:
-        """Whether it has guards or terminal constraints."""
-        return bool(self.guarded or self.terminal_constraints)
-
 
 class Sources(NamedTuple):
     """What a problem has for all its structures, and the functions that were traced, each of them once."""

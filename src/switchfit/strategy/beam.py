@@ -53,7 +53,6 @@ from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter, PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
 from switchfit.problem.structure import select_kind
-from switchfit.problem.unknowns import get_min_duration
 from switchfit.strategy.library import (
     PER_SEQUENCE,
     Children,
@@ -223,7 +222,7 @@ def follow_order(
     """
     found, run = prepare(problem, e), problem.experiments[e]
     modes = np.array([found.modes.index(mode) for mode in run.mode_sequence])
-    shortest = np.array([get_min_duration(problem.min_duration, mode) for mode in run.mode_sequence])
+    shortest = np.array([problem.durations[mode] for mode in run.mode_sequence])
     reach = np.array([[-found.grid], [found.grid]])  # a birth moves by up to the grid
     rules = Rules.of_order(modes, shortest, found.limits[: len(modes) - 1].T + reach)
     return found.run(rules, parameters, 0.0, PER_SEQUENCE * len(modes), replays, evidence)

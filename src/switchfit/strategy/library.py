@@ -21,7 +21,6 @@ from switchfit.problem.data import FloatArray, TerminalConstraint, TransitionCos
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, check_durations
 from switchfit.problem.structure import Function, Structure, select_kind, trace_structure
-from switchfit.problem.unknowns import get_min_duration
 from switchfit.problem.validation import as_count, as_name, as_names, join_names, require_known, shorten
 
 
@@ -159,7 +158,7 @@ def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[st
 
 def _read_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dict[str, float]:
     """Return the shortest duration of each mode; that of the problem where it is left out."""
-    found = {name: get_min_duration(problem.min_duration, name) for name in names}
+    found = {name: problem.durations[name] for name in names}
     if given is not None:
         asked = check_durations(given, problem.system)
         found |= {name: asked.get(name, found[name]) if isinstance(asked, dict) else asked for name in names}
