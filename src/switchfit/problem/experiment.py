@@ -31,6 +31,7 @@ from switchfit.problem.validation import (
     as_array,
     as_callable,
     as_instance,
+    as_instances,
     as_name,
     as_number,
     as_sequence,
@@ -268,7 +269,11 @@ class Experiment:
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
         set_fields(self, time_unit=as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'"))
-        data, jumps, times = _check_data(self.data), _check_jumps(self.jumps), self.transition_times
+        kinds = ", ".join(f"sf.{kind.__name__}" for kind in get_args(Data))
+        data = as_instances(self.data, "data", Data, kinds)  # type: ignore[arg-type]
+        if not data:
+            raise ValueError("data is empty: an experiment needs at least one cost.")
+        jumps, times = as_instances(self.jumps, "jumps", Jump, "an sf.Jump"), self.transition_times
         if times is not None:
             times = as_sequence(times, "transition_times", "a sequence of numbers or sf.Parameter")
             times = tuple(read_date(time, "a transition time") for time in times)
@@ -502,24 +507,6 @@ def _check_map(given: Any) -> Mapping[str, str]:
     return {
         as_name(here, "parameter_map", form): as_name(there, "parameter_map", form) for here, there in names.items()
     }
-
-
-def _check_data(data: Any) -> tuple[Data, ...]:
-    items = tuple(data) if isinstance(data, (list, tuple)) else (data,)
-    kinds = [f"sf.{kind.__name__}" for kind in get_args(Data)]
-    for item in items:
-        as_instance(item, "data", Data, f"{', '.join(kinds)} or a list of them")  # type: ignore[arg-type]
-    if not items:
-        raise ValueError("data is empty: an experiment needs at least one cost.")
-    return items
-
-
-def _check_jumps(given: Any) -> tuple[Jump, ...]:
-    """Return jumps as a tuple, checked."""
-    jumps = as_sequence((given,) if isinstance(given, Jump) else given, "jumps", "an sf.Jump or a sequence of them")
-    for jump in jumps:
-        as_instance(jump, "each of jumps", Jump, "an sf.Jump")
-    return tuple(jumps)
 
 
 def _find_span(data: tuple[Data, ...], missing: tuple[str, ...], t0: Any) -> tuple[float, float]:

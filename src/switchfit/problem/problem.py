@@ -26,6 +26,7 @@ from switchfit.problem.validation import (
     as_choice,
     as_count,
     as_instance,
+    as_instances,
     as_name,
     as_not_negative,
     as_positive,
@@ -198,10 +199,9 @@ class Problem:
 
     def __post_init__(self) -> None:
         as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")
-        given = self.experiments
-        experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
-        if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shorten(given)}.")
+        experiments = as_instances(self.experiments, "experiments", Experiment, "an sf.Experiment")
+        if not experiments:
+            raise ValueError("experiments is empty: a problem needs at least one sf.Experiment.")
         set_fields(
             self,
             parameters=check_parameters(self.parameters),
