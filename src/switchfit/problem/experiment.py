@@ -240,20 +240,17 @@ class Experiment:
                 "An experiment needs a finite horizon with t0 < tf; got "
                 f"({show_time(self, t0)}, {show_time(self, last)}){why}."
             )
-        set_fields(self, taken_from_data=missing)
         modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
-        set_fields(self, is_guess_proposed=self.transition_times is None and len(sequence) > 1)
         given = self.transition_times
+        set_fields(self, taken_from_data=missing, is_guess_proposed=given is None and len(sequence) > 1)
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
         if len(given) != len(sequence) - 1:
             raise ValueError(f"transition_times must be one fewer than the {len(sequence)} modes; got {len(given)}.")
         times = tuple(as_parameter(tau, "a transition time") for tau in given)
-        if self.inputs is not None:
-            as_instance(self.inputs, "inputs", Input, "an sf.Input")
         if self.name is not None:
             set_fields(self, name=as_name(self.name, "name of an experiment"))
         if self.initial_state is not None:
@@ -262,9 +259,10 @@ class Experiment:
         set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_times()
         self._check_data_inside()
-        inputs = () if self.inputs is None else (self.inputs.signal(t0, self.end),)
-        references = (item.signal for item in data if isinstance(item, ReferenceSignal))
-        set_fields(self, signals=(*references, *inputs))
+        signals = [item.signal for item in data if isinstance(item, ReferenceSignal)]
+        if self.inputs is not None:
+            signals.append(as_instance(self.inputs, "inputs", Input, "an sf.Input").signal(t0, self.end))
+        set_fields(self, signals=tuple(signals))
 
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
