@@ -259,7 +259,7 @@ class Experiment:
         set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_times()
         self._check_data_inside()
-        signals = [item.signal for item in data if isinstance(item, ReferenceSignal)]
+        signals = [item.signal for item in self.references]
         if self.inputs is not None:
             signals.append(as_instance(self.inputs, "inputs", Input, "an sf.Input").signal(t0, self.end))
         set_fields(self, signals=tuple(signals))
@@ -292,6 +292,11 @@ class Experiment:
     def measurements(self) -> tuple[Measurements, ...]:
         """The `Measurements` among the data, in their order."""
         return tuple(item for item in self.data if isinstance(item, Measurements))
+
+    @property
+    def references(self) -> tuple[ReferenceSignal, ...]:
+        """The `ReferenceSignal` among the data, in their order."""
+        return tuple(item for item in self.data if isinstance(item, ReferenceSignal))
 
     @property
     def has_free_tf(self) -> bool:

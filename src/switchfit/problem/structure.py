@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise, product
 from typing import Any, Literal, NamedTuple
 
@@ -72,12 +72,6 @@ class Sensor(NamedTuple):
     loss: str
     loss_scale: float
     delay: str | None  # the parameter that is the delay; None if it is a number, which is subtracted from the times
-
-    @classmethod
-    def of(cls, item: Measurements, observe: Function | None) -> Sensor:
-        """Return the sensor of one of the data."""
-        delay = item.delay if isinstance(item.delay, str) else None
-        return cls(observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
 
     @property
     def named(self) -> set[str]:
@@ -282,7 +276,10 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
     used = system.modes if transitions is not None else set(experiment.mode_sequence)
     names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
     x0, n, unknown = _trace_initial_state(trace, initial_state_of(system, experiment))
-    items = partial(select_kind, experiment.data)
+
+    def items(kind: type) -> list[Any]:
+        return [item for item in experiment.data if isinstance(item, kind)]
+
     at: tuple[Shape | None, ...] = ((), (n,), None)
     inputs = None if experiment.inputs is None else experiment.inputs.shape
     input_names = () if experiment.inputs is None else experiment.inputs.names
@@ -309,8 +306,7 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
     after_jumps = (own_modes[i] for i in experiment.passed_by_jumps)  # the mode before it
     sequence = (own_modes[0], *insert_jumps(experiment, own_modes[1:], after_jumps))
     jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for _, jump in experiment.acts]
-    references = ((item, item.signal.channels) for item in items(ReferenceSignal))
-    measurements = ((item, item.values.shape[1]) for item in items(Measurements))
+    references = ((item, item.signal.channels) for item in experiment.references)
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)", jump_maps)
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
     costs = _choose_transition_costs(items(TransitionCost), names)
@@ -326,7 +322,7 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
         parameters=(),
         running=tuple(trace(item.ell, at, (), "RunningCost", "ell(t, x, p)") for item in items(RunningCost)),
         references=tuple((_trace_observe(trace, item, q, n), q) for item, q in references),
-        measurements=tuple(Sensor.of(item, _trace_observe(trace, item, q, n)) for item, q in measurements),
+        measurements=tuple(_trace_sensor(trace, item, n) for item in experiment.measurements),
         terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in items(TerminalCost)),
         guards=guards,
         terminal_constraints=tuple(_trace_terminal_constraint(trace, item, n) for item in items(TerminalConstraint)),
@@ -365,6 +361,13 @@ def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channel
     return None
 
 
+def _trace_sensor(trace: _Tracer, item: Measurements, n: int) -> Sensor:
+    """Return the part of Measurements on which programs depend."""
+    channels, delay = item.values.shape[1], item.delay if isinstance(item.delay, str) else None
+    observe = _trace_observe(trace, item, channels, n)
+    return Sensor(observe, channels, item.sigma_names, item.loss, item.loss_scale, delay)
+
+
 def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int) -> Function:
     """Return the function psi(x, p) of a terminal constraint, which returns a number or (m,)."""
     psi = trace(item.psi, ((n,), None), None, "TerminalConstraint", "psi(x, p)")
@@ -399,8 +402,3 @@ def _choose_transition_costs(items: list[TransitionCost], modes: tuple[str, ...]
 def read_initial_values(initial: Any) -> FloatArray:
     """Return an initial state that is not a function as numbers (n,), with guesses for unknown entries."""
     return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
-
-
-def select_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
-    """Return the items of an experiment's data that are of a kind, in order."""
-    return [item for item in data if isinstance(item, kind)]

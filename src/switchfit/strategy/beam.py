@@ -52,7 +52,6 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter, PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
-from switchfit.problem.structure import select_kind
 from switchfit.strategy.library import (
     PER_SEQUENCE,
     Children,
@@ -74,15 +73,14 @@ INTERVALS = 60
 def choose_grid(run: Experiment) -> float:
     """Return the time between births: that between samples, but at most `INTERVALS` in the horizon."""
     shortest = (run.end - run.t0) / INTERVALS
-    gaps = [np.diff(item.times) for item in select_kind(run.data, Measurements)]
+    gaps = [np.diff(item.times) for item in run.measurements]
     usual = [float(np.median(gap)) for gap in gaps if len(gap)]
     return max([shortest, *([min(usual)] if usual else [])])
 
 
 def list_sample_times(run: Experiment) -> FloatArray:
     """Return the times at which something is measured: (K,), ascending."""
-    measured = select_kind(run.data, Measurements)
-    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in measured]
+    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in run.measurements]
     return np.unique(np.concatenate([np.zeros(0), *times]))
 
 
@@ -330,9 +328,8 @@ class Beam:
         self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
         self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
-        measured = select_kind(run.data, Measurements)
-        is_unknown = any(item.sigma is None for item in measured)
-        self.counts = count_values(measured, mesh.times) if is_unknown else None
+        is_unknown = any(item.sigma is None for item in run.measurements)
+        self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
         self.noise = assume_noise(problem)  # that of all runs
         guards = (self.noise / (GUARD_SD * self.grid)) ** 2
         self.tolerances = Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)

@@ -20,7 +20,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import FloatArray, TerminalConstraint, TransitionCost
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, check_durations
-from switchfit.problem.structure import Function, Structure, select_kind, trace_structure
+from switchfit.problem.structure import Function, Structure, trace_structure
 from switchfit.problem.validation import as_count, as_name, as_names, join_names, require_known, shorten
 
 
@@ -175,7 +175,9 @@ def refuse_unsupported(problem: Problem, e: int) -> None:
     wrong = {
         "a free tf: give tf a number": run.has_free_tf,
         "a delay that is a parameter: give it a number": problem.estimates_delays,
-        "terminal constraints: leave them out of the search": bool(select_kind(run.data, TerminalConstraint)),
+        "terminal constraints: leave them out of the search": any(
+            isinstance(item, TerminalConstraint) for item in run.data
+        ),
     }
     for what, is_there in wrong.items():
         if is_there:
