@@ -268,7 +268,7 @@ class Experiment:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
         set_fields(self, time_unit=as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'"))
         kinds = ", ".join(f"sf.{kind.__name__}" for kind in get_args(Data))
-        data = as_instances(self.data, "data", Data, kinds)  # type: ignore[arg-type]
+        data: tuple[Data, ...] = as_instances(self.data, "data", Data, kinds)  # type: ignore[arg-type]
         if not data:
             raise ValueError("data is empty: an experiment needs at least one cost.")
         jumps, times = as_instances(self.jumps, "jumps", Jump, "an sf.Jump"), self.transition_times
