@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import pad_length, read_initial_values
+from switchfit.problem.structure import pad_length
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
@@ -335,7 +335,7 @@ def build_common_arguments(problem: Problem, e: int) -> Arguments:
     lengths = problem.sample_lengths[e]
     samples = tuple(_pad_samples(*each, experiment.t0) for each in zip(experiment.measurements, lengths, strict=True))
     weights = tuple(_drop_off_diagonal_zeros(item.weights) for item in experiment.references)
-    x0 = np.zeros(structure.n) if callable(initial) else read_initial_values(initial)
+    x0 = np.zeros(structure.n) if callable(initial) else np.array([getattr(x, "value", x) for x in initial], float)
     empty = np.zeros(0)
     return Arguments(empty, empty, fixed, x0, samples, weights)  # type: ignore[arg-type]
 

@@ -228,9 +228,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         self._convert_dates()
-        data = self.data
         missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
-        span = _find_span(data, missing, self.t0) if missing else (0.0, 0.0)
+        span = self._find_span(missing) if missing else (0.0, 0.0)
         t0 = span[0] if self.t0 is None else as_number(self.t0, "t0")
         tf = span[1] if self.tf is None else _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
@@ -287,6 +286,17 @@ class Experiment:
                 parts[name] = count_from(part, origin, self.time_unit, names.get(name, ""))
             parts |= {"origin": origin, "time_zone": origin.time_zone or None}
         set_fields(self, **parts)
+
+    def _find_span(self, missing: tuple[str, ...]) -> tuple[float, float]:
+        """Return the first and the last time of the data, from which t0 or tf is taken where it is left out."""
+        spans = [item.seen_times[[0, -1]] for item in self.measurements if len(item.times)]
+        spans += [item.signal.knots[[0, -1]] for item in self.references]
+        if self.measurements and not spans and self.t0 is not None:  # of a stream
+            spans = [as_number(self.t0, "t0") + np.array([0.0, 1.0])]
+        if not spans:
+            kinds = join_names(dict.fromkeys(type(item).__name__ for item in self.data))
+            raise ValueError(f"{' and '.join(missing)} must be given, as nothing among the data ({kinds}) has times.")
+        return float(np.min(spans)), float(np.max(spans))
 
     @property
     def measurements(self) -> tuple[Measurements, ...]:
@@ -510,19 +520,6 @@ def _check_map(given: Any) -> Mapping[str, str]:
     return {
         as_name(here, "parameter_map", form): as_name(there, "parameter_map", form) for here, there in names.items()
     }
-
-
-def _find_span(data: tuple[Data, ...], missing: tuple[str, ...], t0: Any) -> tuple[float, float]:
-    """Return the first and the last time of the data, from which t0 or tf is taken where it is left out."""
-    sensors = [item for item in data if isinstance(item, Measurements)]
-    spans = [item.seen_times[[0, -1]] for item in sensors if len(item.times)]
-    spans += [item.signal.knots[[0, -1]] for item in data if isinstance(item, ReferenceSignal)]
-    if sensors and not spans and t0 is not None:  # of a stream
-        spans = [as_number(t0, "t0") + np.array([0.0, 1.0])]
-    if not spans:
-        kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
-        raise ValueError(f"{' and '.join(missing)} must be given, as nothing among the data ({kinds}) has times.")
-    return float(np.min(spans)), float(np.max(spans))
 
 
 def _require_single(time: Parameter, what: str) -> None:

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.problem.data import (
-    FloatArray,
     Measurements,
     ReferenceSignal,
     RunningCost,
@@ -397,8 +396,3 @@ def _choose_transition_costs(items: list[TransitionCost], modes: tuple[str, ...]
         if here:
             found[before, after] = here[0]
     return found
-
-
-def read_initial_values(initial: Any) -> FloatArray:
-    """Return an initial state that is not a function as numbers (n,), with guesses for unknown entries."""
-    return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
