@@ -123,7 +123,9 @@ class HybridSystem:
         >>> system.check_labels_of(2)
         """
         for label in ("state_names", "state_units"):
-            as_labels(getattr(self, label), label, "state", n)
+            labels = getattr(self, label)
+            if labels is not None and len(labels) != n:
+                raise ValueError(f"{label} must have one entry for each of the {n} states; got {shorten(labels)}.")
 
 
 def as_state(value: Any, name: str) -> Callable[..., Any] | NDArray[np.float64] | tuple[Parameter, ...]:
