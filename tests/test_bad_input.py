@@ -106,7 +106,7 @@ def refused(build, error, *said):
         (lambda: experiment(mode_sequence="grow"), ["mode_sequence must be a sequence of mode names; got 'grow': giv"]),
         (lambda: experiment(data=[SAMPLES, 3]), ["data must be sf.Measurements", "or a list of them; got int"]),
         (lambda: problem(of=3), ["system must be an sf.HybridSystem; got int"]),
-        (lambda: problem([]), ["experiments must be an sf.Experiment or a non-empty list of them; got []"]),
+        (lambda: problem([SAMPLES]), ["experiments must be an sf.Experiment or a list of them; got Measurements"]),
         (lambda: problem(parameters=["k"]), ["parameters must be a dict of name -> value", "got ['k']"]),
     ],
 )
@@ -164,6 +164,7 @@ def test_wrong_types(build, said):
         (lambda: experiment(transition_times=(math.nan,)), ["a transition time must be a number", "must be finite; g"]),
         (lambda: experiment(transition_times=[[0.5, 0.6]]), ["transition time 1 must be a single number", "(2,)"]),
         (lambda: experiment(data=[]), ["data is empty: an experiment needs at least one cost"]),
+        (lambda: problem([]), ["experiments is empty: a problem needs at least one sf.Experiment"]),
         (lambda: experiment(data=samples([-1, 0.5, 2], [1, 1, 1])), ["inside [t0, tf] = [0.0, 1.0]; 2 of 3 do not"]),
         (lambda: experiment(data=reference(TIMES / 2)), ["over (t0, tf) = (0.0, 1.0)", "from 0.0 to 0.5", "Give t0"]),
         # What the horizon is taken from

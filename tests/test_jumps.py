@@ -389,7 +389,7 @@ def make_jumping(*jumps):
             "lie inside .* = \\[0.0, 36.0, the end left out\\]; .* first is 36.0",
         ),
         (lambda: make_jumping(sf.Jump(-1.0, dose)), ValueError, "1 of 1 do not, the first is -1.0"),
-        (lambda: make_jumping(dose), TypeError, "each of jumps must be an sf.Jump; got function"),
+        (lambda: make_jumping(dose), TypeError, "jumps must be an sf.Jump or a list of them; got function"),
         (lambda: make_jumping(sf.Jump(1.0, lambda t, x, p: np.zeros(2))), ValueError, "the map of a Jump.*\\(2,\\)"),
         (lambda: make_changing(TIMES, guess=8.0), ValueError, "guess of transition time 1 is 8.0, the time of a jump"),
         (lambda: make_changing(TIMES, max_transitions=4), ValueError, "max_transitions is 4, but .* has 5 transitions"),

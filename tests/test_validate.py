@@ -395,7 +395,7 @@ def test_what_cannot_be_compared():
     # 1 is the scale if none is given: the tail of Cauchy's loss falls as 1 / |z|, whose integral is infinite.
     heavy = run(TIMES, values(TIMES, 0), loss="cauchy", loss_scale=1.0)
     for estimates, error, said in (
-        ([one, one.problem], TypeError, r"each of estimates must be a result of sf\.estimate; got Problem"),
+        ([one, one.problem], TypeError, r"estimates must be a result of sf\.estimate or a list of them; got Problem"),
         ([one], ValueError, "compare needs two estimates or more; got 1"),
         ([one, fit(1, runs=area)], ValueError, "model2 has no likelihood: its cost has other terms than Measure"),
         ([one, fit(2, runs=heavy)], ValueError, r"model2 .*: loss='cauchy' is .* a loss_scale above 1; got 1\."),

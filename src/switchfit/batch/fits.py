@@ -35,7 +35,6 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import get_min_duration
 from switchfit.problem.validation import as_level, as_path
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
@@ -385,7 +384,7 @@ def describe_ends(
 
 def _count_collapsed(problem: Problem, experiment: Experiment, ends: FloatArray) -> NDArray[np.int64]:
     """Return how many modes of an experiment last no longer than they must, from their ends (R, N + 2): (R,)."""
-    least = np.array([get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence])
+    least = np.array([problem.durations[mode] for mode in experiment.mode_sequence])
     shortest = least + AT_END * (experiment.end - experiment.t0)
     found: NDArray[np.int64] = np.sum(np.diff(ends, axis=1) <= shortest, axis=1)
     return found

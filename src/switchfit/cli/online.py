@@ -89,13 +89,11 @@ def online(
     for issue in loaded.issues:
         terminal.print_note(issue)
     from switchfit.online.log import build_log
-    from switchfit.problem.data import Measurements
-    from switchfit.problem.structure import select_kind
     from switchfit.strategy.library import build_library
 
     for file in filter(None, (state, journal)):
         file.parent.mkdir(parents=True, exist_ok=True)
-    sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
+    sensors = loaded.problem.experiments[0].measurements
     room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
     settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
     settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}

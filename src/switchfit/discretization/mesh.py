@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial, ReferenceSignal
+from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import pad_length, read_initial_values, select_kind
+from switchfit.problem.structure import pad_length
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
@@ -302,9 +302,8 @@ def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
 
 def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Arguments:
     """Return the arguments of an experiment on a mesh, from those that suit any mesh."""
-    measurements = select_kind(experiment.data, Measurements)
     # Of each sample the index of the cell that ends at it; -1 for t0.
-    cells = (np.searchsorted(mesh.times, item.seen_times) - 1 for item in measurements)
+    cells = (np.searchsorted(mesh.times, item.seen_times) - 1 for item in experiment.measurements)
     samples = tuple(
         padded._replace(cell=_pad_with_last(cell, len(padded.time), 0))  # type: ignore[arg-type]  # made jax arrays
         for cell, padded in zip(cells, common.samples, strict=True)
@@ -321,11 +320,10 @@ def build_common_arguments(problem: Problem, e: int) -> Arguments:
     initial = initial_state_of(problem.system, experiment)
     unread = (experiment.parameter_map.get(name, name) for name, _, read in structure.parameters if not read)
     fixed = tuple(problem.parameters[name].value for name in unread)
-    measurements = select_kind(experiment.data, Measurements)
     lengths = problem.sample_lengths[e]
-    samples = tuple(_pad_samples(*each, experiment.t0) for each in zip(measurements, lengths, strict=True))
-    weights = tuple(_drop_off_diagonal_zeros(item.weights) for item in select_kind(experiment.data, ReferenceSignal))
-    x0 = np.zeros(structure.n) if callable(initial) else read_initial_values(initial)
+    samples = tuple(_pad_samples(*each, experiment.t0) for each in zip(experiment.measurements, lengths, strict=True))
+    weights = tuple(_drop_off_diagonal_zeros(item.weights) for item in experiment.references)
+    x0 = np.zeros(structure.n) if callable(initial) else np.array([getattr(x, "value", x) for x in initial], float)
     empty = np.zeros(0)
     return Arguments(empty, empty, fixed, x0, samples, weights)  # type: ignore[arg-type]
 

@@ -81,7 +81,7 @@ def constraint_errors(fine: Evaluator, theta: FloatArray, constraints: Sequence[
     values, scales = [np.zeros(0)], [np.zeros(0)]
     given = zip(problem.structures, fine.arguments, fine.simulate(theta), strict=True)
     for e, (structure, arguments, simulation) in enumerate(given):
-        if structure.constrained:
+        if problem.constraint_counts[e]:
             tau, p = problem.vectors(theta, e)
             ends = np.stack([simulation.after[rows][-1] for rows in simulation.segments])
             states = np.concatenate([simulation.before, simulation.after])

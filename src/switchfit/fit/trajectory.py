@@ -14,7 +14,7 @@ from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, runs_of
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray, ReferenceSignal
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import Experiment, count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
@@ -342,13 +342,12 @@ def _build_comparisons(
     problem: Problem, e: int, theta: FloatArray, simulation: Simulation, trajectory: Trajectory
 ) -> tuple[Comparison, ...]:
     """Compare measured with fitted for each reference signal and each Measurements."""
-    data, times = problem.experiments[e].data, trajectory.times
+    run, times = problem.experiments[e], trajectory.times
     curves = select_visible(simulation, simulation.y_before, simulation.y_after)
     known = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
     comparisons = []
-    items = [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
     first = measured = 0
-    for item in items:
+    for item in (*run.references, *run.measurements):
         q = item.signal.channels if isinstance(item, ReferenceSignal) else item.values.shape[1]
         channels = slice(first, first + q)
         first += q

@@ -22,7 +22,7 @@ from switchfit.io.problem_file import load_problem
 from switchfit.io.problem_file.building import ProblemFile, digest_file
 from switchfit.modes.result import ModeSearch
 from switchfit.online.state import Now
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import as_date
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
@@ -652,11 +652,10 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
 
 def _has_data(estimate: Estimate, problem: Problem) -> bool:
     """Return whether the measurements of a problem are those that an estimate was fitted to."""
-    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
     fitted = [each for run in estimate.comparisons for each in run if each.kind == "measurements"]
-    return len(items) == len(fitted) and all(
+    return len(problem.measurements) == len(fitted) and all(
         np.array_equal(item.times, each.times) and np.array_equal(item.values, each.measured, equal_nan=True)
-        for item, each in zip(items, fitted, strict=True)
+        for item, each in zip(problem.measurements, fitted, strict=True)
     )
 
 

@@ -41,7 +41,6 @@ from switchfit.online.tracker import (
 )
 from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import (
     as_array,
     as_count,
@@ -836,7 +835,7 @@ def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:
 def _check_problem(problem: Problem) -> list[Measurements]:
     """Return the sensors of a problem that can be estimated online; ValueError for others."""
     run = problem.experiments[0]
-    sensors = list(select_kind(run.data, Measurements))
+    sensors = list(run.measurements)
     wrong = {
         f"{len(problem.experiments)} runs": len(problem.experiments) > 1,
         "other data": len(sensors) < len(run.data),

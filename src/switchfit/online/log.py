@@ -14,7 +14,7 @@ from switchfit.online.state import Alarm, Now, OnlineStatus, list_updates
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_callable, as_instance, as_sequence
+from switchfit.problem.validation import as_array, as_callable, as_instances
 from switchfit.runtime.presentation import Printed, draw_figure, format_line
 
 
@@ -220,10 +220,7 @@ def replay(
     """
     online = OnlineEstimator(problem, **settings)
     own = problem.experiments[0].data
-    form = "sf.Measurements, or a list of them, one for each of the problem's own"
-    given = as_sequence([data] if isinstance(data, Measurements) else own if data is None else data, "data", form)
-    for item in given:
-        as_instance(item, "data", Measurements, form)
+    given = as_instances(own if data is None else data, "data", Measurements, "sf.Measurements")
     if len(given) != len(own):
         raise ValueError(f"the problem has {len(own)} Measurements; got {len(given)} as data.")
     if callback is not None:

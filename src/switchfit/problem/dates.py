@@ -192,6 +192,7 @@ class Dates:
         Parameters
         ----------
         zone : str
+            "" leaves all as they are.
         what : str
             Name of the argument, for messages.
 
@@ -200,7 +201,7 @@ class Dates:
         ValueError
             For a time that clocks in this zone skip, or show twice.
         """
-        if self.time_zone:
+        if self.time_zone or not zone:
             return self
         minutes, places = np.unique(self.instants.astype("datetime64[m]").ravel(), return_inverse=True)
         offsets = [_find_offset(minute, zone, what) for minute in minutes.tolist()]
@@ -397,8 +398,8 @@ class Origin:
         """
         if dates.time_zone and not self.time_zone:
             raise ValueError(f"{what}: {dates!r} has a time zone, but the dates of the experiment have none.")
-        dates = dates.localize(self.time_zone, what) if self.time_zone else dates
-        return np.asarray((dates.instants - self.instant) / LENGTHS[normalize_time_unit(time_unit)])
+        instants = dates.localize(self.time_zone, what).instants
+        return np.asarray((instants - self.instant) / LENGTHS[normalize_time_unit(time_unit)])
 
     def to_dates(self, times: ArrayLike, time_unit: str) -> list[datetime.datetime]:
         """Return times (K,) as dates in the experiment's zone, to the microsecond.
@@ -477,7 +478,7 @@ def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, ti
         raise ValueError(
             f"{given[0][0]} is a date, but not all times of the data are: give origin, the date of time 0."
         )
-    located = [dates.localize(zone, what) if zone else dates for what, dates in candidates]
+    located = [dates.localize(zone, what) for what, dates in candidates]
     return make_origin(min(each.instants.min() for each in located), zone)
 
 

@@ -31,6 +31,7 @@ from switchfit.problem.validation import (
     as_array,
     as_callable,
     as_instance,
+    as_instances,
     as_name,
     as_number,
     as_sequence,
@@ -215,6 +216,8 @@ class Experiment:
     time_zone: str | None = None
     is_guess_proposed: bool = field(init=False, default=False)
     taken_from_data: tuple[str, ...] = field(init=False, default=())  # which of "t0" and "tf" were left out
+    signals: tuple[PiecewisePolynomial, ...] = field(init=False)
+    """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
 
     def __repr__(self) -> str:
         end = "free tf" if isinstance(self.tf, Parameter) else f"{self.tf:.6g}{unit_suffix(self.time_unit)}"
@@ -225,9 +228,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         self._convert_dates()
-        data = self.data
         missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
-        span = _find_span(data, missing, self.t0) if missing else (0.0, 0.0)
+        span = self._find_span(missing) if missing else (0.0, 0.0)
         t0 = span[0] if self.t0 is None else as_number(self.t0, "t0")
         tf = span[1] if self.tf is None else _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
@@ -237,35 +239,38 @@ class Experiment:
                 "An experiment needs a finite horizon with t0 < tf; got "
                 f"({show_time(self, t0)}, {show_time(self, last)}){why}."
             )
-        set_fields(self, taken_from_data=missing)
         modes = as_sequence(self.mode_sequence, "mode_sequence", "a sequence of mode names")
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
-        set_fields(self, is_guess_proposed=self.transition_times is None and len(sequence) > 1)
         given = self.transition_times
+        set_fields(self, taken_from_data=missing, is_guess_proposed=given is None and len(sequence) > 1)
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
         if len(given) != len(sequence) - 1:
             raise ValueError(f"transition_times must be one fewer than the {len(sequence)} modes; got {len(given)}.")
         times = tuple(as_parameter(tau, "a transition time") for tau in given)
-        if self.inputs is not None:
-            as_instance(self.inputs, "inputs", Input, "an sf.Input")
         if self.name is not None:
             set_fields(self, name=as_name(self.name, "name of an experiment"))
-        if self.initial_state is not None and not callable(self.initial_state):
+        if self.initial_state is not None:
             set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
         set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
         set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_times()
         self._check_data_inside()
+        signals = [item.signal for item in self.references]
         if self.inputs is not None:
-            self.inputs.signal(t0, self.end)
+            signals.append(as_instance(self.inputs, "inputs", Input, "an sf.Input").signal(t0, self.end))
+        set_fields(self, signals=tuple(signals))
 
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
         set_fields(self, time_unit=as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'"))
-        data, jumps, times = _check_data(self.data), _check_jumps(self.jumps), self.transition_times
+        kinds = ", ".join(f"sf.{kind.__name__}" for kind in get_args(Data))
+        data: tuple[Data, ...] = as_instances(self.data, "data", Data, kinds)  # type: ignore[arg-type]
+        if not data:
+            raise ValueError("data is empty: an experiment needs at least one cost.")
+        jumps, times = as_instances(self.jumps, "jumps", Jump, "an sf.Jump"), self.transition_times
         if times is not None:
             times = as_sequence(times, "transition_times", "a sequence of numbers or sf.Parameter")
             times = tuple(read_date(time, "a transition time") for time in times)
@@ -282,10 +287,26 @@ class Experiment:
             parts |= {"origin": origin, "time_zone": origin.time_zone or None}
         set_fields(self, **parts)
 
+    def _find_span(self, missing: tuple[str, ...]) -> tuple[float, float]:
+        """Return the first and the last time of the data, from which t0 or tf is taken where it is left out."""
+        spans = [item.seen_times[[0, -1]] for item in self.measurements if len(item.times)]
+        spans += [item.signal.knots[[0, -1]] for item in self.references]
+        if self.measurements and not spans and self.t0 is not None:  # of a stream
+            spans = [as_number(self.t0, "t0") + np.array([0.0, 1.0])]
+        if not spans:
+            kinds = join_names(dict.fromkeys(type(item).__name__ for item in self.data))
+            raise ValueError(f"{' and '.join(missing)} must be given, as nothing among the data ({kinds}) has times.")
+        return float(np.min(spans)), float(np.max(spans))
+
     @property
     def measurements(self) -> tuple[Measurements, ...]:
         """The `Measurements` among the data, in their order."""
         return tuple(item for item in self.data if isinstance(item, Measurements))
+
+    @property
+    def references(self) -> tuple[ReferenceSignal, ...]:
+        """The `ReferenceSignal` among the data, in their order."""
+        return tuple(item for item in self.data if isinstance(item, ReferenceSignal))
 
     @property
     def has_free_tf(self) -> bool:
@@ -343,12 +364,6 @@ class Experiment:
     def initial_times(self) -> FloatArray:
         """Guess of all of `times`, fixed ones included: an ``(N,)`` array."""
         return np.array([tau.value for tau in self._own_times], dtype=np.float64)
-
-    @cached_property
-    def signals(self) -> tuple[PiecewisePolynomial, ...]:
-        """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
-        inputs = () if self.inputs is None else (self.inputs.signal(self.t0, self.end),)
-        return (*(item.signal for item in self.data if isinstance(item, ReferenceSignal)), *inputs)
 
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
         """Return where each mode begins and the last one ends, (..., N + 2), for values of `times` (..., N).
@@ -505,37 +520,6 @@ def _check_map(given: Any) -> Mapping[str, str]:
     return {
         as_name(here, "parameter_map", form): as_name(there, "parameter_map", form) for here, there in names.items()
     }
-
-
-def _check_data(data: Any) -> tuple[Data, ...]:
-    items = tuple(data) if isinstance(data, (list, tuple)) else (data,)
-    kinds = [f"sf.{kind.__name__}" for kind in get_args(Data)]
-    for item in items:
-        as_instance(item, "data", Data, f"{', '.join(kinds)} or a list of them")  # type: ignore[arg-type]
-    if not items:
-        raise ValueError("data is empty: an experiment needs at least one cost.")
-    return items
-
-
-def _check_jumps(given: Any) -> tuple[Jump, ...]:
-    """Return jumps as a tuple, checked."""
-    jumps = as_sequence((given,) if isinstance(given, Jump) else given, "jumps", "an sf.Jump or a sequence of them")
-    for jump in jumps:
-        as_instance(jump, "each of jumps", Jump, "an sf.Jump")
-    return tuple(jumps)
-
-
-def _find_span(data: tuple[Data, ...], missing: tuple[str, ...], t0: Any) -> tuple[float, float]:
-    """Return the first and the last time of the data, from which t0 or tf is taken where it is left out."""
-    sensors = [item for item in data if isinstance(item, Measurements)]
-    spans = [item.seen_times[[0, -1]] for item in sensors if len(item.times)]
-    spans += [item.signal.knots[[0, -1]] for item in data if isinstance(item, ReferenceSignal)]
-    if sensors and not spans and t0 is not None:  # of a stream
-        spans = [as_number(t0, "t0") + np.array([0.0, 1.0])]
-    if not spans:
-        kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
-        raise ValueError(f"{' and '.join(missing)} must be given, as nothing among the data ({kinds}) has times.")
-    return float(np.min(spans)), float(np.max(spans))
 
 
 def _require_single(time: Parameter, what: str) -> None:

@@ -221,7 +221,7 @@ class Function:
     def read(self) -> dict[str, tuple[int, ...]]:
         """Positions of the entries of each parameter that it may read."""
         variables = self.jaxpr.invars[len(self.jaxpr.invars) - len(self.parameters) :]
-        return {name: find_read_entries(self.jaxpr, v) for name, v in zip(self.parameters, variables, strict=True)}
+        return dict(zip(self.parameters, find_read_entries(self.jaxpr, variables), strict=True))
 
     @cached_property
     def takes_input(self) -> bool:

@@ -60,18 +60,17 @@ def find_unread(problem: Problem) -> Unread:
     ----------
     problem : Problem
     """
-    unknowns, texts = problem.unknowns, problem.unknowns.priors.texts()
-    here = find_targets(problem, problem.structures, library=False)
-    free = {name: range(span.start, span.stop) for name, span in unknowns.parameters.items()}
-    left = [name for name, span in free.items() if name not in here and not any(texts[i] for i in span)]
+    unknowns, here = problem.unknowns, find_targets(problem, problem.structures, library=False)
+    free, known = unknowns.parameters, unknowns.priors.precision > 0
+    left = [name for name, span in free.items() if name not in here and not known[span].any()]
     if not left:
         return Unread()
     try:
         elsewhere = find_targets(problem, _trace_libraries(problem), library=True)
     except ValueError:
         return Unread()
-    unread = tuple(unknowns.names[i] for name in left if name not in elsewhere for i in free[name])
-    return Unread(unread, tuple(unknowns.names[i] for name in left if name in elsewhere for i in free[name]))
+    unread = tuple(entry for name in left if name not in elsewhere for entry in unknowns.names[free[name]])
+    return Unread(unread, tuple(entry for name in left if name in elsewhere for entry in unknowns.names[free[name]]))
 
 
 def name_whole_parameters(entries: Iterable[str]) -> tuple[str, ...]:
@@ -115,7 +114,7 @@ def _trace_libraries(problem: Problem) -> list[Structure]:
     if problem.max_transitions is not None:
         return list(problem.structures)
     each = zip(problem.experiments, problem.structures, strict=True)
-    return [trace_structure(problem.system, run, problem._functions, problem.solver, own.N) for run, own in each]
+    return [trace_structure(problem._sources, run, own.N) for run, own in each]
 
 
 VERBS = {

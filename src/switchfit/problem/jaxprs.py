@@ -106,27 +106,27 @@ class Walk:
         return self.run(jaxpr, consts, given, origin if is_of_jax else None)
 
 
-def find_read_entries(jaxpr: Any, variable: Any) -> tuple[int, ...]:
-    """Return the positions in an argument of the entries that may be read: those that a jaxpr does more with than to
-    move them, and to leave them out of slices.
+def find_read_entries(jaxpr: Any, variables: Sequence[Any]) -> list[tuple[int, ...]]:
+    """Return the positions in some arguments of the entries that may be read: those that a jaxpr does more with than
+    to move them, and to leave them out of slices.
 
     Parameters
     ----------
     jaxpr : jaxpr
-    variable : one of its arguments
+    variables : sequence of its arguments
     """
-    held = {variable: np.arange(variable.aval.size).reshape(variable.aval.shape)}
-    read = set[int]()
+    held = {v: (k, np.arange(v.aval.size).reshape(v.aval.shape)) for k, v in enumerate(variables)}
+    read: list[set[int]] = [set() for _ in variables]
     for name, given, made, settings in (
         *((each.primitive.name, each.invars, each.outvars, each.params) for each in jaxpr.eqns),
         ("return", jaxpr.outvars, [], {}),
     ):
-        for entries in [held[atom] for atom in given if not hasattr(atom, "val") and atom in held]:
+        for k, entries in [held[atom] for atom in given if not hasattr(atom, "val") and atom in held]:
             if name in MOVES:
-                held[made[0]] = MOVES[name](entries, settings)
+                held[made[0]] = k, MOVES[name](entries, settings)
             else:
-                read.update(entries.ravel().tolist())
-    return tuple(sorted(read))
+                read[k].update(entries.ravel().tolist())
+    return [tuple(sorted(positions)) for positions in read]
 
 
 def find_line(equation: Any) -> str:
@@ -247,7 +247,8 @@ class _Constants(Walk):
 
     def _check_precision(self, equation: Any, origin: Any) -> None:
         """Raise ValueError if an operation computes in less than double precision."""
-        short = [variable.aval.dtype for variable in equation.outvars if _is_short(variable)]
+        kinds = (getattr(variable.aval, "dtype", np.float64) for variable in equation.outvars)
+        short = list(filter(is_low_precision, kinds))
         if short and equation.primitive.name not in KEEPING:
             raise ValueError(
                 f"{self._what} computes in {short[0]}{_locate(origin)}, and so loses half of all digits: its arguments "
@@ -273,10 +274,6 @@ def _locate(equation: Any) -> str:
     """Return the location of an operation as the end of a sentence, " (file.py:12)"; empty if it is unknown."""
     where = find_line(equation)
     return f" ({where})" if where else ""
-
-
-def _is_short(atom: Any) -> bool:
-    return is_low_precision(getattr(atom.aval, "dtype", np.float64))
 
 
 def _list_indices(equation: Any, given: list[Any]) -> Iterator[tuple[Any, int, int]]:

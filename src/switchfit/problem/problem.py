@@ -18,7 +18,7 @@ from switchfit.optimize import LinearConstraints
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
 from switchfit.problem.experiment import Experiment, drop_jumps, insert_jumps, name_runs, prefix_runs
 from switchfit.problem.parameter import Parameter, as_parameter, require_time_unit, unit_suffix
-from switchfit.problem.structure import Functions, Structure, choose_common_lengths, trace_structure
+from switchfit.problem.structure import Sources, Structure, choose_common_lengths, trace_structure
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.unknowns import Constraint, Unknowns, list_unknowns
 from switchfit.problem.validation import (
@@ -26,6 +26,7 @@ from switchfit.problem.validation import (
     as_choice,
     as_count,
     as_instance,
+    as_instances,
     as_name,
     as_not_negative,
     as_positive,
@@ -53,16 +54,6 @@ def check_durations(given: Any, system: HybridSystem) -> float | dict[str, float
         return as_not_negative(given, "min_duration")
     require_known(given, "min_duration", system.modes)
     return {mode: as_not_negative(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}
-
-
-def check_sequences(system: HybridSystem, experiments: tuple[Experiment, ...], max_transitions: int | None) -> None:
-    """Check the names of modes in mode sequences, and the number of transitions against `max_transitions`."""
-    for experiment in experiments:
-        require_known(experiment.mode_sequence, "mode_sequence", system.modes)
-    if max_transitions is not None:
-        longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
-        if max_transitions < longest:
-            raise ValueError(f"max_transitions is {max_transitions}, but a mode_sequence has {longest} transitions.")
 
 
 def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
@@ -109,10 +100,6 @@ T = TypeVar("T")
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
-
-SOLVERS = ("auto", "explicit", "stiff")
-
-ENGINES = ("auto", "native", "jax")
 
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
@@ -212,54 +199,60 @@ class Problem:
 
     def __post_init__(self) -> None:
         as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")
-        given = self.experiments
-        experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
-        if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-            raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shorten(given)}.")
-        most = None if self.max_transitions is None else as_count(self.max_transitions, "max_transitions")
-        set_fields(self, experiments=experiments, max_transitions=most)
-        check_sequences(self.system, experiments, most)
-        solver, engine = as_choice(self.solver, "solver", SOLVERS), as_choice(self.engine, "engine", ENGINES)
-        rtol, atol = as_positive(self.rtol, "rtol"), as_positive(self.atol, "atol")
-        set_fields(self, solver=solver, engine=engine, rtol=rtol, atol=atol)
+        experiments = as_instances(self.experiments, "experiments", Experiment, "an sf.Experiment")
+        if not experiments:
+            raise ValueError("experiments is empty: a problem needs at least one sf.Experiment.")
+        set_fields(
+            self,
+            parameters=check_parameters(self.parameters),
+            min_duration=check_durations(self.min_duration, self.system),
+            solver=as_choice(self.solver, "solver", ("auto", "explicit", "stiff")),
+            rtol=as_positive(self.rtol, "rtol"),
+            atol=as_positive(self.atol, "atol"),
+            engine=as_choice(self.engine, "engine", ("auto", "native", "jax")),
+            max_transitions=None if self.max_transitions is None else as_count(self.max_transitions, "max_transitions"),
+        )
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
-        parameters = check_parameters(self.parameters)
-        dwell = check_durations(self.min_duration, self.system)
-        set_fields(self, parameters=parameters, min_duration=dwell)
         for run in experiments:
-            check_names(run, parameters)
-        set_fields(self, unknowns=list_unknowns(self.system, experiments, parameters, dwell))
-        if not self.max_transitions:
-            require_unknowns(self)
-        self._check_noise()
+            check_names(run, self.parameters)
         states = [self.system.initial_state, *(run.initial_state for run in experiments)]
         sizes = {len(state) for state in states if state is not None and not callable(state)}
         if len(sizes) > 1:
             raise ValueError(f"initial_state must have as many entries in the system and all experiments; got {sizes}.")
-        set_fields(self, structures=self._trace_structures())
+        self._set_experiments(experiments)
         for structure in self.structures:
             self.system.check_labels_of(structure.n)
+        if not self.max_transitions:
+            require_unknowns(self)
+        self._check_noise()
+
+    def _set_experiments(self, experiments: tuple[Experiment, ...]) -> None:
+        """Set the experiments, the unknowns and the structures, once all else is set."""
+        most = self.max_transitions
+        for run in experiments:
+            require_known(run.mode_sequence, "mode_sequence", self.system.modes)
+            transitions = len(run.transition_times) + len(run.jump_times)
+            if most is not None and most < transitions:
+                raise ValueError(f"max_transitions is {most}, but a mode_sequence has {transitions} transitions.")
+        unknowns = list_unknowns(self.system, experiments, self.parameters, self.durations)
+        set_fields(self, experiments=experiments, unknowns=unknowns)
+        set_fields(self, structures=tuple(trace_structure(self._sources, run, most) for run in experiments))
 
     def _check_noise(self) -> None:
         """Raise ValueError if something is weighed against noise that is unknown."""
-        items = self.measurements
-        relative = self.unknowns.priors.any or any(item.sigma_names or item.loss != "linear" for item in items)
-        if relative and any(item.sigma is None for item in items):
+        relative = self.unknowns.priors.any or not self.is_least_squares
+        if relative and any(item.sigma is None for item in self.measurements):
             raise ValueError(
                 "sigma is left out in some Measurements, and something is weighed against the noise: a prior, a robust "
                 "loss, or other Measurements whose sigma is a parameter. Give sigma a number there, or the name of a "
                 "parameter to estimate it."
             )
 
-    def _trace_structures(self) -> tuple[Structure, ...]:
-        settings = self._functions, self.solver, self.max_transitions
-        return tuple(trace_structure(self.system, e, *settings) for e in self.experiments)
-
     @cached_property
-    def _functions(self) -> Functions:
-        """The functions that were traced, which problems with other sequences share."""
-        return Functions(self.parameters, {})
+    def _sources(self) -> Sources:
+        """What structures are traced from, with the functions that were traced; other sequences share it."""
+        return Sources(self.system, self.parameters, self.solver, {})
 
     def with_sequences(self, sequences: Sequence[Sequence[str]], transition_times: Sequence[ArrayLike]) -> Problem:
         """Return the problem with other mode sequences, which takes a fraction of the time of building it anew.
@@ -300,12 +293,8 @@ class Problem:
             for run, modes, times in given
         )
         changed: Problem = object.__new__(Problem)
-        set_fields(changed, **{name: getattr(self, name) for name in (*GIVEN, "_functions")})
-        set_fields(changed, experiments=experiments)
-        check_sequences(self.system, experiments, self.max_transitions)
-        unknowns = list_unknowns(self.system, experiments, dict(self.parameters), self.min_duration)
-        set_fields(changed, unknowns=unknowns)
-        set_fields(changed, structures=changed._trace_structures())
+        set_fields(changed, **{name: getattr(self, name) for name in (*GIVEN, "_sources")})
+        changed._set_experiments(experiments)
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
@@ -329,6 +318,12 @@ class Problem:
                     f"{', '.join(changed)} does something else in this process than when the problem was built: what "
                     "it reads has changed. Build the problem anew before it is sent to other processes."
                 )
+
+    @cached_property
+    def durations(self) -> dict[str, float]:
+        """The shortest time each mode of the system may last: `min_duration`, 0 for a mode that it leaves out."""
+        given = self.min_duration
+        return {mode: given.get(mode, 0.0) if isinstance(given, Mapping) else given for mode in self.system.modes}
 
     @property
     def measurements(self) -> tuple[Measurements, ...]:
@@ -467,10 +462,7 @@ class Problem:
         places, N = self.places[e], self.structures[e].N
         if self.one_to_one:
             return theta[:N], theta[N:]
-        where = places[:N]
-        if where.min(initial=0) >= 0:
-            return theta[where], theta[places[N:]]
-        tau = self.experiments[e].initial_times_with_jumps.copy()
+        tau, where = self.experiments[e].initial_times_with_jumps.copy(), places[:N]
         tau[where >= 0] = theta[where[where >= 0]]
         return tau, theta[places[N:]]
 
@@ -635,11 +627,11 @@ class Problem:
 
     def _split_parameters(self, theta: FloatArray) -> dict[str, FloatArray]:
         """Return all parameters by name, fixed ones included."""
-        parameters = {}
-        for name, parameter in self.parameters.items():
-            span = self.unknowns.parameters.get(name)
-            parameters[name] = parameter.value if span is None else theta[span].reshape(parameter.shape)
-        return parameters
+        spans = self.unknowns.parameters
+        return {
+            name: theta[spans[name]].reshape(q.shape) if name in spans else q.value
+            for name, q in self.parameters.items()
+        }
 
 
 def place_parameters(problem: Problem, e: int, structure: Structure) -> NDArray[np.intp]:
@@ -681,8 +673,7 @@ def require_estimable(problem: Problem) -> None:
 
 def require_samples(problem: Problem) -> None:
     """Raise ValueError if a sensor has no samples, as it may for an `OnlineEstimator`."""
-    names = name_runs(problem.experiments)
-    for name, run in zip(names, problem.experiments, strict=True):
+    for name, run in zip(problem.run_names, problem.experiments, strict=True):
         if not all(len(item.times) for item in run.measurements):
             raise ValueError(f"the Measurements of {name} have no samples: give times and values.")
 

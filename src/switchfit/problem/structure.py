@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise, product
 from typing import Any, Literal, NamedTuple
 
@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.problem.data import (
-    FloatArray,
     Measurements,
     ReferenceSignal,
     RunningCost,
@@ -72,12 +71,6 @@ class Sensor(NamedTuple):
     loss: str
     loss_scale: float
     delay: str | None  # the parameter that is the delay; None if it is a number, which is subtracted from the times
-
-    @classmethod
-    def of(cls, item: Measurements, observe: Function | None) -> Sensor:
-        """Return the sensor of one of the data."""
-        delay = item.delay if isinstance(item.delay, str) else None
-        return cls(observe, item.values.shape[1], item.sigma_names, item.loss, item.loss_scale, delay)
 
     @property
     def named(self) -> set[str]:
@@ -225,16 +218,13 @@ class Structure:
         at_transitions = self.transition_cost_library or self.guard_library
         return not (self.running or self.terminal or self.terminal_constraints or at_transitions)
 
-    @property
-    def constrained(self) -> bool:
-        """Whether it has guards or terminal constraints."""
-        return bool(self.guarded or self.terminal_constraints)
 
+class Sources(NamedTuple):
+    """What a problem has for all its structures, and the functions that were traced, each of them once."""
 
-class Functions(NamedTuple):
-    """The parameters of a problem, and the functions of its experiments that were traced, each of them once."""
-
+    system: HybridSystem
     parameters: Mapping[str, Parameter]
+    solver: Literal["auto", "explicit", "stiff"]
     traced: dict[Any, Function]
 
 
@@ -247,15 +237,15 @@ class _Tracer:
     read : dict of str to the positions of the entries that are read
     """
 
-    def __init__(self, functions: Functions, experiment: Experiment) -> None:
-        parameters, mapped = functions.parameters, experiment.parameter_map
+    def __init__(self, sources: Sources, experiment: Experiment) -> None:
+        parameters, mapped = sources.parameters, experiment.parameter_map
         order = {name: k for k, name in enumerate(parameters)}
         # The same order for every map, so that runs share a program.
         names = sorted({*parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
         self.named = {name: parameters[mapped.get(name, name)] for name in names}
         self.shapes = {name: q.shape for name, q in self.named.items()}
         self.read: dict[str, set[int]] = {}
-        self._traced, self._key = functions.traced, tuple(self.shapes.items())
+        self._traced, self._key = sources.traced, tuple(self.shapes.items())
 
     def __call__(self, *given: Any) -> Function:
         """Trace a function, given what a `Call` consists of."""
@@ -269,13 +259,7 @@ class _Tracer:
         return traced
 
 
-def trace_structure(
-    system: HybridSystem,
-    experiment: Experiment,
-    functions: Functions,
-    solver: Literal["auto", "explicit", "stiff"],
-    transitions: int | None = None,
-) -> Structure:
+def trace_structure(sources: Sources, experiment: Experiment, transitions: int | None = None) -> Structure:
     """Trace and check the functions of one experiment, and return its structure.
 
     All modes take implicit steps if the solver is "stiff", else all take explicit ones.
@@ -287,11 +271,14 @@ def trace_structure(
     ValueError
         With the name of the mode or function, what it should return and what it returned.
     """
-    trace = _Tracer(functions, experiment)
+    trace, system = _Tracer(sources, experiment), sources.system
     used = system.modes if transitions is not None else set(experiment.mode_sequence)
     names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
     x0, n, unknown = _trace_initial_state(trace, initial_state_of(system, experiment))
-    items = partial(select_kind, experiment.data)
+
+    def items(kind: type) -> list[Any]:
+        return [item for item in experiment.data if isinstance(item, kind)]
+
     at: tuple[Shape | None, ...] = ((), (n,), None)
     inputs = None if experiment.inputs is None else experiment.inputs.shape
     input_names = () if experiment.inputs is None else experiment.inputs.names
@@ -318,8 +305,7 @@ def trace_structure(
     after_jumps = (own_modes[i] for i in experiment.passed_by_jumps)  # the mode before it
     sequence = (own_modes[0], *insert_jumps(experiment, own_modes[1:], after_jumps))
     jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for _, jump in experiment.acts]
-    references = ((item, item.signal.channels) for item in items(ReferenceSignal))
-    measurements = ((item, item.values.shape[1]) for item in items(Measurements))
+    references = ((item, item.signal.channels) for item in experiment.references)
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)", jump_maps)
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
     costs = _choose_transition_costs(items(TransitionCost), names)
@@ -335,12 +321,12 @@ def trace_structure(
         parameters=(),
         running=tuple(trace(item.ell, at, (), "RunningCost", "ell(t, x, p)") for item in items(RunningCost)),
         references=tuple((_trace_observe(trace, item, q, n), q) for item, q in references),
-        measurements=tuple(Sensor.of(item, _trace_observe(trace, item, q, n)) for item, q in measurements),
+        measurements=tuple(_trace_sensor(trace, item, n) for item in experiment.measurements),
         terminal=tuple(trace(item.phi, at[1:], (), "TerminalCost", "phi(x, p)") for item in items(TerminalCost)),
         guards=guards,
         terminal_constraints=tuple(_trace_terminal_constraint(trace, item, n) for item in items(TerminalConstraint)),
         input_shape=inputs,
-        implicit=(solver == "stiff",) * len(modes),
+        implicit=(sources.solver == "stiff",) * len(modes),
         transitions=len(reset_maps) if transitions is None else transitions + len(end),
         reset_library=reset_library,
         guard_library=guard_library,
@@ -374,6 +360,13 @@ def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channel
     return None
 
 
+def _trace_sensor(trace: _Tracer, item: Measurements, n: int) -> Sensor:
+    """Return the part of Measurements on which programs depend."""
+    channels, delay = item.values.shape[1], item.delay if isinstance(item.delay, str) else None
+    observe = _trace_observe(trace, item, channels, n)
+    return Sensor(observe, channels, item.sigma_names, item.loss, item.loss_scale, delay)
+
+
 def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int) -> Function:
     """Return the function psi(x, p) of a terminal constraint, which returns a number or (m,)."""
     psi = trace(item.psi, ((n,), None), None, "TerminalConstraint", "psi(x, p)")
@@ -403,13 +396,3 @@ def _choose_transition_costs(items: list[TransitionCost], modes: tuple[str, ...]
         if here:
             found[before, after] = here[0]
     return found
-
-
-def read_initial_values(initial: Any) -> FloatArray:
-    """Return an initial state that is not a function as numbers (n,), with guesses for unknown entries."""
-    return np.array([x.value if isinstance(x, Parameter) else x for x in initial], dtype=np.float64)
-
-
-def select_kind(data: tuple[Any, ...], kind: type) -> list[Any]:
-    """Return the items of an experiment's data that are of a kind, in order."""
-    return [item for item in data if isinstance(item, kind)]

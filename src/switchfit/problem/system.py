@@ -103,8 +103,7 @@ class HybridSystem:
         set_fields(self, modes=MappingProxyType(dict(self.modes)))
         for name in ("reset_maps", "guards"):
             set_fields(self, **{name: MappingProxyType(_check_pairs(getattr(self, name), name, self.modes))})
-        if not callable(self.initial_state):
-            set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
+        set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
         for label in ("state_names", "state_units"):
             set_fields(self, **{label: as_labels(getattr(self, label), label, "state")})
         if not callable(self.initial_state):
@@ -129,14 +128,18 @@ class HybridSystem:
                 raise ValueError(f"{label} must have one entry for each of the {n} states; got {shorten(labels)}.")
 
 
-def as_state(value: Any, name: str) -> NDArray[np.float64] | tuple[Parameter, ...]:
+def as_state(value: Any, name: str) -> Callable[..., Any] | NDArray[np.float64] | tuple[Parameter, ...]:
     """Return `value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` if it contains any.
+
+    A function is returned as it is.
 
     Raises
     ------
     ValueError
         With `name` in the message.
     """
+    if callable(value):
+        return value
     if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
         form = "a number or an sf.Parameter"
         entries = tuple(as_parameter(entry, f"each entry of {name}", form, fixed=True) for entry in value)

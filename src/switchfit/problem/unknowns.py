@@ -238,8 +238,8 @@ class Unknowns:
 def list_unknowns(
     system: HybridSystem,
     experiments: tuple[Experiment, ...],
-    parameters: dict[str, Parameter],
-    durations: float | Mapping[str, float],
+    parameters: Mapping[str, Parameter],
+    durations: Mapping[str, float],
 ) -> Unknowns:
     """Return the unknowns of a problem in their order, with bounds, priors, scales and the order of times.
 
@@ -247,9 +247,9 @@ def list_unknowns(
     ----------
     system : HybridSystem
     experiments : tuple of Experiment
-    parameters : dict of str to Parameter
-    durations : float or mapping of str to float
-        Shortest time a mode may last.
+    parameters : mapping of str to Parameter
+    durations : mapping of str to float
+        Shortest time each mode may last.
     """
     names: list[str] = []
     units: list[str] = []
@@ -296,28 +296,17 @@ def list_unknowns(
     return Unknowns(tuple(names), tuple(units), value, lower, upper, *places, A, b, rows, priors, log, starts)
 
 
-def get_min_duration(min_duration: float | Mapping[str, float], mode: str) -> float:
-    """Return the shortest duration of a mode, given that of a problem.
-
-    Parameters
-    ----------
-    min_duration : float or mapping of str to float
-    mode : str
-    """
-    return float(min_duration.get(mode, 0.0)) if isinstance(min_duration, Mapping) else min_duration
-
-
 def _build_ordering(
-    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, durations: float | Mapping[str, float]
+    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, durations: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
     rows, bounds, constraints = [], [], []
     labels, units = name_runs(experiments), {experiment.time_unit for experiment in experiments}
     is_log = any(tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times)
-    if (is_log or len(units) > 1) and (any(durations.values()) if isinstance(durations, Mapping) else durations):
+    if (is_log or len(units) > 1) and any(durations.values()):
         raise ValueError(
             "min_duration must be 0 where transition times are on a logarithmic scale, or in different units "
-            f"({join_names(sorted(units))}); got {durations}."
+            f"({join_names(sorted(units))}); got {max(durations.values())}."
         )
     unit_rows = np.eye(d + 1, d)  # the last one, of times that are fixed, is zero
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
@@ -326,7 +315,7 @@ def _build_ordering(
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
         known = np.where(ends < 0, knots, 0.0)
         for i, mode in enumerate(experiment.mode_sequence):
-            dwell, unit = get_min_duration(durations, mode), unit_suffix(experiment.time_unit)
+            dwell, unit = durations[mode], unit_suffix(experiment.time_unit)
             length = knots[i + 1] - knots[i]
             if length < dwell * (1 - 1e-12):
                 raise ValueError(

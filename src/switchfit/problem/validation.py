@@ -478,6 +478,13 @@ def as_instance(value: Any, what: str, kind: type[T], form: str) -> T:
     return value
 
 
+def as_instances(value: Any, what: str, kind: type[T], form: str) -> tuple[T, ...]:
+    """Return an instance of `kind`, or a sequence of them, as a tuple; messages use `form` as the name of one."""
+    form = f"{form} or a list of them"
+    items = (value,) if isinstance(value, kind) else as_sequence(value, what, form)
+    return tuple(as_instance(item, what, kind, form) for item in items)
+
+
 def as_callable(value: Any, what: str, form: str, *, arguments: int | None = None) -> Callable[..., Any]:
     """Return a function, which must not be a class; messages use `form` as its name.
 

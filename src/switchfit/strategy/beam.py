@@ -52,8 +52,6 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter, PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
-from switchfit.problem.structure import select_kind
-from switchfit.problem.unknowns import get_min_duration
 from switchfit.strategy.library import (
     PER_SEQUENCE,
     Children,
@@ -75,15 +73,14 @@ INTERVALS = 60
 def choose_grid(run: Experiment) -> float:
     """Return the time between births: that between samples, but at most `INTERVALS` in the horizon."""
     shortest = (run.end - run.t0) / INTERVALS
-    gaps = [np.diff(item.times) for item in select_kind(run.data, Measurements)]
+    gaps = [np.diff(item.times) for item in run.measurements]
     usual = [float(np.median(gap)) for gap in gaps if len(gap)]
     return max([shortest, *([min(usual)] if usual else [])])
 
 
 def list_sample_times(run: Experiment) -> FloatArray:
     """Return the times at which something is measured: (K,), ascending."""
-    measured = select_kind(run.data, Measurements)
-    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in measured]
+    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in run.measurements]
     return np.unique(np.concatenate([np.zeros(0), *times]))
 
 
@@ -223,7 +220,7 @@ def follow_order(
     """
     found, run = prepare(problem, e), problem.experiments[e]
     modes = np.array([found.modes.index(mode) for mode in run.mode_sequence])
-    shortest = np.array([get_min_duration(problem.min_duration, mode) for mode in run.mode_sequence])
+    shortest = np.array([problem.durations[mode] for mode in run.mode_sequence])
     reach = np.array([[-found.grid], [found.grid]])  # a birth moves by up to the grid
     rules = Rules.of_order(modes, shortest, found.limits[: len(modes) - 1].T + reach)
     return found.run(rules, parameters, 0.0, PER_SEQUENCE * len(modes), replays, evidence)
@@ -331,9 +328,8 @@ class Beam:
         self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
         self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
-        measured = select_kind(run.data, Measurements)
-        is_unknown = any(item.sigma is None for item in measured)
-        self.counts = count_values(measured, mesh.times) if is_unknown else None
+        is_unknown = any(item.sigma is None for item in run.measurements)
+        self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
         self.noise = assume_noise(problem)  # that of all runs
         guards = (self.noise / (GUARD_SD * self.grid)) ** 2
         self.tolerances = Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)

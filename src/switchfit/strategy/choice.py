@@ -20,7 +20,7 @@ from switchfit.fit.evaluator import measure_variation
 from switchfit.fit.result import Step
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray, ReferenceSignal
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
@@ -124,7 +124,7 @@ def is_explained(problem: Problem, cost: float, least: float = UNLIKELY) -> bool
         return cost <= (1 - NEARLY_ALL) * float(measure_variation(problem).sum())
     if not (problem.is_sigma_known and problem.is_least_squares):
         return False
-    count = sum(item.count for item in items if isinstance(item, Measurements))
+    count = sum(item.count for item in problem.measurements)
     freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
     return freedom > 0 and bool(compare_with_sigma(2 * cost, freedom)[0] >= least)
 

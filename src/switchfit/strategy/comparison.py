@@ -28,11 +28,10 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray, Measurements, robust
+from switchfit.problem.data import FloatArray, robust
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import select_kind
-from switchfit.problem.validation import as_instance, as_labels, as_sequence
+from switchfit.problem.validation import as_instances, as_labels
 from switchfit.runtime import special
 from switchfit.runtime.presentation import Displayed, format_line, join_first
 
@@ -223,9 +222,7 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
     >>> table.best, table.delta_bic.round(1).tolist()
     ('on, off', [8476.6, 0.0])
     """
-    fits = list(as_sequence(estimates, "estimates", "a sequence of results of sf.estimate"))
-    for fit in fits:
-        as_instance(fit, "each of estimates", Estimate, "a result of sf.estimate")
+    fits = list(as_instances(estimates, "estimates", Estimate, "a result of sf.estimate"))
     if len(fits) < 2:
         raise ValueError(f"compare needs two estimates or more; got {len(fits)}.")
     labels = as_labels(names, "names", "estimate", len(fits)) or tuple(f"model{k + 1}" for k in range(len(fits)))
@@ -269,7 +266,7 @@ def find_difference(first: Problem, second: Problem) -> str:
         return f"{len(runs[0])} and {len(runs[1])} experiments"
     for label, *pair in zip(name_runs(runs[0]), *runs, strict=True):
         where = "" if len(runs[0]) == 1 else f" of {label}"
-        items = [select_kind(run.data, Measurements) for run in pair]
+        items = [run.measurements for run in pair]
         if len(items[0]) != len(items[1]):
             return f"{len(items[0])} and {len(items[1])} Measurements{where}"
         for a, b in zip(*items, strict=True):

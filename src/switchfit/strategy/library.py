@@ -20,8 +20,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import FloatArray, TerminalConstraint, TransitionCost
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, check_durations
-from switchfit.problem.structure import Function, Structure, select_kind, trace_structure
-from switchfit.problem.unknowns import get_min_duration
+from switchfit.problem.structure import Function, Structure, trace_structure
 from switchfit.problem.validation import as_count, as_name, as_names, join_names, require_known, shorten
 
 
@@ -159,7 +158,7 @@ def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[st
 
 def _read_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dict[str, float]:
     """Return the shortest duration of each mode; that of the problem where it is left out."""
-    found = {name: get_min_duration(problem.min_duration, name) for name in names}
+    found = {name: problem.durations[name] for name in names}
     if given is not None:
         asked = check_durations(given, problem.system)
         found |= {name: asked.get(name, found[name]) if isinstance(asked, dict) else asked for name in names}
@@ -176,7 +175,9 @@ def refuse_unsupported(problem: Problem, e: int) -> None:
     wrong = {
         "a free tf: give tf a number": run.has_free_tf,
         "a delay that is a parameter: give it a number": problem.estimates_delays,
-        "terminal constraints: leave them out of the search": bool(select_kind(run.data, TerminalConstraint)),
+        "terminal constraints: leave them out of the search": any(
+            isinstance(item, TerminalConstraint) for item in run.data
+        ),
     }
     for what, is_there in wrong.items():
         if is_there:
@@ -191,7 +192,7 @@ def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -
     if not (has_cost or pair in problem.system.reset_maps or pair in problem.system.guards):
         return None, None, None
     alone = replace(run, mode_sequence=pair, transition_times=None, jumps=())
-    found = trace_structure(problem.system, alone, problem._functions, problem.solver, 1)
+    found = trace_structure(problem._sources, alone, 1)
     return found.reset_maps[0], found.transition_costs[0], found.guards[0]
 
 
@@ -209,7 +210,7 @@ def trace_transitions(problem: Problem, e: int, library: Library | None, births:
     else:
         pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
         steps = [(pair, (modes.index(pair[0]), modes.index(pair[1]))) for pair in pairs]
-    structure = trace_structure(problem.system, run, problem._functions, problem.solver, births)
+    structure = trace_structure(problem._sources, run, births)
     known: list[list[Any]] = [list(dict.fromkeys(structure.reset_maps[i] for i in structure.jumps)), [], []]
     size = max(len(modes), *(1 + max(place) for _, place in steps), 1)
     tables = np.full((3, size, size), -1, dtype=np.int64)

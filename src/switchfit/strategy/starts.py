@@ -35,7 +35,6 @@ from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import get_min_duration
 from switchfit.runtime.errors import HiddenSwitchError
 from switchfit.runtime.progress import show_detail
 
@@ -178,7 +177,7 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         # Those of the modes may differ; what this leaves infeasible is moved to the nearest feasible point.
-        shortest = min(get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence)
+        shortest = min(problem.durations[mode] for mode in experiment.mode_sequence)
         for begin, end, group in _list_stretches(experiment, where):
             # Sorted uniform numbers are uniform over all ordered times; minimum durations are added to their gaps.
             room = end - begin - (len(group) + 1) * shortest

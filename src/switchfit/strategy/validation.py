@@ -43,7 +43,6 @@ from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment, show_time
 from switchfit.problem.parameter import PriorTerms
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import as_level, as_names, join_names, list_columns, shorten
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
@@ -101,7 +100,7 @@ def build_other_problem(estimate: Estimate, other: Any) -> Problem:
 def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Experiment:
     """Return the only experiment of a fit with the data of another log."""
     run, given = problem.experiments[0], list(other) if isinstance(other, (list, tuple)) else [other]
-    items = select_kind(run.data, Measurements)
+    items = run.measurements
     is_log = list_columns(other) is not None and hasattr(other, "times")
     if not is_log and not (given and all(isinstance(item, Measurements) for item in given)):
         raise TypeError(

@@ -47,7 +47,6 @@ from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import get_min_duration
 from switchfit.problem.validation import as_callable, as_flag, as_instance, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
@@ -92,7 +91,7 @@ def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
     low, high = unknowns.lower.copy(), unknowns.upper.copy()
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         times, places = experiment.initial_times, where.tolist()
-        gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
+        gaps = [problem.durations[mode] for mode in experiment.mode_sequence]  # before each time
         latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
         for i in reversed(range(len(places))):
             latest = min(latest, times[i] if places[i] < 0 else high[places[i]])

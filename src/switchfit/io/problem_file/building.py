@@ -5,7 +5,6 @@ What it names in Python is loaded: the model, observations, jumps. Its files are
 
 from __future__ import annotations
 
-import functools
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -318,7 +317,8 @@ class _Run:
             raise ValueError("observe names states, but the model has no state_names; add them to it.")
         if unknown := [name for name in table.observe if name not in states]:
             raise ValueError(f"observe names the unknown state {unknown[0]!r}; the states are {', '.join(states)}.")
-        return select_states(tuple(map(states.index, table.observe)))
+        picked = np.array([states.index(name) for name in table.observe])
+        return lambda t, x, p: x[picked]
 
     def _build_data(self, place: str, item: DataTable, log: Log) -> Measurements | ReferenceSignal:
         observe = self._build_observe(place, item)
@@ -376,20 +376,3 @@ def build_parameters(path: Path, contents: Contents) -> dict[str, Parameter]:
     """
     given = contents.parameters.items()
     return {name: build_at(f"{path}: parameters.{name}", build_parameter, table) for name, table in given}
-
-
-@functools.cache
-def select_states(indices: tuple[int, ...]) -> Callable[..., Any]:
-    """Return the observation ``h(t, x, p) = x[indices]``, cached by indices so that it compiles once.
-
-    Parameters
-    ----------
-    indices : tuple of int
-        Positions in the state.
-    """
-    picked = np.array(indices)
-
-    def observe(t: Any, x: Any, p: Any) -> Any:
-        return x[picked]
-
-    return observe

@@ -69,7 +69,7 @@ def _place_window(log: Log, table: LogTable, run: ExperimentTable) -> tuple[list
         other = "numbers" if log.dates is None else "dates, of which the window has one"
         raise ValueError(f"window = [{ends[0]}, {ends[1]}] has dates, and {log.source} has {other}. Give both alike.")
     zone = run.time_zone or log.time_zone
-    dates = log.dates.localize(zone, log.source) if zone else log.dates
+    dates = log.dates.localize(zone, log.source)
     origin = make_origin(dates.instants[0], zone)
     limits = [float(origin.to_numbers(as_date(end, "window"), "s", "window")) for end in ends]
     return limits, origin.to_numbers(log.dates, "s", log.source)

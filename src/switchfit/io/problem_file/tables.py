@@ -71,20 +71,19 @@ def _check_time(given: Any) -> Any:
     raise PydanticCustomError("time_type", f"Input should be a number or a date such as {EXAMPLES}")
 
 
-def _wrap_value(given: Any) -> Any:
-    """Return ``{ value = 0.8 }`` for ``0.8``, the guess of an unknown."""
-    return given if isinstance(given, dict) else {"value": given}
+def _wrap(key: str, **more: Any) -> BeforeValidator:
+    """Return a validator that makes a table with one key, and more, of anything that is no table."""
+    return BeforeValidator(lambda given: given if isinstance(given, dict) else {key: given, **more})
 
 
-def _wrap_known(given: Any) -> Any:
-    """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0, or tf, that is no table is known."""
-    return given if isinstance(given, dict) else {"value": given, "fixed": True}
+GUESS = _wrap("value")
+"""``0.8``, the guess of an unknown, becomes ``{ value = 0.8 }``."""
 
+KNOWN = _wrap("value", fixed=True)
+"""``0.5``, a state at t0 or tf, becomes ``{ value = 0.5, fixed = true }``."""
 
-def _wrap_name(given: Any) -> Any:
-    """Return ``{ name = "skid_steer" }`` for ``"skid_steer"``, a model without arguments."""
-    return given if isinstance(given, dict) else {"name": given}
-
+NAMED = _wrap("name")
+"""``"skid_steer"``, a model without arguments, becomes ``{ name = "skid_steer" }``."""
 
 ENTRY = BeforeValidator(lambda given: given if isinstance(given, list) else [given])
 """A list; a single entry becomes a list of one."""
@@ -237,7 +236,7 @@ class JumpTable(Table):
 
     time: Annotated[list[Time], ENTRY]
     """when, in the experiment's time_unit or as a date: one time, or several"""
-    map: Annotated[ModelTable, BeforeValidator(_wrap_name)]
+    map: Annotated[ModelTable, NAMED]
     """'file.py:function' with map(t, x, p), which returns the state just after; or a table with the name and arguments
     of a function that returns such a map"""
 
@@ -248,7 +247,7 @@ class ExperimentTable(Table):
     mode_sequence: Names | None = None
     """names of the modes in the order of their activity; left out, switchfit modes finds it, for which there must be
     [library]"""
-    transition_times: list[Annotated[TransitionTable, BeforeValidator(_wrap_value)]] | None = None
+    transition_times: list[Annotated[TransitionTable, GUESS]] | None = None
     """first guess of each transition time, in time_unit or as a date, one fewer than modes; if left out, all of the log
     is searched"""
     time_unit: str = Field(default="s", min_length=1)
@@ -261,10 +260,10 @@ class ExperimentTable(Table):
     """data to which the model is fitted; the costs of several tables are added"""
     t0: Time = None
     """start of the horizon, a number or a date; left out, the first sample"""
-    tf: Annotated[TransitionTable, BeforeValidator(_wrap_known)] | None = None
+    tf: Annotated[TransitionTable, KNOWN] | None = None
     """end of the horizon; left out, the last sample. A number or a date, or a table with value, lower and upper if it
     is to be estimated"""
-    initial_state: list[Annotated[StateTable, BeforeValidator(_wrap_known)]] | None = None
+    initial_state: list[Annotated[StateTable, KNOWN]] | None = None
     """state at t0, instead of the model's: a number, or a table if it is to be estimated"""
     parameter_map: dict[str, str] = {}
     """the model's name of a parameter = the name under [parameters] that this run uses for it"""
@@ -354,11 +353,11 @@ class OptionsTable(Table):
 class Contents(Table):
     """The whole file: a model with parameters and experiments, or a problem built in Python."""
 
-    model: Annotated[ModelTable, BeforeValidator(_wrap_name)] | None = None
+    model: Annotated[ModelTable, NAMED] | None = None
     """a built-in model, or 'file.py:object', or a table with name and arguments"""
-    problem: Annotated[ModelTable, BeforeValidator(_wrap_name)] | None = None
+    problem: Annotated[ModelTable, NAMED] | None = None
     """'file.py:object' with an sf.Problem or a function making one, instead of all the rest"""
-    parameters: dict[str, Annotated[ParameterTable, BeforeValidator(_wrap_value)]] = {}
+    parameters: dict[str, Annotated[ParameterTable, GUESS]] = {}
     """the model's parameters"""
     experiments: Annotated[list[ExperimentTable], ENTRY] = []
     """the runs"""
