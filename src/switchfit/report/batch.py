@@ -293,10 +293,7 @@ def plot_starts(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
     study : Multistart
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
-
-
-def _draw_waterfall(study: Multistart, ax: Axes) -> None:
+    drawn, ax = style.open_axes(ax, (7.0, 3.6))
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
     costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
     floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding
@@ -318,3 +315,4 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> None:
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")
     ax.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    return style.turn_off_formulas(drawn)

@@ -318,25 +318,14 @@ _JUMPS = "the profile jumps at {}: the other unknowns have several minima, and t
 
 @draw_figure.register(Profile)
 def plot_profile(profile: Profile, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw a profile with its thresholds and interval, and the quadratic approximation.
+    """Draw the likelihood ratio against the value, with the thresholds, the interval, and the quadratic approximation.
 
     Parameters
     ----------
     profile : Profile
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, partial(draw_profile, profile))
-
-
-def draw_profile(profile: Profile, ax: Axes) -> None:
-    """Draw the likelihood ratio against the value, with the thresholds, the interval, and the quadratic approximation.
-
-    Parameters
-    ----------
-    profile : Profile
-    ax : matplotlib.axes.Axes
-    """
-    regions = profile.regions()
+    (drawn, ax), regions = style.open_axes(ax), profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
     near = np.flatnonzero(ratio <= top)
@@ -370,6 +359,7 @@ def draw_profile(profile: Profile, ax: Axes) -> None:
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
     ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
+    return style.turn_off_formulas(drawn)
 
 
 @draw_figure.register(ResidualDiagnostics)

@@ -11,9 +11,6 @@ them, and those of axes.
 
 from __future__ import annotations
 
-import base64
-import gzip
-import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -26,14 +23,13 @@ from bokeh.embed import json_item
 from bokeh.layouts import column
 from bokeh.plotting import figure
 from bokeh.resources import Resources
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 
 from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report import text
+from switchfit.report import sentences, text, uncertainty
 from switchfit.report.formats import Timed, describe_clock, format_span, label_quantity, label_time
+from switchfit.report.html import embed_figure
 from switchfit.report.html.curves import (
     Columns,
     Curves,
@@ -46,8 +42,7 @@ from switchfit.report.html.curves import (
     list_transitions,
 )
 from switchfit.report.plot import choose_mode_colours, find_plane
-from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
-from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
+from switchfit.report.sentences import format_share
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.residuals import explain_worst, rank_runs
 from switchfit.uncertainty.verdict import find_issues
@@ -250,8 +245,6 @@ MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
 MOST_CHANNELS = 6
 """Channels of a run that are shown at first; the others are switched on."""
-MOST_DIAGNOSED = 2
-"""Channels whose residuals have figures."""
 MARGIN = 0.01
 """Part of the horizon that is shown before and after it."""
 MOST_SLIDERS = 24
@@ -273,34 +266,18 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    functions: list[Any] = [certify, find_issues, format_span, join_words, list_reasons, unit_suffix]
-    functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
+    functions = (certify, embed_figure, find_issues, format_span, unit_suffix)
     environment.globals |= {function.__name__: function for function in functions}
+    environment.globals |= {"sentences": sentences, "text": text, "uncertainty": uncertainty}
     runs, payload = _prepare_figures(estimate)
-    payload["drawings"] = drawings = {}
-    if estimate.residuals.channels:
-        drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
-    if any(record.optimality > 0 for record in estimate.history):
-        drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
-    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
+    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
-    content |= {"sliders": payload["sliders"], "sliders_cut": cut, "drawings": drawings, "library": library}
+    content |= {"sliders": payload["sliders"], "sliders_cut": cut, "library": library}
     content |= {"correlated": [estimate.theta_names[i] for i in known]}
     content |= {"correlation": estimate.correlation[np.ix_(known, known)]}
     return environment.get_template("report.html").render(content, payload=_write_json(payload))
-
-
-def _compress_svg(figure: Figure) -> str:
-    """Return a figure as SVG, compressed and in base64: a tenth of its size."""
-    figure.set_layout_engine(None)  # which draws everything twice more
-    height = figure.get_figheight()
-    figure.subplots_adjust(left=0.11, right=0.98, bottom=0.55 / height, top=1 - 0.4 / height)
-    drawn = io.BytesIO()
-    with rc_context({"svg.fonttype": "none"}):
-        figure.savefig(drawn, format="svg", transparent=True)
-    return base64.b64encode(gzip.compress(drawn.getvalue())).decode()
 
 
 def _write_json(value: Any) -> str:
