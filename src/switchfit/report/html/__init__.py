@@ -47,6 +47,7 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem())
 
 
+@format_html.register(Problem)
 @format_html.register(Prediction)
 @format_html.register(Displayed)
 def show_result(result: Any) -> str:
@@ -63,7 +64,8 @@ def show_result(result: Any) -> str:
     if hasattr(result, "plot") and not is_empty and size <= LARGEST_FIGURE:
         source = embed_figure(result.plot(), dpi=DOTS)
         image = f'<img alt="the figure of the result" style="background: white" src="{source}">'
-    return f"<div><pre>{escape(str(result))}</pre>{image}</div>"
+    text = repr(result) if is_forecast else format_text(result)
+    return f"<div><pre>{escape(text)}</pre>{image}</div>"
 
 
 def embed_figure(figure: Figure, **settings: Any) -> str:
@@ -78,14 +80,3 @@ def embed_figure(figure: Figure, **settings: Any) -> str:
     picture = io.BytesIO()
     figure.savefig(picture, format="png", **settings)
     return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"
-
-
-@format_html.register(Problem)
-def show_problem(problem: Problem) -> str:
-    """Return the experiments, and the unknowns with their first guesses and bounds.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    return f"<div><pre>{escape(format_text(problem))}</pre></div>"
