@@ -66,7 +66,7 @@ def _count_minima(study: Multistart) -> int:
 
 
 @singledispatch
-def tabulate_study(study: Fits) -> tuple[Table, str]:
+def tabulate_study(fits: Fits) -> tuple[Table, str]:
     """Return the table of many fits, and what it leaves out; the table is empty where too few converged.
 
     A row for each fit: level, cost, and the unknowns with their standard errors; of many, the worst first. Bootstraps
@@ -74,9 +74,8 @@ def tabulate_study(study: Fits) -> tuple[Table, str]:
 
     Parameters
     ----------
-    study : Fits
+    fits : Fits
     """
-    fits = study
     listed, notes = range(len(fits)), []
     if len(fits) > LISTED_FITS:
         listed = fits.worst_first[:LISTED_WORST].tolist()
@@ -183,7 +182,7 @@ def plot_fits(fits: Fits) -> Figure:
         width, height, most = 2.9, 0.9 + 0.2 * max(len(order), 5), DRAWN_UNKNOWNS
         shown = select_unknowns(fits, DRAWN_UNKNOWNS)
     if isinstance(fits, MonteCarlo | Bootstrap) and fits.success.sum() < 2:
-        draw = _say_too_few
+        shown, title = [], TOO_FEW
     columns = max(min(len(shown), most), 1)
     rows = max(-(-len(shown) // columns), 1)
     figure = style.make_figure(width * columns + 0.5, height * rows + 0.5)
@@ -256,11 +255,6 @@ def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> None:
         normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)
         ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
     ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
-
-
-def _say_too_few(study: Fits, k: int, ax: Axes) -> None:
-    ax.set_title(TOO_FEW, fontsize=SMALL, wrap=True)
-    ax.set_axis_off()
 
 
 def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> None:
