@@ -14,7 +14,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num, nu
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
-from matplotlib.ticker import Formatter, Locator
+from matplotlib.ticker import Locator
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
@@ -132,7 +132,7 @@ class DateLocator(Locator):
         return ((np.asarray(ticks) - self.start) / self.length).tolist()
 
 
-class DateFormatter(Formatter):
+class DateFormatter(ConciseDateFormatter):
     """Dates as short as their neighbours allow.
 
     Parameters
@@ -141,19 +141,13 @@ class DateFormatter(Formatter):
     """
 
     def __init__(self, locator: DateLocator) -> None:
+        super().__init__(locator.dates, locator.zone, FORMATS, OFFSETS, ZERO_FORMATS)
         self.locator = locator
-        self.dates = ConciseDateFormatter(
-            locator.dates, tz=locator.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
-        )
 
-    def __call__(self, x: float, pos: int | None = None) -> str:
-        """Return the label of one tick, or of a place under the pointer."""
-        return num2date(float(self.locator.to_days([x])[0]), tz=self.locator.zone).strftime("%Y-%m-%d %H:%M:%S")
+    def format_data_short(self, value: float) -> str:
+        """Return the label of a place under the pointer."""
+        return num2date(float(self.locator.to_days([value])[0]), tz=self.locator.zone).strftime("%Y-%m-%d %H:%M:%S")
 
     def format_ticks(self, values: Sequence[float]) -> list[str]:
         """Return the labels of all ticks."""
-        return self.dates.format_ticks(self.locator.to_days(values).tolist())
-
-    def get_offset(self) -> str:
-        """Return what all labels leave out, such as the year."""
-        return str(self.dates.get_offset())
+        return super().format_ticks(self.locator.to_days(values).tolist())

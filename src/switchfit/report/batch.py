@@ -124,8 +124,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     if count < 2:
         return Table([], ""), TOO_FEW
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
-    with np.errstate(invalid="ignore"):
-        reported = np.median(study.standard_errors[study.success], axis=0)
+    reported = np.median(study.standard_errors[study.success], axis=0)
     rows, shown, clocks = [], select_unknowns(study, LISTED_UNKNOWNS), list_dated(study)
     for i in shown:
         truth = format_time(study.truth[i], clocks[i], spread[i])
@@ -248,8 +247,7 @@ def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> None:
     ax : matplotlib.axes.Axes
     """
     _draw_histogram(study, k, study.truth[k], ax, density=True)
-    with np.errstate(invalid="ignore"):
-        error = float(np.median(study.standard_errors[study.success, k]))
+    error = float(np.median(study.standard_errors[study.success, k]))
     if np.isfinite(error) and error > 0:
         x = np.linspace(*ax.get_xlim(), 300)
         normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)

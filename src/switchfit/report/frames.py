@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import SECONDS, normalize_time_unit
 from switchfit.report.formats import format_iso, format_unit, get_unit, list_dated
 from switchfit.runtime.frames import Column, Frame, describe_frame
 from switchfit.uncertainty.prediction import Prediction
@@ -79,6 +79,19 @@ def _split(values: FloatArray, names: Sequence[str], units: Sequence[str], label
     """Return the columns of values (K, n), whose names are put into a label."""
     named = zip(names, units, values.T, strict=True)
     return [Column(label.format(name), column, format_unit(unit)) for name, unit, column in named]
+
+
+def _surround(
+    values: FloatArray,
+    errors: FloatArray,
+    ends: FloatArray,
+    names: Sequence[str],
+    units: Sequence[str],
+    label: str = "{}",
+) -> list[Column]:
+    """Return the columns of values (K, n), of their standard errors, and of the ends of their intervals (K, n, 2)."""
+    parts = {"{}": values, ERROR: errors, LOW: ends[..., 0], HIGH: ends[..., 1]}
+    return [column for kind, part in parts.items() for column in _split(part, names, units, kind.format(label))]
 
 
 def list_holds(fit: Fit, name: str) -> Iterator[str]:
@@ -153,11 +166,9 @@ def _list_dates(result: Trajectory | Prediction) -> list[Column]:
     origin = result.origin
     if origin is None:
         return []
-    dates = [origin.find_date(time, result.time_unit) for time in result.times.tolist()]
-    # As datetime64, which have no zone of their own.
-    bare = [date and (date.astimezone(UTC).replace(tzinfo=None) if date.tzinfo else date) for date in dates]
-    values = np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
-    return [Column("date (UTC)" if origin.time_zone else "date", values)]
+    microseconds = 1e6 * SECONDS[normalize_time_unit(result.time_unit)] * result.times
+    values = origin.instant + np.round(microseconds).astype("timedelta64[us]")
+    return [Column("date (UTC)" if origin.time_zone else "date", values.astype("datetime64[ns]"))]
 
 
 @describe_frame.register(Trajectory)
@@ -181,17 +192,12 @@ def describe_prediction(prediction: Prediction) -> Frame:
     ----------
     prediction : Prediction
     """
-    state = {"{}": prediction.states, ERROR: prediction.state_errors}
-    state |= dict(zip((LOW, HIGH), np.moveaxis(prediction.state_band(), -1, 0), strict=True))
-    output = {"{}": prediction.outputs, ERROR: prediction.output_errors}
-    output |= dict(zip((LOW, HIGH), np.moveaxis(prediction.output_band(), -1, 0), strict=True))
-    output["{} noise"] = prediction.noise
-    columns = _list_dates(prediction)
-    for label, values in state.items():
-        columns += _split(values, prediction.state_names, prediction.state_units, label)
-    for label, values in output.items():
-        names = prediction.output_names
-        columns += _split(values, names, [""] * len(names), label.format("{} output"))
+    state, output = prediction.state_errors, prediction.output_errors
+    names, units = prediction.state_names, prediction.state_units
+    columns = [*_list_dates(prediction), *_surround(prediction.states, state, prediction.state_band(), names, units)]
+    names, units = prediction.output_names, ("",) * len(prediction.output_names)
+    columns += _surround(prediction.outputs, output, prediction.output_band(), names, units, "{} output")
+    columns += _split(prediction.noise, names, units, "{} output noise")
     return Frame((Column("time", prediction.times, prediction.time_unit),), tuple(columns))
 
 
@@ -221,14 +227,12 @@ def describe_fits(fits: Fits) -> Frame:
     ----------
     fits : Fits
     """
-    low, high = np.moveaxis(fits.confidence_intervals(), -1, 0)
     errors = np.where(fits.standard_errors > 0, fits.standard_errors, np.nan)
     columns = [Column("level", fits.levels), Column("status", fits.status)]
     if isinstance(fits, Multistart):
         columns.append(Column("cluster", fits.clusters))
-    own = {"{}": fits.theta, ERROR: errors, LOW: low, HIGH: high, "{} start": fits.start}
-    for label, values in own.items():
-        columns += _split(values, fits.theta_names, fits.theta_units, label)
+    columns += _surround(fits.theta, errors, fits.confidence_intervals(), fits.theta_names, fits.theta_units)
+    columns += _split(fits.start, fits.theta_names, fits.theta_units, "{} start")
     names = ("cost", "explained", "samples", "optimality", "iterations", "evaluations", "collapsed", "at_bounds")
     columns += [Column(name, getattr(fits, name)) for name in (*names, "message")]
     attributes: dict[str, str | float] = {"requested": fits.requested, "seconds": float(fits.seconds)}

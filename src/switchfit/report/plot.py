@@ -132,9 +132,7 @@ def plot_runs(
             times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
             plot_transitions(times, intervals[e], ax, level=level if ax is axes[-1] else None)
             if ax is not axes[-1]:
-                ax.tick_params(labelbottom=False)
-                ax.xaxis.offsetText.set_visible(False)
-                ax.set_xlabel("")
+                ax.label_outer()
         if len(result.trajectories) > 1:
             block.suptitle(result.run_names[e], fontsize="medium", fontweight="bold")
     handles = style.collect_handles(figure.axes)
@@ -531,7 +529,7 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) 
     )
 
 
-PLOTS: dict[str, Callable[..., Any]]
+PLOTS: dict[str, Callable[..., Axes | Figure]]
 PLOTS = {"fit": plot_fit, "convergence": plot_convergence, "timeline": plot_timeline, "plane": plot_plane}
 """Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
 
@@ -548,5 +546,4 @@ def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> 
     settings
         Keyword arguments of its function.
     """
-    drawn: Axes | Figure = PLOTS[what](estimate, **settings)
-    return drawn
+    return PLOTS[what](estimate, **settings)
