@@ -11,7 +11,6 @@ them, and those of axes.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -266,6 +265,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     functions = (certify, embed_figure, find_issues, format_span, unit_suffix)
     environment.globals |= {function.__name__: function for function in functions}
     environment.globals |= {"sentences": sentences, "text": text, "uncertainty": uncertainty}
@@ -274,16 +274,10 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
     content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
-    content |= {"sliders": payload["sliders"], "sliders_cut": cut, "library": library}
+    content |= {"payload": payload, "sliders": payload["sliders"], "sliders_cut": cut, "library": library}
     content |= {"correlated": [estimate.theta_names[i] for i in known]}
     content |= {"correlation": estimate.correlation[np.ix_(known, known)]}
-    return environment.get_template("report.html").render(content, payload=_write_json(payload))
-
-
-def _write_json(value: Any) -> str:
-    """Return JSON that can stand inside a script element."""
-    written = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return environment.get_template("report.html").render(content)
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -315,11 +309,9 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
         ranges = {"times": {"start": first - margin, "end": last + margin}}
         figures.append({"template": template, "sources": written, "ranges": ranges})
-    sliders: list[dict[str, Any]] = []
-    if estimate.problem is not None and np.isfinite(estimate.cost):
-        movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
-        sliders = build_sliders(estimate, curves, list(movable))
-        templates |= {"slice": json_item(draw_slice())} if sliders else {}
+    movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
+    sliders = build_sliders(estimate, curves, list(movable) if np.isfinite(estimate.cost) else [])
+    templates |= {"slice": json_item(draw_slice())} if sliders else {}
     moved = [slider["place"] for slider in sliders]
     for slider in sliders:
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
