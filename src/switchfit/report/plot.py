@@ -198,10 +198,7 @@ def plot_residuals(comparison: Comparison, channel: int, ax: Axes) -> None:
     """
     residual = replace_infinities(comparison.residuals[:, channel])
     ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
-    if comparison.kind == "measurements":
-        ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
-    else:
-        ax.plot(*break_at_transitions(comparison.times, residual), "-", color=REFERENCE, linewidth=THIN, zorder=3)
+    draw_measured(comparison, comparison.times, residual, ax)
     _mark_outliers(comparison, residual, channel, ax)
     if comparison.sigma is not None:
         sigma = replace_infinities(comparison.sigma[:, channel])
@@ -397,7 +394,9 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
 
 
 def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes) -> None:
-    """Draw samples as dots, or a reference signal as a dashed line.
+    """Draw samples as dots, smaller the more there are, or a reference signal as a dashed line.
+
+    Thousands of dots are one picture in a vector file.
 
     Parameters
     ----------
@@ -407,16 +406,11 @@ def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes
     ax : matplotlib.axes.Axes
     """
     if comparison.kind == "measurements":
-        ax.plot(x, y, label="measured", zorder=3, **draw_dots(len(x)))
+        size = 4.5 if len(x) <= 100 else 3.0 if len(x) <= 400 else 1.5
+        look: dict[str, Any] = {"alpha": 0.8 if len(x) <= 400 else 0.5, "rasterized": len(x) > 5000}
+        ax.plot(x, y, "o", color=DATA, markersize=size, markeredgewidth=0, label="measured", zorder=3, **look)
     elif comparison.kind == "reference":
         ax.plot(x, y, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
-
-
-def draw_dots(count: int) -> dict[str, Any]:
-    """Draw dots that become smaller the more there are; thousands are one picture in a vector file."""
-    look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markeredgewidth": 0, "color": DATA}
-    size = 4.5 if count <= 100 else 3.0 if count <= 400 else 1.5
-    return look | {"markersize": size, "alpha": 0.8 if count <= 400 else 0.5, "rasterized": count > 5000}
 
 
 def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax: Axes) -> None:

@@ -56,7 +56,7 @@ UNBROKEN = {"break-inside": "avoid"}
 WIDE: dict[str, Any] = {"sizing_mode": "stretch_width"}
 TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
 UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
-DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
+DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None, "tags": ["ink"]}
 DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
 """Of shades below the curves, of what was measured, and of what it is compared with."""
 DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
@@ -138,7 +138,7 @@ def _make_time_figure(
     plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
     own = sources["transitions"]
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
-    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
+    line = plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3, tags=["ink"])
     if height > RESIDUAL_HEIGHT:
         tips = [("transition", "@name"), ("modes", "@modes"), ("time", "@value"), ("95 %", "@interval")]
         _add_hover(plot, line, tips)
@@ -150,12 +150,6 @@ def _put_legend_above(plot: Any) -> None:
     plot.legend.click_policy = "hide"
     plot.legend.orientation = "horizontal"
     plot.add_layout(plot.legend[0], "above")
-
-
-def _tag(renderer: Any, tag: str) -> Any:
-    """Let the page's script colour a glyph."""
-    renderer.glyph.tags = [tag]
-    return renderer
 
 
 def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
@@ -179,8 +173,8 @@ def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSour
     if "lo0" in curves.curve:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
         plot.varea(x="fit_t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
-    still = _tag(plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED), "muted")
-    still.name, still.visible = "still", False
+    still = {"name": "still", "visible": False, "tags": ["muted"]}
+    plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED, **still)
     return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
 
 
@@ -189,9 +183,9 @@ def _draw_measured(
 ) -> Any:
     """Draw what is measured as dots, or a reference signal as a dashed line."""
     if curves.kind == "reference":
-        return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
+        return plot.line(x, y, source=source, line_width=1.6, tags=["ink"], **DASHED, **legend)
     size = next(size for most, size in DOT_SIZES.items() if len(curves.samples["t"]) <= most)
-    return _tag(plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend), "ink")
+    return plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend)
 
 
 def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
@@ -206,7 +200,7 @@ def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSo
 def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
     for side in ("s", "n") if "s0" in curves.samples else ():
-        _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
+        plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted", tags=["muted"])
     _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
 
 
@@ -219,8 +213,14 @@ def _draw_path(
     plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
     _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
     plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
-    mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
-    _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
+    mark: dict[str, Any] = {
+        "marker": "diamond",
+        "size": "size",
+        "fill_color": FIT,
+        "line_color": DATA,
+        "tags": ["edge"],
+    }
+    plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark)
     _put_legend_above(plot)
     return plot
 
@@ -231,8 +231,8 @@ def draw_slice() -> Any:
     plot.xaxis.axis_label.name = "slice-label"
     source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
     plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")
-    _tag(plot.line("x", "quadratic", source=source, legend_label="quadratic", **DASHED), "muted")
-    _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
+    plot.line("x", "quadratic", source=source, legend_label="quadratic", tags=["muted"], **DASHED)
+    plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA, tags=["edge"])
     plot.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
     plot.xaxis.ticker.desired_num_ticks = 4  # labels of dates are long
     plot.xaxis.formatter = models.CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
