@@ -81,19 +81,6 @@ def _split(values: FloatArray, names: Sequence[str], units: Sequence[str], label
     return [Column(label.format(name), column, format_unit(unit)) for name, unit, column in named]
 
 
-def _surround(
-    values: FloatArray,
-    errors: FloatArray,
-    ends: FloatArray,
-    names: Sequence[str],
-    units: Sequence[str],
-    label: str = "{}",
-) -> list[Column]:
-    """Return the columns of values (K, n), of their standard errors, and of the ends of their intervals (K, n, 2)."""
-    parts = {"{}": values, ERROR: errors, LOW: ends[..., 0], HIGH: ends[..., 1]}
-    return [column for kind, part in parts.items() for column in _split(part, names, units, kind.format(label))]
-
-
 def list_holds(fit: Fit, name: str) -> Iterator[str]:
     """Yield what holds an unknown: a bound, a kink, or that the cost does not depend on it.
 
@@ -192,12 +179,14 @@ def describe_prediction(prediction: Prediction) -> Frame:
     ----------
     prediction : Prediction
     """
-    state, output = prediction.state_errors, prediction.output_errors
-    names, units = prediction.state_names, prediction.state_units
-    columns = [*_list_dates(prediction), *_surround(prediction.states, state, prediction.state_band(), names, units)]
-    names, units = prediction.output_names, ("",) * len(prediction.output_names)
-    columns += _surround(prediction.outputs, output, prediction.output_band(), names, units, "{} output")
-    columns += _split(prediction.noise, names, units, "{} output noise")
+    band, output_band = (np.moveaxis(ends, -1, 0) for ends in (prediction.state_band(), prediction.output_band()))
+    states = {"{}": prediction.states, ERROR: prediction.state_errors, LOW: band[0], HIGH: band[1]}
+    outputs = {"{}": prediction.outputs, ERROR: prediction.output_errors, LOW: output_band[0], HIGH: output_band[1]}
+    columns, names = _list_dates(prediction), prediction.output_names
+    for label, values in states.items():
+        columns += _split(values, prediction.state_names, prediction.state_units, label)
+    for label, values in (outputs | {"{} noise": prediction.noise}).items():
+        columns += _split(values, names, [""] * len(names), label.format("{} output"))
     return Frame((Column("time", prediction.times, prediction.time_unit),), tuple(columns))
 
 
@@ -227,12 +216,14 @@ def describe_fits(fits: Fits) -> Frame:
     ----------
     fits : Fits
     """
+    low, high = np.moveaxis(fits.confidence_intervals(), -1, 0)
     errors = np.where(fits.standard_errors > 0, fits.standard_errors, np.nan)
     columns = [Column("level", fits.levels), Column("status", fits.status)]
     if isinstance(fits, Multistart):
         columns.append(Column("cluster", fits.clusters))
-    columns += _surround(fits.theta, errors, fits.confidence_intervals(), fits.theta_names, fits.theta_units)
-    columns += _split(fits.start, fits.theta_names, fits.theta_units, "{} start")
+    own = {"{}": fits.theta, ERROR: errors, LOW: low, HIGH: high, "{} start": fits.start}
+    for label, values in own.items():
+        columns += _split(values, fits.theta_names, fits.theta_units, label)
     names = ("cost", "explained", "samples", "optimality", "iterations", "evaluations", "collapsed", "at_bounds")
     columns += [Column(name, getattr(fits, name)) for name in (*names, "message")]
     attributes: dict[str, str | float] = {"requested": fits.requested, "seconds": float(fits.seconds)}
