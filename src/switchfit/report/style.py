@@ -9,6 +9,8 @@ matplotlib is imported where a figure is made: it takes longer to load than half
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -85,21 +87,19 @@ def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
     return handles
 
 
-def draw_legend_above(ax: Axes, *, title: str = "", height: float = 1.0) -> None:
+def draw_legend_above(ax: Axes, *, title: str = "") -> None:
     """Draw the legend of an axes above it, with as many columns as it has room for.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
     title : str, optional
-    height : float, optional
-        Of its lower edge, in heights of the axes; names of modes reach to 1.08.
     """
     from switchfit.report.axes import fit_legend
 
     if handles := collect_handles([ax]):
         look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
-        look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, height)}
+        look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
         ax.legend(handles.values(), handles.keys(), title=title, borderaxespad=0.2, **look)
 
 
@@ -180,3 +180,17 @@ def turn_off_formulas(drawn: Drawn) -> Drawn:
         if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
             text.set_parse_math(False)
     return drawn
+
+
+def embed_figure(figure: Figure, **settings: Any) -> str:
+    """Return a figure as the source of an image.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    settings
+        Of ``Figure.savefig``.
+    """
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", **settings)
+    return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"

@@ -7,16 +7,15 @@ which prepares its numbers, are imported when a page is made, not with switchfit
 
 from __future__ import annotations
 
-import base64
-import io
 from html import escape
 from typing import Any
 
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
 from switchfit.problem.problem import Problem
+from switchfit.report import style
 from switchfit.runtime.errors import import_library
-from switchfit.runtime.presentation import Displayed, Figure, format_html, format_page, format_text
+from switchfit.runtime.presentation import Displayed, format_html, format_page, format_text
 from switchfit.uncertainty.prediction import Prediction
 
 DOTS = 64
@@ -62,21 +61,7 @@ def show_result(result: Any) -> str:
     is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
     image = ""
     if hasattr(result, "plot") and not is_empty and size <= LARGEST_FIGURE:
-        source = embed_figure(result.plot(), dpi=DOTS)
+        source = style.embed_figure(result.plot(), dpi=DOTS)
         image = f'<img alt="the figure of the result" style="background: white" src="{source}">'
     text = repr(result) if is_forecast else format_text(result)
     return f"<div><pre>{escape(text)}</pre>{image}</div>"
-
-
-def embed_figure(figure: Figure, **settings: Any) -> str:
-    """Return a figure as the source of an image.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-    settings
-        Of ``Figure.savefig``.
-    """
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", **settings)
-    return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"

@@ -26,9 +26,8 @@ from bokeh.resources import Resources
 from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report import sentences, text, uncertainty
+from switchfit.report import sentences, style, text, uncertainty
 from switchfit.report.formats import Timed, describe_clock, format_span, label_quantity, label_time
-from switchfit.report.html import embed_figure
 from switchfit.report.html.curves import (
     Columns,
     Curves,
@@ -266,7 +265,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    functions = (certify, embed_figure, find_issues, format_span, unit_suffix)
+    functions = (certify, style.embed_figure, find_issues, format_span, unit_suffix)
     environment.globals |= {function.__name__: function for function in functions}
     environment.globals |= {"sentences": sentences, "text": text, "uncertainty": uncertainty}
     runs, payload = _prepare_figures(estimate)
