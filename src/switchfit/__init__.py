@@ -7,10 +7,8 @@ NumPy, so that the command line answers ``--help`` at once. Type checkers read t
 from importlib import import_module as _import_module
 
 from switchfit.runtime import compile_small_loops_whole as _compile_small_loops_whole
-from switchfit.runtime.presentation import register_later as _register_later
 
 _compile_small_loops_whole()  # now: XLA reads its flags when it first compiles, in whatever part of the program
-_register_later(lambda: _import_module("switchfit.report"))
 
 __version__ = "0.1.0"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import io
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num, nu
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
-from matplotlib.ticker import Formatter, Locator
+from matplotlib.ticker import Locator
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
@@ -26,7 +25,7 @@ LETTER, HANDLE = 0.55, 4.8
 
 
 def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | float) -> dict[str, Any]:
-    """Return settings of a legend with as many columns as a width has room for.
+    """Return settings of a legend with as many columns of its widest entry as a width has room for.
 
     Parameters
     ----------
@@ -37,20 +36,9 @@ def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | floa
         Largest number of columns.
     fontsize : str or float
     """
-    # In points, so that it stays the same where the size is changed outside of a context with other fonts.
     size = FontProperties(size=fontsize).get_size_in_points()
-    columns = min(most, max(len(labels), 1))
-    while columns > 1 and _measure_legend(labels, columns) > 72 * inches / size:
-        columns -= 1
-    return {"fontsize": size, "ncols": columns, "frameon": False}
-
-
-def _measure_legend(labels: list[str], columns: int) -> float:
-    """Return the width of a legend in sizes of its font; matplotlib fills it column by column."""
-    rows, longer = divmod(len(labels), columns)
-    ends = [k * rows + min(k, longer) for k in range(columns + 1)]
-    parts = [labels[begin:end] for begin, end in pairwise(ends)]
-    return sum(HANDLE + LETTER * max(map(len, part), default=0) for part in parts)
+    widest = size * (HANDLE + LETTER * max(map(len, labels), default=0))
+    return {"fontsize": size, "ncols": min(most, max(int(72 * inches / widest), 1)), "frameon": False}
 
 
 class NotebookFigure(Figure):
@@ -64,9 +52,7 @@ class NotebookFigure(Figure):
         self.savefig(picture, format="png", dpi=DOTS)
         return picture.getvalue()
 
-    def draw_legend(
-        self, handles: Mapping[str, Any], *, most: int = 4, fontsize: str | float | None = None, **settings: Any
-    ) -> None:
+    def draw_legend(self, handles: Mapping[str, Any], *, most: int = 4, **settings: Any) -> None:
         """Draw the legend of all axes, with as many columns as the width has room for, also after it changes.
 
         Parameters
@@ -74,12 +60,11 @@ class NotebookFigure(Figure):
         handles : mapping of label to handle
         most : int, optional
             Largest number of columns.
-        fontsize : str or float, optional
         settings
             Others of ``Figure.legend``.
         """
-        look = fit_legend(list(handles), self.get_figwidth(), most, fontsize or rcParams["legend.fontsize"])
-        self.legend_settings = {"handles": handles, "most": most, "fontsize": look["fontsize"], **settings}
+        look = fit_legend(list(handles), self.get_figwidth(), most, rcParams["legend.fontsize"])
+        self.legend_settings = {"handles": handles, "most": most, **settings}
         self.legend_drawn = self.legend(list(handles.values()), list(handles), **look, **settings)
 
     def set_size_inches(self, w: Any, h: float | None = None, forward: bool = True) -> None:
@@ -132,7 +117,7 @@ class DateLocator(Locator):
         return ((np.asarray(ticks) - self.start) / self.length).tolist()
 
 
-class DateFormatter(Formatter):
+class DateFormatter(ConciseDateFormatter):
     """Dates as short as their neighbours allow.
 
     Parameters
@@ -141,19 +126,13 @@ class DateFormatter(Formatter):
     """
 
     def __init__(self, locator: DateLocator) -> None:
+        super().__init__(locator.dates, locator.zone, FORMATS, OFFSETS, ZERO_FORMATS)
         self.locator = locator
-        self.dates = ConciseDateFormatter(
-            locator.dates, tz=locator.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
-        )
 
-    def __call__(self, x: float, pos: int | None = None) -> str:
-        """Return the label of one tick, or of a place under the pointer."""
-        return num2date(float(self.locator.to_days([x])[0]), tz=self.locator.zone).strftime("%Y-%m-%d %H:%M:%S")
+    def format_data_short(self, value: float) -> str:
+        """Return the label of a place under the pointer."""
+        return num2date(float(self.locator.to_days([value])[0]), tz=self.locator.zone).strftime("%Y-%m-%d %H:%M:%S")
 
     def format_ticks(self, values: Sequence[float]) -> list[str]:
         """Return the labels of all ticks."""
-        return self.dates.format_ticks(self.locator.to_days(values).tolist())
-
-    def get_offset(self) -> str:
-        """Return what all labels leave out, such as the year."""
-        return str(self.dates.get_offset())
+        return super().format_ticks(self.locator.to_days(values).tolist())

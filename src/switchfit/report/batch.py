@@ -66,7 +66,7 @@ def _count_minima(study: Multistart) -> int:
 
 
 @singledispatch
-def tabulate_study(study: Fits) -> tuple[Table, str]:
+def tabulate_study(fits: Fits) -> tuple[Table, str]:
     """Return the table of many fits, and what it leaves out; the table is empty where too few converged.
 
     A row for each fit: level, cost, and the unknowns with their standard errors; of many, the worst first. Bootstraps
@@ -74,9 +74,8 @@ def tabulate_study(study: Fits) -> tuple[Table, str]:
 
     Parameters
     ----------
-    study : Fits
+    fits : Fits
     """
-    fits = study
     listed, notes = range(len(fits)), []
     if len(fits) > LISTED_FITS:
         listed = fits.worst_first[:LISTED_WORST].tolist()
@@ -125,8 +124,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     if count < 2:
         return Table([], ""), TOO_FEW
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
-    with np.errstate(invalid="ignore"):
-        reported = np.median(study.standard_errors[study.success], axis=0)
+    reported = np.median(study.standard_errors[study.success], axis=0)
     rows, shown, clocks = [], select_unknowns(study, LISTED_UNKNOWNS), list_dated(study)
     for i in shown:
         truth = format_time(study.truth[i], clocks[i], spread[i])
@@ -183,7 +181,7 @@ def plot_fits(fits: Fits) -> Figure:
         width, height, most = 2.9, 0.9 + 0.2 * max(len(order), 5), DRAWN_UNKNOWNS
         shown = select_unknowns(fits, DRAWN_UNKNOWNS)
     if isinstance(fits, MonteCarlo | Bootstrap) and fits.success.sum() < 2:
-        draw = _say_too_few
+        shown, title = [], TOO_FEW
     columns = max(min(len(shown), most), 1)
     rows = max(-(-len(shown) // columns), 1)
     figure = style.make_figure(width * columns + 0.5, height * rows + 0.5)
@@ -249,18 +247,12 @@ def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> None:
     ax : matplotlib.axes.Axes
     """
     _draw_histogram(study, k, study.truth[k], ax, density=True)
-    with np.errstate(invalid="ignore"):
-        error = float(np.median(study.standard_errors[study.success, k]))
+    error = float(np.median(study.standard_errors[study.success, k]))
     if np.isfinite(error) and error > 0:
         x = np.linspace(*ax.get_xlim(), 300)
         normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)
         ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
     ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
-
-
-def _say_too_few(study: Fits, k: int, ax: Axes) -> None:
-    ax.set_title(TOO_FEW, fontsize=SMALL, wrap=True)
-    ax.set_axis_off()
 
 
 def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> None:
@@ -293,10 +285,7 @@ def plot_starts(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
     study : Multistart
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
-
-
-def _draw_waterfall(study: Multistart, ax: Axes) -> None:
+    drawn, ax = style.open_axes(ax, (7.0, 3.6))
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
     costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
     floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding
@@ -318,3 +307,4 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> None:
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")
     ax.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    return style.turn_off_formulas(drawn)

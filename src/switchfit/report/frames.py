@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import SECONDS, normalize_time_unit
 from switchfit.report.formats import format_iso, format_unit, get_unit, list_dated
 from switchfit.runtime.frames import Column, Frame, describe_frame
 from switchfit.uncertainty.prediction import Prediction
@@ -153,11 +153,9 @@ def _list_dates(result: Trajectory | Prediction) -> list[Column]:
     origin = result.origin
     if origin is None:
         return []
-    dates = [origin.find_date(time, result.time_unit) for time in result.times.tolist()]
-    # As datetime64, which have no zone of their own.
-    bare = [date and (date.astimezone(UTC).replace(tzinfo=None) if date.tzinfo else date) for date in dates]
-    values = np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
-    return [Column("date (UTC)" if origin.time_zone else "date", values)]
+    microseconds = 1e6 * SECONDS[normalize_time_unit(result.time_unit)] * result.times
+    values = origin.instant + np.round(microseconds).astype("timedelta64[us]")
+    return [Column("date (UTC)" if origin.time_zone else "date", values.astype("datetime64[ns]"))]
 
 
 @describe_frame.register(Trajectory)
@@ -181,16 +179,13 @@ def describe_prediction(prediction: Prediction) -> Frame:
     ----------
     prediction : Prediction
     """
-    state = {"{}": prediction.states, ERROR: prediction.state_errors}
-    state |= dict(zip((LOW, HIGH), np.moveaxis(prediction.state_band(), -1, 0), strict=True))
-    output = {"{}": prediction.outputs, ERROR: prediction.output_errors}
-    output |= dict(zip((LOW, HIGH), np.moveaxis(prediction.output_band(), -1, 0), strict=True))
-    output["{} noise"] = prediction.noise
-    columns = _list_dates(prediction)
-    for label, values in state.items():
+    band, output_band = (np.moveaxis(ends, -1, 0) for ends in (prediction.state_band(), prediction.output_band()))
+    states = {"{}": prediction.states, ERROR: prediction.state_errors, LOW: band[0], HIGH: band[1]}
+    outputs = {"{}": prediction.outputs, ERROR: prediction.output_errors, LOW: output_band[0], HIGH: output_band[1]}
+    columns, names = _list_dates(prediction), prediction.output_names
+    for label, values in states.items():
         columns += _split(values, prediction.state_names, prediction.state_units, label)
-    for label, values in output.items():
-        names = prediction.output_names
+    for label, values in (outputs | {"{} noise": prediction.noise}).items():
         columns += _split(values, names, [""] * len(names), label.format("{} output"))
     return Frame((Column("time", prediction.times, prediction.time_unit),), tuple(columns))
 

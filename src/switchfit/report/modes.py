@@ -412,11 +412,7 @@ def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure
     found : Insertion
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, lambda ax: _draw_insertion(found, ax), (7.2, 3.8))
-
-
-def _draw_insertion(found: Insertion, ax: Axes) -> None:
-    run = found.trajectory
+    (drawn, ax), run = style.open_axes(ax, (7.2, 3.8)), found.trajectory
     order = [*plot.choose_mode_colours([run]), *found.modes]
     colours, shades = (style.assign_colours(order, palette) for palette in (LINE_COLOURS, MODE_COLOURS))  # of one hue
     ax.axhline(0.0, color=REFERENCE, linewidth=THIN, zorder=2)
@@ -431,6 +427,7 @@ def _draw_insertion(found: Insertion, ax: Axes) -> None:
     ax.set_ylabel(formats.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
+    return style.turn_off_formulas(drawn)
 
 
 # --- what an online estimator said -----------------------------------------------------------------------------------

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -133,9 +132,7 @@ def plot_runs(
             times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
             plot_transitions(times, intervals[e], ax, level=level if ax is axes[-1] else None)
             if ax is not axes[-1]:
-                ax.tick_params(labelbottom=False)
-                ax.xaxis.offsetText.set_visible(False)
-                ax.set_xlabel("")
+                ax.label_outer()
         if len(result.trajectories) > 1:
             block.suptitle(result.run_names[e], fontsize="medium", fontweight="bold")
     handles = style.collect_handles(figure.axes)
@@ -201,10 +198,7 @@ def plot_residuals(comparison: Comparison, channel: int, ax: Axes) -> None:
     """
     residual = replace_infinities(comparison.residuals[:, channel])
     ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
-    if comparison.kind == "measurements":
-        ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
-    else:
-        ax.plot(*break_at_transitions(comparison.times, residual), "-", color=REFERENCE, linewidth=THIN, zorder=3)
+    draw_measured(comparison, comparison.times, residual, ax)
     _mark_outliers(comparison, residual, channel, ax)
     if comparison.sigma is not None:
         sigma = replace_infinities(comparison.sigma[:, channel])
@@ -272,18 +266,16 @@ def plot_convergence(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
         An optimality of 0 in its history is left out.
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, lambda ax: _draw_convergence(estimate, ax), (6.4, 3.4))
-
-
-def _draw_convergence(fit: Fit, ax: Axes) -> None:
-    optimality = np.array([record.optimality for record in fit.history], dtype=np.float64)
+    drawn, ax = style.open_axes(ax, (6.4, 3.4))
+    optimality = np.array([record.optimality for record in estimate.history], dtype=np.float64)
     shown = np.where(optimality > 0, optimality, np.nan)
     ax.set_yscale("log")
-    ax.plot([record.iteration for record in fit.history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
-    style.draw_level(ax, "tolerance", fit.tolerance, "left")  # where the curve is far above it
+    ax.plot([record.iteration for record in estimate.history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
+    style.draw_level(ax, "tolerance", estimate.tolerance, "left")  # where the curve is far above it
     ax.locator_params(axis="x", integer=True)
     ax.set_xlabel("iteration")
     ax.set_ylabel("optimality (KKT residual)")
+    return style.turn_off_formulas(drawn)
 
 
 def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
@@ -297,33 +289,29 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
     ax : matplotlib.axes.Axes, optional
     """
     runs = choose_runs(estimate, LONGEST_TIMELINE)
-    title = count_worst(runs, estimate.trajectories, "experiments")
-    draw = partial(_draw_timeline, estimate, runs, level)
-    return style.draw_on(ax, draw, (8.0, 1.3 + 0.4 * len(runs)), legend=1.0, title=title)
-
-
-def _draw_timeline(fit: Fit, runs: Sequence[int], level: float, ax: Axes) -> None:
-    """Draw the rows of a timeline, the first on top."""
-    colours = choose_mode_colours(fit.trajectories)
-    ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
-    first, last = float(ends.min()), float(ends.max())
+    drawn, ax = style.open_axes(ax, (8.0, 1.3 + 0.4 * len(runs)))
+    trajectories, colours = [estimate.trajectories[e] for e in runs], choose_mode_colours(estimate.trajectories)
+    first = float(min(run.times[0] for run in trajectories))
+    last = float(max(run.times[-1] for run in trajectories))
     inches = ax.bbox.width / ax.figure.dpi / (last - first)
-    for row, e in enumerate(runs):
-        for mode, begin, end in (span for span in fit.trajectories[e].mode_spans if span[2] > span[1]):
+    for row, (e, run) in enumerate(zip(runs, trajectories, strict=True)):  # the first on top
+        for mode, begin, end in (span for span in run.mode_spans if span[2] > span[1]):
             fits = inches * (end - begin) > 0.085 * len(mode) + 0.1
             bar: dict[str, Any] = {"color": colours[mode], "edgecolor": TRANSITION, "linewidth": THIN / 2}
             ax.barh(row, end - begin, 0.7, begin, label="" if fits else mode, **bar)
             if fits:
                 ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
-        for low, high in find_transition_intervals(fit, e, level).tolist():
+        for low, high in find_transition_intervals(estimate, e, level).tolist():
             if np.isfinite(high - low):
                 look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
                 ax.plot([low, high], [row, row], "|-", label=f"transition time, {100 * level:g} % interval", **look)
-    style.label_axis(ax, fit.trajectories[runs[0]])
+    style.label_axis(ax, trajectories[0])
     ax.set_xlim(first, last)
-    ax.set_ylim(len(ends) - 0.5, -0.5)
-    ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
+    ax.set_ylim(len(runs) - 0.5, -0.5)
+    ax.set_yticks(range(len(runs)), [estimate.run_names[e] for e in runs] if len(estimate.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
+    style.draw_legend_above(ax, title=count_worst(runs, estimate.trajectories, "experiments"))
+    return style.turn_off_formulas(drawn)
 
 
 def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = False) -> dict[str, str]:
@@ -406,7 +394,9 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
 
 
 def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes) -> None:
-    """Draw samples as dots, or a reference signal as a dashed line.
+    """Draw samples as dots, smaller the more there are, or a reference signal as a dashed line.
+
+    Thousands of dots are one picture in a vector file.
 
     Parameters
     ----------
@@ -416,16 +406,11 @@ def draw_measured(comparison: Comparison, x: FloatArray, y: FloatArray, ax: Axes
     ax : matplotlib.axes.Axes
     """
     if comparison.kind == "measurements":
-        ax.plot(x, y, label="measured", zorder=3, **draw_dots(len(x)))
+        size = 4.5 if len(x) <= 100 else 3.0 if len(x) <= 400 else 1.5
+        look: dict[str, Any] = {"alpha": 0.8 if len(x) <= 400 else 0.5, "rasterized": len(x) > 5000}
+        ax.plot(x, y, "o", color=DATA, markersize=size, markeredgewidth=0, label="measured", zorder=3, **look)
     elif comparison.kind == "reference":
         ax.plot(x, y, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
-
-
-def draw_dots(count: int) -> dict[str, Any]:
-    """Draw dots that become smaller the more there are; thousands are one picture in a vector file."""
-    look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markeredgewidth": 0, "color": DATA}
-    size = 4.5 if count <= 100 else 3.0 if count <= 400 else 1.5
-    return look | {"markersize": size, "alpha": 0.8 if count <= 400 else 0.5, "rasterized": count > 5000}
 
 
 def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax: Axes) -> None:
@@ -504,7 +489,23 @@ def plot_plane(
     if named is not None and len(named) != 2:
         raise ValueError(f"channels must be two names; got {shorten(channels)}.")
     (comparison, plane), trajectory = _choose_plane(estimate, experiment, named), estimate.trajectories[experiment]
-    return style.draw_on(ax, partial(_draw_plane, comparison, plane, trajectory), (6.4, 5.6), legend=1.0)
+    drawn, ax = style.open_axes(ax, (6.4, 5.6))
+    x, y = comparison.measured[:, plane].T
+    draw_measured(comparison, x, y, ax)
+    colours = choose_mode_colours([trajectory], lines=True)
+    segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
+    for (mode, begin, end), first, last in segments:
+        label = f"fitted: {mode}" if end > begin else ""
+        ax.plot(*comparison.curve[first:last, plane].T, color=colours[mode], linewidth=2 * LINE, zorder=4, label=label)
+    ends = comparison.curve[trajectory.segments[1:-1] - 1][:, plane]
+    if len(ends):
+        marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
+        ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
+    labels = [label_quantity(comparison.names[k], comparison.units[k]) for k in plane]
+    ax.set(xlabel=labels[0], ylabel=labels[1])
+    ax.set_aspect("equal", adjustable="datalim")
+    style.draw_legend_above(ax)
+    return style.turn_off_formulas(drawn)
 
 
 def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> tuple[Comparison, list[int]]:
@@ -522,24 +523,7 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) 
     )
 
 
-def _draw_plane(comparison: Comparison, both: list[int], trajectory: Trajectory, ax: Axes) -> None:
-    x, y = comparison.measured[:, both].T
-    draw_measured(comparison, x, y, ax)
-    colours = choose_mode_colours([trajectory], lines=True)
-    segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
-    for (mode, begin, end), first, last in segments:
-        label = f"fitted: {mode}" if end > begin else ""
-        ax.plot(*comparison.curve[first:last, both].T, color=colours[mode], linewidth=2 * LINE, zorder=4, label=label)
-    ends = comparison.curve[trajectory.segments[1:-1] - 1][:, both]
-    if len(ends):
-        marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
-        ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
-    labels = [label_quantity(comparison.names[k], comparison.units[k]) for k in both]
-    ax.set(xlabel=labels[0], ylabel=labels[1])
-    ax.set_aspect("equal", adjustable="datalim")
-
-
-PLOTS: dict[str, Callable[..., Any]]
+PLOTS: dict[str, Callable[..., Axes | Figure]]
 PLOTS = {"fit": plot_fit, "convergence": plot_convergence, "timeline": plot_timeline, "plane": plot_plane}
 """Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
 
@@ -556,5 +540,4 @@ def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> 
     settings
         Keyword arguments of its function.
     """
-    drawn: Axes | Figure = PLOTS[what](estimate, **settings)
-    return drawn
+    return PLOTS[what](estimate, **settings)

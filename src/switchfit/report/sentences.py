@@ -125,7 +125,7 @@ def write_termination(ended: Termination) -> str:
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
-    template = _ONLY_UNREAD if only_unread else _ENDINGS[ended.status]
+    template = _ENDINGS["only unread" if only_unread else ended.status]
     if "{reason}" not in template and ended.reason is not None and ended.reason.kind == "undefined":
         template += "{reason}"
     return template.format(**vars(ended) | _describe_ending(ended)) + active
@@ -160,8 +160,8 @@ def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
     return "; ".join(f"{write_reason(issue)}: {write_step(Issue(step, issue.subjects))}" for issue, step in issues)
 
 
-_ONLY_UNREAD = "Converged (optimality {optimality:.1e}), but {unread}."
-_ENDINGS = {
+_ENDINGS: dict[Status | str, str] = {
+    "only unread": "Converged (optimality {optimality:.1e}), but {unread}.",
     Status.CONVERGED: "Converged: the optimality {optimality:.1e} is below the tolerance {tolerance:.1e}.",
     Status.CONVERGED_PRECISION: "Converged to the precision of the cost {cost:.6e}: the optimality {optimality:.1e} is "
     "above the tolerance {tolerance:.1e}, but the decrease still predicted is below the error of the cost, or would "
@@ -217,26 +217,6 @@ _REPAIRS = {
 def _write_repair(issue: Issue) -> str:
     remedy, repaired = _REPAIRS[issue.kind]
     return repaired if get_figure(issue, "repaired") == 1.0 else remedy.format(*issue.subjects)
-
-
-_LOG_ISSUES: dict[str, Sentence] = {
-    "log: unsorted times": "{where}: times are not in order, {time} is written too late; {repair}.",
-    "log: clock jump": "{where}: the clock jumps back by {step}, to {time}; {repair}.",
-    "log: repeated time": "{where}: the time {time} stands there twice; {repair}.",
-    "log: missing times": "{where}: without a time; left out.",
-    "log: broken lines": "{where}: broken; left out.",
-    "log: damaged sentences": "{where}: no sentence, or with a wrong checksum; left out.",
-    "log: no stamps": "{0}: messages of {1} have no stamps; the times are those of the recorder.",
-    "log: refused": "Left out: {0}",
-    "log: gap": "{where}: a gap of {step} after {time}, where samples are typically {typical} apart.",
-    "log: wrapped angle": "{where}: the angle {2!r} jumps by a turn of {turn:.6g}; {repair}.",
-    "log: text": "{where}: {3!r} in column {2!r} is not a number, and the column is left out; leave the cell "
-    "empty, or repair='drop-broken-lines' leaves out such lines.",
-    "log: constant": "{0}: constant in all samples: {1}.",
-    "log: empty": "{0}: without any value: {1}.",
-    "log: repeated name": "{0} has several columns {1!r}, which are left out; rename all but one.",
-}
-"""Kind of an issue -> its sentence."""
 
 
 # --- issues -----------------------------------------------------------------------------------------------------------
@@ -313,7 +293,22 @@ _DELAYED = " J has a kink where a transition meets a late sample's moment: fix t
 _BOUND = "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known."
 _ISSUES: dict[str, Sentence] = {
     "trade off": _write_combination,
-    **_LOG_ISSUES,
+    # Odd things in logs
+    "log: unsorted times": "{where}: times are not in order, {time} is written too late; {repair}.",
+    "log: clock jump": "{where}: the clock jumps back by {step}, to {time}; {repair}.",
+    "log: repeated time": "{where}: the time {time} stands there twice; {repair}.",
+    "log: missing times": "{where}: without a time; left out.",
+    "log: broken lines": "{where}: broken; left out.",
+    "log: damaged sentences": "{where}: no sentence, or with a wrong checksum; left out.",
+    "log: no stamps": "{0}: messages of {1} have no stamps; the times are those of the recorder.",
+    "log: refused": "Left out: {0}",
+    "log: gap": "{where}: a gap of {step} after {time}, where samples are typically {typical} apart.",
+    "log: wrapped angle": "{where}: the angle {2!r} jumps by a turn of {turn:.6g}; {repair}.",
+    "log: text": "{where}: {3!r} in column {2!r} is not a number, and the column is left out; leave the cell "
+    "empty, or repair='drop-broken-lines' leaves out such lines.",
+    "log: constant": "{0}: constant in all samples: {1}.",
+    "log: empty": "{0}: without any value: {1}.",
+    "log: repeated name": "{0} has several columns {1!r}, which are left out; rename all but one.",
     # Before the numbers are believed
     "lower bound": _BOUND,
     "upper bound": _BOUND,
@@ -365,6 +360,7 @@ _ISSUES: dict[str, Sentence] = {
     "the unknowns that trade off, or take hessian='gauss-newton'.{delay}",
     "error": "{names}",
 }
+"""Kind of an issue -> its sentence."""
 
 
 # --- verdict ----------------------------------------------------------------------------------------------------------

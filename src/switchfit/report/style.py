@@ -9,7 +9,9 @@ matplotlib is imported where a figure is made: it takes longer to load than half
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import base64
+import io
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from switchfit.report.formats import Timed, label_quantity, label_time
@@ -18,7 +20,7 @@ from switchfit.runtime.presentation import Axes, Figure
 if TYPE_CHECKING:
     from switchfit.report.axes import NotebookFigure
 
-Drawn = TypeVar("Drawn", "Axes", "Figure")
+Drawn = TypeVar("Drawn", bound="Axes | Figure")
 
 MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1", "#ececec", "#dcc9b6")
 """Light, and of different lightness one after the other, so that they differ in grey too."""
@@ -47,27 +49,14 @@ def make_figure(width: float, height: float) -> NotebookFigure:
     return NotebookFigure(figsize=(width, height), layout="constrained")
 
 
-def draw_on(
-    ax: Axes | None,
-    draw: Callable[[Axes], None],
-    size: tuple[float, float] = (6.4, 4.2),
-    *,
-    legend: float = 0.0,
-    title: str = "",
-) -> Axes | Figure:
-    """Draw in the given axes and return them, or in a new figure and return that.
+def open_axes(ax: Axes | None, size: tuple[float, float] = (6.4, 4.2)) -> tuple[Axes | Figure, Axes]:
+    """Return what a plot of one axes returns, and the axes in which it draws: those given, or those of a new figure.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes or None
-    draw : callable
-        ``draw(ax)`` draws one axes.
     size : (width, height)
         Of the new figure in inches.
-    legend : float, optional
-        Height of the lower edge of a legend, in heights of the axes; names of modes reach to 1.08. 0 draws none.
-    title : str, optional
-        Of the legend.
 
     Raises
     ------
@@ -76,14 +65,12 @@ def draw_on(
     """
     from matplotlib.axes import Axes
 
-    figure = make_figure(*size) if ax is None else None
-    panel: Any = ax if figure is None else figure.subplots()
-    if not isinstance(panel, Axes):
+    if ax is None:
+        figure = make_figure(*size)
+        return figure, figure.subplots()
+    if not isinstance(ax, Axes):
         raise TypeError(f"ax must be a matplotlib Axes; got {type(ax).__name__}.")
-    draw(panel)
-    if legend:
-        draw_legend_above(panel, title=title, height=legend)
-    return turn_off_formulas(panel) if figure is None else turn_off_formulas(figure)
+    return ax, ax
 
 
 def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
@@ -100,20 +87,19 @@ def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
     return handles
 
 
-def draw_legend_above(ax: Axes, *, title: str = "", height: float = 1.0) -> None:
+def draw_legend_above(ax: Axes, *, title: str = "") -> None:
     """Draw the legend of an axes above it, with as many columns as it has room for.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
-    title, height : optional
-        As of `draw_on`.
+    title : str, optional
     """
     from switchfit.report.axes import fit_legend
 
     if handles := collect_handles([ax]):
         look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
-        look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, height)}
+        look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
         ax.legend(handles.values(), handles.keys(), title=title, borderaxespad=0.2, **look)
 
 
@@ -194,3 +180,17 @@ def turn_off_formulas(drawn: Drawn) -> Drawn:
         if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
             text.set_parse_math(False)
     return drawn
+
+
+def embed_figure(figure: Figure, **settings: Any) -> str:
+    """Return a figure as the source of an image.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    settings
+        Of ``Figure.savefig``.
+    """
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", **settings)
+    return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"

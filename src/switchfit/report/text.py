@@ -211,20 +211,14 @@ def tabulate_channels(fit: Fit) -> Table:
     for label, e, comparison, k in list_channels(fit.comparisons, fit.run_names):
         residual, sigma = comparison.residuals[:, k], comparison.sigma
         count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
-        scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
+        scaled = "" if sigma is None else f"{np.sqrt(np.nanmean((residual / sigma[:, k]) ** 2)):.3g}"
         share = explain_channel(comparison, k)
         explained = "" if np.isnan(share) else format_share(share)
         unit = get_unit(comparison, k, fit.trajectories[e])
-        rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
+        rows.append([label, count, f"{comparison.rmse[k]:.4g}", unit, scaled, explained])
         shares.append(share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
     return Table([rows[k] for k in np.argsort(shares, kind="stable")], "<>><>>", titles)
-
-
-def _format_size(values: FloatArray, digits: int) -> str:
-    """Return the root mean square of the values that are known; blank without any."""
-    known = values[np.isfinite(values)]
-    return f"{np.sqrt(np.mean(known**2)):.{digits}g}" if len(known) else ""
 
 
 def _format_unknowns(fit: Fit, most: int) -> list[str]:

@@ -48,6 +48,7 @@ def tabulate_certificate(certificate: Certificate) -> Table:
     held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
     failures = "; ".join(map(str, certificate.failures))
     error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
+    orders = ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in certificate.taylor_orders)
     rows = [
         ("KKT residual", f"{certificate.optimality:.2e}"),
         ("smallest Hessian eigenvalue, free directions", f"{certificate.smallest_eigenvalue:.4g}"),
@@ -57,7 +58,10 @@ def tabulate_certificate(certificate: Certificate) -> Table:
         ("largest integration error, relative", error),
         ("paper's gradient against discretised, relative", _format_gap(certificate.gradient_gap)),
         ("paper's Hessian against discretised, relative", _format_gap(certificate.hessian_gap)),
-        ("Taylor orders of J, with gradient, with Hessian", _format_orders(certificate.taylor_orders)),
+        (
+            "Taylor orders of J, with gradient, with Hessian",
+            orders if np.isfinite(certificate.taylor_orders).any() else "not checked",
+        ),
         ("active constraints", held or "none"),
         ("verdict", f"FAILED: {failures}" if failures else "passed"),
     ]
@@ -66,12 +70,6 @@ def tabulate_certificate(certificate: Certificate) -> Table:
 
 def _format_gap(gap: float) -> str:
     return "not checked" if np.isnan(gap) else f"{gap:.1e}"
-
-
-def _format_orders(orders: tuple[float, ...]) -> str:
-    if np.isnan(orders).all():
-        return "not checked"
-    return ", ".join("rounding" if np.isnan(order) else f"{order:.2f}" for order in orders)
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -318,25 +316,14 @@ _JUMPS = "the profile jumps at {}: the other unknowns have several minima, and t
 
 @draw_figure.register(Profile)
 def plot_profile(profile: Profile, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw a profile with its thresholds and interval, and the quadratic approximation.
+    """Draw the likelihood ratio against the value, with the thresholds, the interval, and the quadratic approximation.
 
     Parameters
     ----------
     profile : Profile
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(ax, partial(draw_profile, profile))
-
-
-def draw_profile(profile: Profile, ax: Axes) -> None:
-    """Draw the likelihood ratio against the value, with the thresholds, the interval, and the quadratic approximation.
-
-    Parameters
-    ----------
-    profile : Profile
-    ax : matplotlib.axes.Axes
-    """
-    regions = profile.regions()
+    (drawn, ax), regions = style.open_axes(ax), profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
     near = np.flatnonzero(ratio <= top)
@@ -370,6 +357,7 @@ def draw_profile(profile: Profile, ax: Axes) -> None:
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
     ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
+    return style.turn_off_formulas(drawn)
 
 
 @draw_figure.register(ResidualDiagnostics)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from switchfit.experiment_design import Design
-from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import formats, plot, style
@@ -32,35 +31,26 @@ def plot_prediction(prediction: Prediction, *, level: float = 0.95) -> Figure:
     level : float, between 0 and 1
     """
     outputs = plot.list_outputs(prediction.fit, prediction.experiment)
+    trajectory, order = prediction.fit.trajectories[prediction.experiment], np.argsort(prediction.times, kind="stable")
+    times, values = prediction.times[order], prediction.outputs if prediction.output_names else prediction.states
+    begin, end = trajectory.mode_spans[0][1], trajectory.mode_spans[-1][2]
     figure = style.make_figure(8.0, 0.9 + 2.6 * len(outputs))
     axes = figure.subplots(len(outputs), 1, sharex=True, squeeze=False)[:, 0]
-    for number, (comparison, k) in enumerate(outputs):
-        _draw_prediction(prediction, number, comparison, k, level, axes[number])
-        axes[number].label_outer()
+    for number, ((comparison, k), ax) in enumerate(zip(outputs, axes, strict=True)):
+        plot.plot_bands(prediction, number, level, ax)
+        ax.plot(times, values[order, number], "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
+        plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
+        plot.plot_modes(trajectory, ax, labels=ax is axes[0])
+        if times[-1] > end:
+            colour = plot.choose_mode_colours([trajectory])[trajectory.mode_spans[-1][0]]
+            ax.axvspan(end, times[-1], color=colour, linewidth=0, zorder=0)
+            ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
+        style.label_axis(ax, prediction)
+        ax.set_xlim(min(times[0], begin), max(times[-1], end))
+        ax.set_ylabel(label_quantity(comparison.names[k], comparison.units[k]))
+        ax.label_outer()
     figure.draw_legend(style.collect_handles(axes), loc="outside upper right")
     return style.turn_off_formulas(figure)
-
-
-def _draw_prediction(
-    prediction: Prediction, number: int, comparison: Comparison, k: int, level: float, ax: Axes
-) -> None:
-    """Draw one output, whose modes are named above the first."""
-    trajectory = prediction.fit.trajectories[prediction.experiment]
-    order, end = np.argsort(prediction.times, kind="stable"), trajectory.mode_spans[-1][2]
-    times = prediction.times[order]
-    y = (prediction.outputs if prediction.output_names else prediction.states)[order, number]
-    plot.plot_bands(prediction, number, level, ax)
-    ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
-    plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
-    plot.plot_modes(trajectory, ax, labels=number == 0)
-    first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
-    if last > end:
-        colour = plot.choose_mode_colours([trajectory])[trajectory.mode_spans[-1][0]]
-        ax.axvspan(end, last, color=colour, linewidth=0, zorder=0)
-        ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
-    style.label_axis(ax, prediction)
-    ax.set_xlim(first, last)
-    ax.set_ylabel(label_quantity(comparison.names[k], comparison.units[k]))
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -140,8 +130,7 @@ def _find_intervals(found: Validation, e: int, level: float) -> FloatArray:
     """Return the interval of each transition time of one run, NaN where it is not estimated: (N, 2)."""
     transitions = [begin for _, begin, _ in found.trajectories[e].mode_spans[1:]]
     places = found.problem.unknowns.times[e][: len(transitions)]
-    errors = np.append(np.sqrt(np.diag(found.corrected_covariance)), np.nan)  # the last: not estimated
-    half = found.quantile(level) * errors[places]
+    half = found.quantile(level) * np.append(found.corrected_standard_errors, np.nan)[places]  # the last: not estimated
     return np.stack([transitions - half, transitions + half], axis=-1)
 
 

@@ -1,40 +1,37 @@
-"""Dispatch of results to the functions that write and draw them.
-
-Results are data. Their ``__str__`` and ``plot`` call `format_text` and `draw_figure`, for which the modules of
-`switchfit.report` register a function for each kind of result. The report thus depends on the results, and no result
-depends on the report, which is imported when a result is first written or drawn. Settings are the keyword arguments of
-the registered function.
-
-Dispatch of a result to functions of rooms that come after its own.
+"""Dispatch of results to functions of rooms that come after their own.
 
 Results are data. How one is written or drawn, and how an estimate is validated with another run, is in later rooms,
-which register a function for each kind of result (`functools.singledispatch`). These rooms are imported at the first
-call that needs them.
+which register a function for each kind of result (`functools.singledispatch`): their ``__str__`` and ``plot`` call
+`format_text` and `draw_figure`, for which the modules of `switchfit.report` register functions. The report thus depends
+on the results, and no result depends on the report, which is imported when a result is first written or drawn. Settings
+are the keyword arguments of the registered function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import singledispatch
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-_loaders: list[Callable[[], object]] = []
+if TYPE_CHECKING:
+    from functools import _SingleDispatchCallable
+
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+    from typing_extensions import TypeVar
+
+    Drawn = TypeVar("Drawn", bound=Axes | Figure, default=Figure)
+    Returned = TypeVar("Returned")
+else:
+    Axes = Figure = Drawn = Any  # for annotations: to import matplotlib takes longer than half of switchfit
+"""`Drawn` is what a plot returns: the axes that it is given, otherwise a new Figure."""
 
 
-def register_later(load: Callable[[], object]) -> None:
-    """Have `load` called before a kind of result is refused: it imports the modules that register functions.
+def call_registered(dispatcher: _SingleDispatchCallable[Returned], result: object, **settings: Any) -> Returned:
+    """Call the function that is registered for a result, after importing the report, whose modules register them.
 
-    Parameters
-    ----------
-    load : callable
-    """
-    _loaders.append(load)
-
-
-def call_registered(dispatcher: Any, result: object, **settings: Any) -> Any:
-    """Call the function that is registered for a result, after importing the modules that register functions.
-
-    For the default of a dispatcher, which is what a result gets as long as those modules are not imported.
+    For the default of a dispatcher, which is what a result gets as long as the report is not imported.
 
     Parameters
     ----------
@@ -49,11 +46,10 @@ def call_registered(dispatcher: Any, result: object, **settings: Any) -> Any:
     TypeError
         For a kind of result that no module has registered.
     """
-    for load in _loaders:
-        load()
-    function = dispatcher.dispatch(type(result))
-    if function is dispatcher.dispatch(object):
-        name = dispatcher.__name__
+    import_module("switchfit.report")
+    function, default = dispatcher.dispatch(type(result)), dispatcher.dispatch(object)
+    if function is default:
+        name = default.__name__
         raise TypeError(f"{name} has no function for a {type(result).__name__}: register one with {name}.register.")
     return function(result, **settings)
 
@@ -73,22 +69,10 @@ def validate_on(estimate: Any, other: Any, **settings: Any) -> Any:
     return call_registered(validate_on, estimate, other=other, **settings)
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes as Axes
-    from matplotlib.figure import Figure as Figure
-    from typing_extensions import TypeVar
-
-    Drawn = TypeVar("Drawn", bound=Axes | Figure, default=Figure)
-else:
-    Axes = Figure = Drawn = Any  # for annotations: to import matplotlib takes longer than half of switchfit
-"""`Drawn` is what a plot returns: the axes that it is given, otherwise a new Figure."""
-
-
 @singledispatch
 def format_text(result: Any, **settings: Any) -> str:
     """Return a result as plain text, of one or more lines, without a newline at the end."""
-    text: str = call_registered(format_text, result, **settings)
-    return text
+    return call_registered(format_text, result, **settings)
 
 
 @singledispatch
@@ -100,15 +84,13 @@ def draw_figure(result: Any, **settings: Any) -> Any:
 @singledispatch
 def format_page(result: Any, **settings: Any) -> str:
     """Return a result as one HTML page that needs no other file."""
-    text: str = call_registered(format_page, result, **settings)
-    return text
+    return call_registered(format_page, result, **settings)
 
 
 @singledispatch
 def format_html(result: Any) -> str:
     """Return a result as a few lines of HTML, as a notebook shows it."""
-    text: str = call_registered(format_html, result)
-    return text
+    return call_registered(format_html, result)
 
 
 class Printed:

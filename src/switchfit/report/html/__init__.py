@@ -7,14 +7,13 @@ which prepares its numbers, are imported when a page is made, not with switchfit
 
 from __future__ import annotations
 
-import base64
-import io
 from html import escape
 from typing import Any
 
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
 from switchfit.problem.problem import Problem
+from switchfit.report import style
 from switchfit.runtime.errors import import_library
 from switchfit.runtime.presentation import Displayed, format_html, format_page, format_text
 from switchfit.uncertainty.prediction import Prediction
@@ -47,6 +46,7 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
     return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem())
 
 
+@format_html.register(Problem)
 @format_html.register(Prediction)
 @format_html.register(Displayed)
 def show_result(result: Any) -> str:
@@ -61,19 +61,7 @@ def show_result(result: Any) -> str:
     is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
     image = ""
     if hasattr(result, "plot") and not is_empty and size <= LARGEST_FIGURE:
-        picture = io.BytesIO()
-        result.plot().savefig(picture, format="png", dpi=DOTS)
-        source = f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"
+        source = style.embed_figure(result.plot(), dpi=DOTS)
         image = f'<img alt="the figure of the result" style="background: white" src="{source}">'
-    return f"<div><pre>{escape(str(result))}</pre>{image}</div>"
-
-
-@format_html.register(Problem)
-def show_problem(problem: Problem) -> str:
-    """Return the experiments, and the unknowns with their first guesses and bounds.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    return f"<div><pre>{escape(format_text(problem))}</pre></div>"
+    text = repr(result) if is_forecast else format_text(result)
+    return f"<div><pre>{escape(text)}</pre>{image}</div>"

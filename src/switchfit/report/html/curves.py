@@ -122,16 +122,15 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     if len(segments) != len(trajectory.pieces):  # a mode without duration: other meshes have other nodes there
         times, nodes, segments = trajectory.times, None, trajectory.pieces
     values, slopes, band = _stack_outputs_and_states(estimate, e, nodes)
-    kept, breaks = _thin(segments, points)
-    modes = np.repeat([trajectory.modes[start] for start in trajectory.pieces[:-1]], np.diff(segments))[kept]
+    kept = _thin(segments, points)
+    modes = np.repeat(trajectory.modes[trajectory.pieces[:-1]], np.diff(segments))
 
     def at_nodes(values: FloatArray) -> FloatArray:
         """Thin values at the nodes (L,), and break them at transitions."""
-        return replace_infinities(np.insert(values[kept], breaks, np.nan))
+        return replace_infinities(np.where(kept < 0, np.nan, values[kept]))
 
     def list_curve(columns: Sequence[int], late: float) -> dict[str, Any]:
-        curve: dict[str, Any] = {"t": np.insert(times[kept], breaks, np.nan) + late}
-        curve["mode"] = np.insert(modes.astype(object), breaks, "").tolist()
+        curve: dict[str, Any] = {"t": at_nodes(times) + late, "mode": np.where(kept < 0, "", modes[kept]).tolist()}
         for k, column in enumerate(columns):
             curve[f"y{k}"] = at_nodes(values[:, column])
             if band is not None:
@@ -148,23 +147,19 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         late = float(comparison.curve_times[0] - trajectory.times[0])
         count = len(comparison.times)
         drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
-        if comparison.kind == "reference" and count == len(times):
-            drawn = kept
         curve = list_curve(columns, late)
         if find_plane(names, units) is not None:
-            before_breaks = np.append(False, np.isnan(curve["t"][:-1]))
-            curve["size"] = np.where(before_breaks, 13.0, 0.0).astype("f4")
-        moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late)
-        samples = _list_samples(comparison, drawn, moved, places)
+            curve["size"] = np.where(np.roll(kept < 0, 1), 13.0, 0.0).astype("f4")
+        # Samples are nodes, unless they are late. At a transition the derivative is that just before it.
+        nearest = np.minimum(np.searchsorted(times, comparison.times[drawn] - late), len(times) - 1)
+        samples = _list_samples(comparison, drawn, None if slopes is None else slopes[nearest][:, columns], places)
         left_out = count - len(drawn) if comparison.kind == "measurements" else 0
         found.append(Curves(names, tuple(units), comparison.kind, curve, samples, left_out))
     measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
-    hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
-    if hidden:
+    if hidden := [k for k, name in enumerate(trajectory.state_names) if name not in measured]:
         names, given = (tuple(own[k] for k in hidden) for own in (trajectory.state_names, trajectory.state_units))
-        found.append(
-            Curves(names, tuple(map(format_unit, given)), "states", list_curve([first + k for k in hidden], 0))
-        )
+        curve = list_curve([first + k for k in hidden], 0.0)
+        found.append(Curves(names, tuple(map(format_unit, given)), "states", curve))
     return found
 
 
@@ -202,26 +197,12 @@ def _stack_outputs_and_states(
     return values, slopes, np.hstack([prediction.output_band(), prediction.state_band()])
 
 
-def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return which nodes are kept, the ends of all segments among them, and before which of these a curve breaks."""
+def _thin(segments: NDArray[np.intp], points: int) -> NDArray[np.intp]:
+    """Return which nodes are kept, the ends of all segments among them, with -1 where a transition breaks a curve."""
     stride = max(-(-int(segments[-1]) // points), 1)
-    parts = [
-        np.unique(np.concatenate([np.arange(start, end, stride), [end - 1]]))
-        for start, end in itertools.pairwise(segments.tolist())
-    ]
-    return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
-
-
-def _find_sample_slopes(
-    comparison: Comparison, nodes: Points, columns: Sequence[int], drawn: NDArray[np.intp], late: float
-) -> FloatArray:
-    """Return the derivatives of what is fitted at the samples that are drawn, all of them nodes unless late: (K, Q, d).
-
-    At a transition, that just before it.
-    """
-    nearest = np.minimum(np.searchsorted(nodes.times, comparison.times[drawn] - late), len(nodes.times) - 1)
-    is_every_node = comparison.kind == "reference" and len(comparison.times) == len(nodes.times)
-    return nodes.outputs_d[drawn if is_every_node else nearest][:, columns]
+    ends = itertools.pairwise(segments.tolist())
+    parts = [np.unique(np.append(np.arange(start, end, stride), end - 1)) for start, end in ends]
+    return np.concatenate([np.append(part, -1) for part in parts])[:-1]
 
 
 def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:

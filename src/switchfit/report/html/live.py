@@ -53,8 +53,7 @@ class LivePage:
         templates = files("switchfit.report.html") / "templates"
         page, css = ((templates / each).read_text(encoding="utf-8") for each in ("live.html", "report.css"))
         self.page = page.replace("/* report.css */", css)
-        self._count, self._lines = 0, tuple[str, ...]()
-        self._state = (self._count, self._lines)
+        self._state: tuple[int, tuple[str, ...]] = (0, ())
         try:
             self._server = ThreadingHTTPServer((ADDRESS, port), make_handler(self))
         except (OSError, OverflowError) as error:

@@ -11,10 +11,6 @@ them, and those of axes.
 
 from __future__ import annotations
 
-import base64
-import gzip
-import io
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -26,13 +22,11 @@ from bokeh.embed import json_item
 from bokeh.layouts import column
 from bokeh.plotting import figure
 from bokeh.resources import Resources
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 
 from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report import text
+from switchfit.report import sentences, style, text, uncertainty
 from switchfit.report.formats import Timed, describe_clock, format_span, label_quantity, label_time
 from switchfit.report.html.curves import (
     Columns,
@@ -46,8 +40,7 @@ from switchfit.report.html.curves import (
     list_transitions,
 )
 from switchfit.report.plot import choose_mode_colours, find_plane
-from switchfit.report.sentences import format_share, join_words, list_reasons, write_reason, write_step
-from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
+from switchfit.report.sentences import format_share
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.residuals import explain_worst, rank_runs
 from switchfit.uncertainty.verdict import find_issues
@@ -62,7 +55,7 @@ UNBROKEN = {"break-inside": "avoid"}
 WIDE: dict[str, Any] = {"sizing_mode": "stretch_width"}
 TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
 UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
-DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
+DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None, "tags": ["ink"]}
 DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
 """Of shades below the curves, of what was measured, and of what it is compared with."""
 DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
@@ -144,7 +137,7 @@ def _make_time_figure(
     plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
     own = sources["transitions"]
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
-    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
+    line = plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3, tags=["ink"])
     if height > RESIDUAL_HEIGHT:
         tips = [("transition", "@name"), ("modes", "@modes"), ("time", "@value"), ("95 %", "@interval")]
         _add_hover(plot, line, tips)
@@ -156,12 +149,6 @@ def _put_legend_above(plot: Any) -> None:
     plot.legend.click_policy = "hide"
     plot.legend.orientation = "horizontal"
     plot.add_layout(plot.legend[0], "above")
-
-
-def _tag(renderer: Any, tag: str) -> Any:
-    """Let the page's script colour a glyph."""
-    renderer.glyph.tags = [tag]
-    return renderer
 
 
 def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
@@ -185,8 +172,8 @@ def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSour
     if "lo0" in curves.curve:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
         plot.varea(x="fit_t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
-    still = _tag(plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED), "muted")
-    still.name, still.visible = "still", False
+    still = {"name": "still", "visible": False, "tags": ["muted"]}
+    plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED, **still)
     return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
 
 
@@ -195,9 +182,9 @@ def _draw_measured(
 ) -> Any:
     """Draw what is measured as dots, or a reference signal as a dashed line."""
     if curves.kind == "reference":
-        return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
+        return plot.line(x, y, source=source, line_width=1.6, tags=["ink"], **DASHED, **legend)
     size = next(size for most, size in DOT_SIZES.items() if len(curves.samples["t"]) <= most)
-    return _tag(plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend), "ink")
+    return plot.scatter(x, y, source=source, size=scale * size, **DOTS, **legend)
 
 
 def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
@@ -212,7 +199,7 @@ def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSo
 def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
     for side in ("s", "n") if "s0" in curves.samples else ():
-        _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
+        plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted", tags=["muted"])
     _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
 
 
@@ -225,8 +212,14 @@ def _draw_path(
     plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
     _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
     plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
-    mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
-    _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
+    mark: dict[str, Any] = {
+        "marker": "diamond",
+        "size": "size",
+        "fill_color": FIT,
+        "line_color": DATA,
+        "tags": ["edge"],
+    }
+    plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark)
     _put_legend_above(plot)
     return plot
 
@@ -237,8 +230,8 @@ def draw_slice() -> Any:
     plot.xaxis.axis_label.name = "slice-label"
     source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
     plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")
-    _tag(plot.line("x", "quadratic", source=source, legend_label="quadratic", **DASHED), "muted")
-    _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
+    plot.line("x", "quadratic", source=source, legend_label="quadratic", tags=["muted"], **DASHED)
+    plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA, tags=["edge"])
     plot.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
     plot.xaxis.ticker.desired_num_ticks = 4  # labels of dates are long
     plot.xaxis.formatter = models.CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
@@ -250,8 +243,6 @@ MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
 MOST_CHANNELS = 6
 """Channels of a run that are shown at first; the others are switched on."""
-MOST_DIAGNOSED = 2
-"""Channels whose residuals have figures."""
 MARGIN = 0.01
 """Part of the horizon that is shown before and after it."""
 MOST_SLIDERS = 24
@@ -273,40 +264,19 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    functions: list[Any] = [certify, find_issues, format_span, join_words, list_reasons, unit_suffix]
-    functions += [tabulate_certificate, tabulate_diagnostics, write_direction, write_reason, write_step]
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    functions = (certify, style.embed_figure, find_issues, format_span, unit_suffix)
     environment.globals |= {function.__name__: function for function in functions}
+    environment.globals |= {"sentences": sentences, "text": text, "uncertainty": uncertainty}
     runs, payload = _prepare_figures(estimate)
-    payload["drawings"] = drawings = {}
-    if estimate.residuals.channels:
-        drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
-    if any(record.optimality > 0 for record in estimate.history):
-        drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
-    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs, "text": text}
+    content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
-    content |= {"sliders": payload["sliders"], "sliders_cut": cut, "drawings": drawings, "library": library}
+    content |= {"payload": payload, "sliders": payload["sliders"], "sliders_cut": cut, "library": library}
     content |= {"correlated": [estimate.theta_names[i] for i in known]}
     content |= {"correlation": estimate.correlation[np.ix_(known, known)]}
-    return environment.get_template("report.html").render(content, payload=_write_json(payload))
-
-
-def _compress_svg(figure: Figure) -> str:
-    """Return a figure as SVG, compressed and in base64: a tenth of its size."""
-    figure.set_layout_engine(None)  # which draws everything twice more
-    height = figure.get_figheight()
-    figure.subplots_adjust(left=0.11, right=0.98, bottom=0.55 / height, top=1 - 0.4 / height)
-    drawn = io.BytesIO()
-    with rc_context({"svg.fonttype": "none"}):
-        figure.savefig(drawn, format="svg", transparent=True)
-    return base64.b64encode(gzip.compress(drawn.getvalue())).decode()
-
-
-def _write_json(value: Any) -> str:
-    """Return JSON that can stand inside a script element."""
-    written = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return environment.get_template("report.html").render(content)
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -338,11 +308,9 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
         ranges = {"times": {"start": first - margin, "end": last + margin}}
         figures.append({"template": template, "sources": written, "ranges": ranges})
-    sliders: list[dict[str, Any]] = []
-    if estimate.problem is not None and np.isfinite(estimate.cost):
-        movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
-        sliders = build_sliders(estimate, curves, list(movable))
-        templates |= {"slice": json_item(draw_slice())} if sliders else {}
+    movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
+    sliders = build_sliders(estimate, curves, list(movable) if np.isfinite(estimate.cost) else [])
+    templates |= {"slice": json_item(draw_slice())} if sliders else {}
     moved = [slider["place"] for slider in sliders]
     for slider in sliders:
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]

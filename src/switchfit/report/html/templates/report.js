@@ -152,15 +152,6 @@ window.switchfitDates = switchfitDates;
     document.getElementById(name).closest(".run")?.querySelectorAll("[data-channel]").forEach(switchChannel);
   }
 
-  // Drawings that nothing moves, as compressed SVG.
-  async function unpack(name, packed) {
-    const image = document.getElementById(name);
-    const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
-    const text = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
-    image.src = `data:image/svg+xml,${encodeURIComponent(text)}`;
-    await image.decode();
-  }
-
   function repaint() {
     for (const [name, doc] of documents) if (doc) doc.roots().forEach((root) => paint(root, name));
   }
@@ -331,7 +322,6 @@ window.switchfitDates = switchfitDates;
   if (chooser) chooser.addEventListener("change", () => show(chooser.value));
   (async () => {
     await show("0");
-    for (const [name, packed] of Object.entries(payload.drawings)) await unpack(name, packed);
     if (sliders.length) await embed("slice", { template: "slice", sources: sliceSources(), ranges: {} });
     move();
     document.documentElement.dataset.ready = "true";
