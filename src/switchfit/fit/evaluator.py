@@ -50,20 +50,29 @@ class Evaluator:
         Points at which the meshes are refined; the problem's initial guess if left out.
     meshes : sequence of Mesh, optional
         Meshes to use instead of refined ones.
+    arguments : sequence of Arguments, optional
+        Data and constants on these meshes, where they are not the problem's own.
     finer : float
         Multiplies the number of cells of refined meshes.
     """
 
     def __init__(
-        self, problem: Problem, *thetas: FloatArray, meshes: Sequence[Mesh] | None = None, finer: float = 1.0
+        self,
+        problem: Problem,
+        *thetas: FloatArray,
+        meshes: Sequence[Mesh] | None = None,
+        arguments: Sequence[Arguments] | None = None,
+        finer: float = 1.0,
     ) -> None:
         self.problem = problem
         if meshes is None:
             points = thetas or (problem.initial_theta,)
             meshes = [refine_mesh_of_run(run, *points, finer=finer) for run in self.runs]
         self.meshes = list(meshes)
-        padded = self._pad_meshes()
-        self._set_arguments([run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)])
+        if arguments is None:
+            arguments = [run.build_arguments(mesh) for run, mesh in zip(self.runs, self._pad_meshes(), strict=True)]
+        self.arguments = list(arguments)
+        self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
 
     @cached_property
     def runs(self) -> tuple[Run, ...]:
@@ -110,13 +119,14 @@ class Evaluator:
         return Evaluator(self.problem, meshes=[new or mesh for new, mesh in zip(found, self.meshes, strict=True)])
 
     def __call__(
-        self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
-    ) -> Evaluation[FloatArray]:
+        self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact", arrow: bool = False
+    ) -> Evaluation[Any]:
         """Return the cost, gradient and Hessian; for a transition time on a node, the derivatives on its `side`.
 
-        `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
+        `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN). As an `arrow`, it takes
+        time and memory that are linear in the number of experiments.
         """
-        whole = self._add_runs(self._evaluate_experiments(theta, side, method, matrix), len(theta))
+        whole = self._add_runs(self._evaluate_experiments(theta, side, method, matrix), len(theta), arrow)
         return self._add_priors(whole, theta, matrix)
 
     def constrained(self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0) -> Evaluation[FloatArray]:
@@ -127,19 +137,23 @@ class Evaluator:
         results = [engine.constrained(*at, side, own) for engine, at, own in each]
         return self._add_priors(self._add_runs(results, len(theta)), theta)
 
-    def _add_runs(self, results: list[Evaluation[FloatArray]], d: int) -> Evaluation[FloatArray]:
+    def _add_runs(self, results: list[Evaluation[FloatArray]], d: int, arrow: bool = False) -> Evaluation[Any]:
         """Return the sum of the evaluations of all experiments, which are in their own unknowns, in theta (d,)."""
-        if self.problem.one_to_one:
+        if self.problem.one_to_one and not arrow:
             return results[0]
-        cost, gradient, hessian, slopes = 0.0, np.zeros(d), np.zeros((d, d)), []
-        for one, (own, mine) in zip(results, self.problem.own_places, strict=True):
+        size = self.layout.own.shape[1] + len(self.layout.shared) if arrow else d
+        parts = np.zeros((len(results) if arrow else 1, size, size))
+        cost, gradient, slopes = 0.0, np.zeros(d), []
+        for e, (one, (own, mine)) in enumerate(zip(results, self.problem.own_places, strict=True)):
             cost += one.cost
             # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
             np.add.at(gradient, mine, one.gradient[own])
-            np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
+            part, places = (parts[e], self._slots[e]) if arrow else (parts[0], mine)
+            np.add.at(part, (places[:, None], places), one.hessian[own[:, None], own])
             slopes.append(np.zeros((len(one.constraints), d)))
             if len(one.constraints):
                 np.add.at(slopes[-1].T, mine, one.jacobian[:, own].T)
+        hessian = Arrow.of_runs(self.layout, parts) if arrow else parts[0]
         constraints, jacobian = np.concatenate([one.constraints for one in results]), np.concatenate(slopes)
         return Evaluation(cost, gradient, hessian, constraints, jacobian, _join_errors(results))
 
@@ -150,20 +164,6 @@ class Evaluator:
         J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
         hessian = found.hessian.plus_diagonal(h) if isinstance(found.hessian, Arrow) else found.hessian + np.diag(h)
         return replace(found, cost=found.cost + float(J), gradient=found.gradient + g, hessian=hessian)
-
-    def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> Evaluation[Arrow]:
-        """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
-        total, gradient, parts = 0.0, np.zeros(len(theta)), []
-        size = self.layout.own.shape[1] + len(self.layout.shared)
-        results = self._evaluate_experiments(theta, side, "auto", matrix)
-        for one, (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
-            total += one.cost
-            np.add.at(gradient, mine, one.gradient[own])
-            part = np.zeros((size, size))
-            np.add.at(part, (slots[:, None], slots), one.hessian[own[:, None], own])
-            parts.append(part)
-        whole = Evaluation(total, gradient, Arrow.of_runs(self.layout, parts), row_errors=_join_errors(results))
-        return self._add_priors(whole, theta, matrix)
 
     @cached_property
     def layout(self) -> ArrowLayout:
@@ -188,19 +188,6 @@ class Evaluator:
     def takes_implicit_steps(self) -> bool:
         """Whether a mode of an experiment takes implicit steps."""
         return any(any(structure.implicit) for structure in self.structures)
-
-    def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
-        """Replace data and constants; the meshes are those of the new nodes."""
-        for name in ("halved", "structures", "sorted_breakpoints", "_jax_engines"):
-            self.__dict__.pop(name, None)
-        before = zip(self.meshes, arguments, strict=True)
-        self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
-        self._set_arguments(list(arguments))
-
-    def _set_arguments(self, arguments: list[Arguments]) -> None:
-        """Store the arguments on the meshes that the evaluator has, and choose the engines."""
-        self.arguments = arguments
-        self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
 
     def judge_rows(self) -> Evaluator:
         """Estimate the errors of rows in all evaluations from now on; return the evaluator."""

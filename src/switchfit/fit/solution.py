@@ -183,17 +183,14 @@ def minimize_cost(
     change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
-
-    evaluate_theta: Callable[..., Evaluation[Any]] = source
-    if by_blocks and hessian not in ("none", "descent-first"):
-        evaluate_theta = source.arrow
+    arrow = by_blocks and hessian not in ("none", "descent-first")
 
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if change is None else change.to_theta(z)
         if multipliers is not None:
             here = source.constrained(theta, side, multipliers)
         else:
-            here = evaluate_theta(theta, side, matrix=matrix)
+            here = source(theta, side, matrix=matrix, arrow=arrow)
             if not seen:
                 seen.append(True)
                 # Unknowns that their bounds hold are not estimated: a search holds what acts in no mode.
