@@ -792,7 +792,7 @@ class Estimate(Fit, Tabular, Displayed):
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:
-        """Read what `save` wrote.
+        """Read what `save` wrote: every field is equal, and arrays have the same bits, dtype and shape.
 
         Parameters
         ----------
@@ -802,8 +802,11 @@ class Estimate(Fit, Tabular, Displayed):
 
         Raises
         ------
+        OSError
+            If there is no such file (FileNotFoundError) or it cannot be read.
         ValueError
-            If the file is not one of switchfit's, or the problem has other unknowns or other time units.
+            If it is not valid JSON, not written by switchfit, of another version, or not as it was written, or the
+            problem has other unknowns or other time units.
 
         See Also
         --------
@@ -825,10 +828,19 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        fit, certificate, provenance = load_saved(as_path(path, "path"))
+        file = as_path(path, "path")
+        content = read_document(file, "a saved estimate", FORMAT, VERSION)
+        try:
+            found = parse_fit(content)
+            provenance = from_json(Provenance | None, content.get("provenance"), "provenance")
+        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+            raise ValueError(f"{path} is damaged: {error}.") from error
+        if provenance is not None and provenance.folder:
+            folder = os.path.normpath(file.resolve().parent / provenance.folder)
+            provenance = replace(provenance, folder=folder)
         if problem is not None:
-            _check_loaded(fit, problem, path)
-        return cls(**vars(fit), saved_certificate=certificate, problem=problem, provenance=provenance)
+            _check_loaded(found, problem, path)
+        return replace(found, problem=problem, provenance=provenance)
 
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
@@ -1006,37 +1018,8 @@ def _compute_seal(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
 
 
-def load_saved(path: Path) -> tuple[Fit, Certificate, Provenance | None]:
-    """Return what `save_fit` wrote, with the provenance if it was saved.
-
-    Every field is equal, and arrays have the same bits, dtype and shape.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OSError
-        If there is no such file (FileNotFoundError) or it cannot be read.
-    ValueError
-        If it is not valid JSON, not written by switchfit, of another version, or not as it was written.
-    """
-    content = read_document(Path(path), "a saved estimate", FORMAT, VERSION)
-    try:
-        fit, certificate = parse_fit(content)
-        given = content.get("provenance")
-        if given is None:
-            return fit, certificate, None
-        found = from_json(Provenance, given, "provenance")
-        folder = found.folder and os.path.normpath(path.resolve().parent / found.folder)
-        return fit, certificate, replace(found, folder=folder)
-    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-        raise ValueError(f"{path} is damaged: {error}.") from error
-
-
-def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
-    """Return a fit and its certificate from the content of a file of this version.
+def parse_fit(content: Mapping[str, Any]) -> Estimate:
+    """Return an estimate, without its model, from the content of a file of this version.
 
     Parameters
     ----------
@@ -1049,4 +1032,5 @@ def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
     """
     if not isinstance(content, Mapping) or content.get("seal") != _compute_seal(content):
         raise ValueError("its content is not what was written")
-    return from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")
+    certificate = from_json(Certificate, content["certificate"], "certificate")
+    return Estimate(**vars(from_json(Fit, content["fit"], "fit")), saved_certificate=certificate)
