@@ -21,7 +21,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -698,7 +698,7 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if given is not None:
             return as_instance(given, "provenance", Provenance, "the provenance of a problem file")
-        return self.provenance if self.saved_certificate is not None else describe_python_problem()
+        return self.provenance if self.saved_certificate is not None else Provenance()
 
     def save_report(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
@@ -868,6 +868,30 @@ PACKAGES = ("switchfit", "daqp", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
 """Whose versions are kept."""
 
 
+@cache
+def find_version(package: str) -> str:
+    """Return the version of a package.
+
+    Parameters
+    ----------
+    package : str
+    """
+    try:
+        return version(package)
+    except PackageNotFoundError:  # a copy of the sources that is not installed
+        return "not installed as a package"
+
+
+def find_versions() -> dict[str, str]:
+    """Return the versions of Python and of `PACKAGES`."""
+    return {"Python": platform.python_version(), **{package: find_version(package) for package in PACKAGES}}
+
+
+def describe_platform() -> str:
+    """Return operating system and processor."""
+    return f"{platform.platform()}, {platform.machine()}"
+
+
 @dataclass(frozen=True)
 class FileDigest:
     """A file that a fit was made from.
@@ -889,7 +913,7 @@ class FileDigest:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a fit was made from.
+    """What a fit was made from; by default a problem that was built in Python, here.
 
     Attributes
     ----------
@@ -911,14 +935,14 @@ class Provenance:
     platform : str
     """
 
-    problem_file: str
-    folder: str
-    text: str
-    log: str
-    options: Mapping[str, int | float | str]
-    files: tuple[FileDigest, ...]
-    versions: Mapping[str, str]
-    platform: str
+    problem_file: str = ""
+    folder: str = ""
+    text: str = ""
+    log: str = ""
+    options: Mapping[str, int | float | str] = field(default_factory=dict)
+    files: tuple[FileDigest, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=find_versions)
+    platform: str = field(default_factory=describe_platform)
 
 
 def make_relative(path: str | Path, folder: str | Path) -> str:
@@ -933,35 +957,6 @@ def make_relative(path: str | Path, folder: str | Path) -> str:
         return Path(os.path.relpath(whole, os.path.abspath(folder))).as_posix()
     except ValueError:
         return Path(whole).as_posix()
-
-
-def describe_python_problem() -> Provenance:
-    """Return what is known of a problem that was built in Python: versions and platform."""
-    return Provenance("", "", "", "", {}, (), find_versions(), describe_platform())
-
-
-def find_versions() -> dict[str, str]:
-    """Return the versions of Python and of `PACKAGES`."""
-    return {"Python": platform.python_version(), **{package: find_version(package) for package in PACKAGES}}
-
-
-@cache
-def find_version(package: str) -> str:
-    """Return the version of a package.
-
-    Parameters
-    ----------
-    package : str
-    """
-    try:
-        return version(package)
-    except PackageNotFoundError:  # a copy of the sources that is not installed
-        return "not installed as a package"
-
-
-def describe_platform() -> str:
-    """Return operating system and processor."""
-    return f"{platform.platform()}, {platform.machine()}"
 
 
 FORMAT = "switchfit fit"

@@ -284,11 +284,6 @@ def evaluator_of(problem: Problem) -> Evaluator:
     return Evaluator(problem)
 
 
-def is_kept(evaluator: Evaluator) -> bool:
-    """Return whether an evaluator is the one that its problem keeps, by `evaluator_of`."""
-    return evaluator is evaluator.problem.__dict__.get(evaluator_of.__name__)
-
-
 def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation[FloatArray]:
     """Evaluate the cost, the exact gradient and the exact Hessian of a problem.
 

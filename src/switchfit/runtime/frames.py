@@ -49,8 +49,7 @@ def describe_frame(result: Any, **settings: Any) -> Frame:
     settings
         Keyword arguments of the registered function.
     """
-    frame: Frame = call_registered(describe_frame, result, **settings)
-    return frame
+    return call_registered(describe_frame, result, **settings)
 
 
 class Tabular:

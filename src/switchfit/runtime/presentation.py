@@ -31,7 +31,7 @@ def register_later(load: Callable[[], object]) -> None:
     _loaders.append(load)
 
 
-def call_registered(dispatcher: Any, result: object, **settings: Any) -> Any:
+def call_registered(dispatcher: Callable[..., T], result: object, **settings: Any) -> T:
     """Call the function that is registered for a result, after importing the modules that register functions.
 
     For the default of a dispatcher, which is what a result gets as long as those modules are not imported.
@@ -51,9 +51,10 @@ def call_registered(dispatcher: Any, result: object, **settings: Any) -> Any:
     """
     for load in _loaders:
         load()
-    function = dispatcher.dispatch(type(result))
-    if function is dispatcher.dispatch(object):
-        name = dispatcher.__name__
+    registered: Any = dispatcher
+    function: Callable[..., T] = registered.dispatch(type(result))
+    if function is registered.dispatch(object):
+        name = registered.__name__
         raise TypeError(f"{name} has no function for a {type(result).__name__}: register one with {name}.register.")
     return function(result, **settings)
 
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Figure
     from typing_extensions import TypeVar
 
+    T = TypeVar("T")
     Drawn = TypeVar("Drawn", bound=Axes | Figure, default=Figure)
 else:
     Axes = Figure = Drawn = Any  # for annotations: to import matplotlib takes longer than half of switchfit
@@ -87,8 +89,7 @@ else:
 @singledispatch
 def format_text(result: Any, **settings: Any) -> str:
     """Return a result as plain text, of one or more lines, without a newline at the end."""
-    text: str = call_registered(format_text, result, **settings)
-    return text
+    return call_registered(format_text, result, **settings)
 
 
 @singledispatch
@@ -100,15 +101,13 @@ def draw_figure(result: Any, **settings: Any) -> Any:
 @singledispatch
 def format_page(result: Any, **settings: Any) -> str:
     """Return a result as one HTML page that needs no other file."""
-    text: str = call_registered(format_page, result, **settings)
-    return text
+    return call_registered(format_page, result, **settings)
 
 
 @singledispatch
 def format_html(result: Any) -> str:
     """Return a result as a few lines of HTML, as a notebook shows it."""
-    text: str = call_registered(format_html, result)
-    return text
+    return call_registered(format_html, result)
 
 
 class Printed:

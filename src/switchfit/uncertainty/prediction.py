@@ -372,8 +372,7 @@ class Prediction(Tabular):
         >>> len(fit.predict(np.linspace(0.0, 9.0, 200)).plot().axes)
         1
         """
-        figure: Figure = draw_figure(self, level=as_level(level))
-        return figure
+        return draw_figure(self, level=as_level(level))
 
 
 def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:
