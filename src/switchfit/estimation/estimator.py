@@ -31,13 +31,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, inverse_on
+from switchfit.fit.result import Fit, inverse_on, measure_quantile
 from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
-from switchfit.runtime import special
 from switchfit.runtime.files import from_json, read_document, to_json, write_atomically, write_document
 from switchfit.runtime.frames import Tabular, build_pandas, describe_frame
 from switchfit.runtime.presentation import (
@@ -390,8 +389,7 @@ class Estimate(Fit, Tabular, Displayed):
         """
         intervals = super().confidence_intervals(level)
         if hessian != "exact":
-            by_t = float(special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
-            quantile = by_t if hessian == "sandwich" else self.quantile(level)
+            quantile = measure_quantile(level, max(self.freedom, 1), self.sigma_known and hessian != "sandwich")
             return self.build_intervals(quantile * np.sqrt(np.diag(self.covariance_from(hessian))))
         pieces, places = self._trace_profiles(level)
         return replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))

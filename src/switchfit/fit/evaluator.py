@@ -155,7 +155,8 @@ class Evaluator:
                 np.add.at(slopes[-1].T, mine, one.jacobian[:, own].T)
         hessian = Arrow.of_runs(self.layout, parts) if arrow else parts[0]
         constraints, jacobian = np.concatenate([one.constraints for one in results]), np.concatenate(slopes)
-        return Evaluation(cost, gradient, hessian, constraints, jacobian, _join_errors(results))
+        row_errors = tuple(one.row_errors[0] if one.row_errors else np.nan for one in results)
+        return Evaluation(cost, gradient, hessian, constraints, jacobian, row_errors)
 
     def _add_priors(self, found: Evaluation[Any], theta: FloatArray, matrix: Matrix = "exact") -> Evaluation[Any]:
         """Return an evaluation with the priors in cost, gradient and Hessian."""
@@ -268,11 +269,6 @@ class Evaluator:
         return points
 
 
-def _join_errors(results: Sequence[Evaluation[FloatArray]]) -> tuple[float, ...]:
-    """Return the errors of the rows of each experiment."""
-    return tuple(one.row_errors[0] if one.row_errors else np.nan for one in results)
-
-
 def is_covered_by_paper(problem: Problem) -> bool:
     """Return whether the paper's equations cover all terms of the cost."""
     return not any(any(f is not None for f in s.transition_costs) for s in problem.structures)
@@ -336,10 +332,8 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     evaluator = evaluator_of(problem)
     at = problem.check_theta(theta)
     found = evaluator(at, method=method)
-    if problem.constraint_names:
-        held = evaluator.constrained(at)
-        found = replace(found, constraints=held.constraints, jacobian=held.jacobian)
-    return replace(found, stiffness=evaluator.stiffness) if evaluator.stiffness else found
+    held = evaluator.constrained(at) if problem.constraint_names else found
+    return replace(found, constraints=held.constraints, jacobian=held.jacobian, stiffness=evaluator.stiffness)
 
 
 ITERATIONS = 60
