@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh, Stiffness
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh_of_run
-from switchfit.engine.choice import SplitEngine, engine_of, summarize
-from switchfit.engine.jax import JaxEngine
-from switchfit.engine.protocol import Engine, Evaluation, Matrix, Run, Simulation, runs_of
+from switchfit.engine.choice import SmoothEngine, SplitEngine, engine_of, summarize
+from switchfit.engine.native.engine import NativeEngine
+from switchfit.engine.protocol import DenseEvaluation, Engine, Evaluation, Matrix, Run, Simulation, runs_of
 from switchfit.optimize.matrix import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
@@ -225,34 +225,25 @@ class Evaluator:
             return [engine.derivatives(*find(theta, e), side, matrix) for e, engine in enumerate(self.engines)]
         if method == "adjoint" and not is_covered_by_paper(self.problem):
             raise ValueError("the paper's equations have no TransitionCost: choose another method.")
+        by: Any = "forward" if method == "autodiff" else method
+
+        def evaluate(
+            e: int, p: FloatArray, structure: Structure, engine: SmoothEngine, tau: FloatArray
+        ) -> DenseEvaluation:
+            if method == "adjoint":
+                with use_float64(), use_compilation_cache():
+                    J, g, H = evaluate_paper(self.arguments[e], tau, p, float(side), structure=structure)
+                return Evaluation(float(J), np.array(g), np.array(H))
+            by_jax = engine.fallback if isinstance(engine, NativeEngine) else engine
+            return by_jax.derivatives(tau, p, side, matrix, by)
+
         found = []
-        for e, (tau, p) in enumerate(self._vectors(theta)):
-            engine, evaluate = self.engines[e], partial(self._evaluate_by, method, e, p=p, side=side, matrix=matrix)
+        for e, (engine, (tau, p)) in enumerate(zip(self.engines, self._vectors(theta), strict=True)):
             if isinstance(engine, SplitEngine):
-                found.append(engine.derivatives(tau, p, side, matrix, evaluate))
+                found.append(engine.derivatives(tau, p, side, matrix, partial(evaluate, e, p)))
             else:
-                found.append(evaluate(self.structures[e], tau))
+                found.append(evaluate(e, p, self.structures[e], engine, tau))
         return found
-
-    def _evaluate_by(
-        self, method: Any, e: int, structure: Structure, tau: FloatArray, p: FloatArray, side: int, matrix: Matrix
-    ) -> Evaluation[FloatArray]:
-        """Evaluate experiment e by the paper's equations or by JAX, which keeps its arguments on its device."""
-        if method == "adjoint":
-            with use_float64(), use_compilation_cache():
-                J, g, H = evaluate_paper(self.arguments[e], tau, p, float(side), structure=structure)
-            return Evaluation(float(J), np.array(g), np.array(H))
-        own = self.engines[e]
-        if not isinstance(own, JaxEngine):
-            key = e, structure
-            if key not in self._jax_engines:
-                self._jax_engines[key] = JaxEngine(structure, self.arguments[e], self.meshes[e])
-            own = self._jax_engines[key]
-        return own.derivatives(tau, p, side, matrix, "forward" if method == "autodiff" else method)
-
-    @cached_property
-    def _jax_engines(self) -> dict[tuple[int, Structure], JaxEngine]:
-        return {}
 
     @cached_property
     def sorted_breakpoints(self) -> Breakpoints:
