@@ -73,8 +73,10 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     for group in _list_idle_groups(problem, theta):
         idle[group[0]] = True
     if parameters and any(_has_collapsed(problem, theta, e) for e in range(len(problem.experiments))):
+        base = evaluator.cost(theta)
         for i in _list_parameters(problem):
-            idle[i] = not _has_effect(evaluator, theta, i)
+            moved = map(evaluator.cost, list_changes(problem, theta, i, CHANGES))
+            idle[i] = all(abs(cost - base) <= NO_EFFECT * abs(base) for cost in moved)
     return idle
 
 
@@ -134,13 +136,6 @@ def _list_parameters(problem: Problem) -> list[int]:
     spans = problem.unknowns.parameters.values()
     without = {name for names in find_unread(problem) for name in names}
     return [i for span in spans for i in range(span.start, span.stop) if problem.theta_names[i] not in without]
-
-
-def _has_effect(evaluator: Evaluator, theta: FloatArray, i: int) -> bool:
-    """Return whether J changes with unknown i."""
-    base = evaluator.cost(theta)
-    moved = map(evaluator.cost, list_changes(evaluator.problem, theta, i, CHANGES))
-    return any(not abs(cost - base) <= NO_EFFECT * abs(base) for cost in moved)
 
 
 MANY_RUNS = 16

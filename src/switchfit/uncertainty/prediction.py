@@ -453,8 +453,12 @@ def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Pred
     e : int, from 0
     points : Points
     """
-    covariance = _require_covariance(fit)
-    trajectory = fit.trajectories[e]
+    if not np.isfinite(fit.covariance).all():
+        raise ValueError(
+            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
+            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
+        )
+    covariance, trajectory = fit.corrected_covariance, fit.trajectories[e]
     names = [name for comparison in fit.comparisons[e] for name in comparison.names]
     return Prediction(
         points.times,
@@ -472,16 +476,6 @@ def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Pred
         trajectory.origin,
         not np.array_equal(covariance, fit.covariance),
     )
-
-
-def _require_covariance(fit: Any) -> FloatArray:
-    """Return the corrected covariance of a fit; raise ValueError if it has none."""
-    if not np.isfinite(fit.covariance).all():
-        raise ValueError(
-            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
-            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
-        )
-    return np.asarray(fit.corrected_covariance)
 
 
 def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, times: FloatArray) -> Points:
