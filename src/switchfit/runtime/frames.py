@@ -49,7 +49,8 @@ def describe_frame(result: Any, **settings: Any) -> Frame:
     settings
         Keyword arguments of the registered function.
     """
-    return call_registered(describe_frame, result, **settings)
+    frame: Frame = call_registered(describe_frame, result, **settings)
+    return frame
 
 
 class Tabular:

@@ -31,7 +31,7 @@ def register_later(load: Callable[[], object]) -> None:
     _loaders.append(load)
 
 
-def call_registered(dispatcher: Callable[..., T], result: object, **settings: Any) -> T:
+def call_registered(dispatcher: Any, result: object, **settings: Any) -> Any:
     """Call the function that is registered for a result, after importing the modules that register functions.
 
     For the default of a dispatcher, which is what a result gets as long as those modules are not imported.
@@ -51,10 +51,9 @@ def call_registered(dispatcher: Callable[..., T], result: object, **settings: An
     """
     for load in _loaders:
         load()
-    registered: Any = dispatcher
-    function: Callable[..., T] = registered.dispatch(type(result))
-    if function is registered.dispatch(object):
-        name = registered.__name__
+    function = dispatcher.dispatch(type(result))
+    if function is dispatcher.dispatch(object):
+        name = dispatcher.__name__
         raise TypeError(f"{name} has no function for a {type(result).__name__}: register one with {name}.register.")
     return function(result, **settings)
 
@@ -79,7 +78,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Figure
     from typing_extensions import TypeVar
 
-    T = TypeVar("T")
     Drawn = TypeVar("Drawn", bound=Axes | Figure, default=Figure)
 else:
     Axes = Figure = Drawn = Any  # for annotations: to import matplotlib takes longer than half of switchfit
@@ -89,7 +87,8 @@ else:
 @singledispatch
 def format_text(result: Any, **settings: Any) -> str:
     """Return a result as plain text, of one or more lines, without a newline at the end."""
-    return call_registered(format_text, result, **settings)
+    text: str = call_registered(format_text, result, **settings)
+    return text
 
 
 @singledispatch
@@ -101,13 +100,15 @@ def draw_figure(result: Any, **settings: Any) -> Any:
 @singledispatch
 def format_page(result: Any, **settings: Any) -> str:
     """Return a result as one HTML page that needs no other file."""
-    return call_registered(format_page, result, **settings)
+    text: str = call_registered(format_page, result, **settings)
+    return text
 
 
 @singledispatch
 def format_html(result: Any) -> str:
     """Return a result as a few lines of HTML, as a notebook shows it."""
-    return call_registered(format_html, result)
+    text: str = call_registered(format_html, result)
+    return text
 
 
 class Printed:

@@ -113,20 +113,17 @@ def limit_unknowns(problem: Problem) -> Limits:
     unknowns, d = problem.unknowns, len(problem.theta_names)
     found = Limits(np.full(d, -1), np.zeros(d), unknowns.lower.copy(), unknowns.upper.copy())
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        times, places = experiment.initial_times, where.tolist()
-        gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
+        free, times = where >= 0, experiment.initial_times
+        gaps = np.array([get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence])
         latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
-        for i in reversed(range(len(places))):
-            latest = min(latest, times[i] if places[i] < 0 else found.high[places[i]])
-            if places[i] >= 0:
-                found.high[places[i]] = latest
-            latest -= gaps[i]
-        before, earliest = -1, experiment.t0
-        for i, place in enumerate(places):
-            earliest = max(earliest + gaps[i], times[i] if place < 0 else found.low[place])
-            if place >= 0:
-                found.before[place], found.gap[place], found.low[place] = before, gaps[i], earliest
-            before = place
+        low, high = np.where(free, [found.low[where], found.high[where]], times)
+        # Without the gaps before them, times are in order.
+        ahead = np.cumsum(gaps)[: len(where)]
+        earlier = np.maximum.accumulate(np.maximum(low - ahead, experiment.t0)) + ahead
+        later = np.minimum.accumulate(np.minimum(high - ahead, latest - ahead[-1:])[::-1])[::-1] + ahead
+        own = where[free]
+        found.before[own], found.gap[own] = np.append(-1, where)[:-1][free], gaps[: len(where)][free]
+        found.low[own], found.high[own] = np.maximum(low, earlier)[free], np.minimum(high, later)[free]
     return found
 
 
