@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,7 +57,7 @@ from switchfit.uncertainty.prediction import (
     Sensitivity,
     build_gauss_newton,
     collect_sample_derivatives,
-    compute_sensitivity,
+    compute_sensitivities,
     predict,
 )
 from switchfit.uncertainty.profiles import Profile, profile
@@ -320,9 +320,7 @@ class Estimate(Fit, Tabular, Displayed):
     @cached_property
     def sensitivities(self) -> tuple[Sensitivity, ...]:
         """States and outputs with their derivatives in theta, one per experiment, on the meshes of the fit."""
-        evaluator = self.evaluator_at_solution()
-        meshes = enumerate(evaluator.meshes)
-        return tuple(compute_sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
+        return compute_sensitivities(self.evaluator_at_solution(), self.theta)
 
     def evaluator_at_solution(self) -> Evaluator:
         """Return the problem on the meshes of the fit; of a loaded estimate on meshes refined at the solution.
@@ -350,9 +348,9 @@ class Estimate(Fit, Tabular, Displayed):
             raise ValueError(
                 "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
             )
-        if self.evaluator is None:  # of a loaded estimate, whose meshes are not saved
-            object.__setattr__(self, "evaluator", Evaluator(self.problem, self.theta))
-        return cast(Evaluator, self.evaluator)
+        evaluator = self.evaluator or Evaluator(self.problem, self.theta)  # the meshes of an estimate are not saved
+        object.__setattr__(self, "evaluator", evaluator)
+        return evaluator
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return intervals of all unknowns, cut off at the bounds: (d, 2).

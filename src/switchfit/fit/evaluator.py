@@ -103,9 +103,8 @@ class Evaluator:
 
     def halve_rows(self, theta: FloatArray) -> Evaluator:
         """Return the same problem with every step at theta cut in two, to estimate the integration error."""
-        times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
-        meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
-        return Evaluator(self.problem, meshes=meshes)
+        each = zip(self.meshes, self._vectors(theta), strict=True)
+        return Evaluator(self.problem, meshes=[mesh.halve_rows(tau) for mesh, (tau, _) in each])
 
     def stabilize(self, *thetas: FloatArray) -> Evaluator | None:
         """Return the same problem with implicit steps where explicit ones are unstable near the last of some thetas;
@@ -206,10 +205,10 @@ class Evaluator:
         """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
         return summarize(self.engines, self.problem.run_names)
 
-    def simulate(self, theta: FloatArray) -> list[Simulation]:
-        """Simulate all experiments row by row."""
+    def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
+        """Simulate all experiments row by row, with the derivatives of rows if `tangents`."""
         each = zip(self.engines, self._vectors(theta), strict=True)
-        return [engine.simulate(*at, tangents=False) for engine, at in each]
+        return [engine.simulate(*at, tangents=tangents) for engine, at in each]
 
     def _vectors(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Return the transition times (N,) and parameters (M,) of each experiment."""

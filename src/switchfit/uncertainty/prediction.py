@@ -40,6 +40,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import read_times, select_visible
 from switchfit.problem.data import FloatArray, influence
@@ -137,6 +138,18 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
     engine = engine_of(run, run.build_arguments(mesh), mesh)
     simulation = engine.simulate(*run.vectors(theta), tangents=True)
     return Sensitivity(simulation, problem.places[e], theta)
+
+
+def compute_sensitivities(evaluator: Evaluator, theta: FloatArray) -> tuple[Sensitivity, ...]:
+    """Return the same of each experiment on the meshes of an evaluator.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    """
+    each = zip(evaluator.simulate(theta, tangents=True), evaluator.problem.places, strict=True)
+    return tuple(Sensitivity(simulation, places, theta) for simulation, places in each)
 
 
 class SampleDerivatives(NamedTuple):
