@@ -33,7 +33,7 @@ def run(report: Report, quick: bool) -> None:
         evaluator = Evaluator(problem)
         evaluator(problem.initial_theta)
         first, programs = time.perf_counter() - began, _program_of.cache_info().misses - before
-        alone = _fastest(lambda at=evaluator, theta=problem.initial_theta: at.arrow(theta))
+        alone = _fastest(lambda at=evaluator, theta=problem.initial_theta: at(theta, arrow=True))
         blocks, iterations = _iteration(evaluator, by_blocks=True)
         full, _ = _iteration(evaluator, by_blocks=False)
         for name, seconds in zip(least, (alone, blocks, full), strict=True):

@@ -79,7 +79,7 @@ def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
     variables = Variables.of(theta, np.array([theta - 100, theta + 100]), log, ~log, origin)
     runs = [replace(ramp(0, "log").experiments[0], name=name) for name in "ab"]
     problem = sf.Problem(RAMP, runs, {"v": 2.0})
-    here = Evaluator(problem).arrow(problem.initial_theta)
+    here = Evaluator(problem)(problem.initial_theta, arrow=True)
     assert isinstance(here.hessian, Arrow)
     found = _to_variables(variables, theta, here, None)
     expected = variables.derivatives_inward(theta, here.gradient, here.hessian.dense())

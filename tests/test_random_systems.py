@@ -527,7 +527,7 @@ def differences(
                 tolerances = PAPER if method == "adjoint" else CLOSE
                 wrong += compare(kinds, f"{where}, {method}", evaluator(theta, side, method), expected, tolerances)
             if len(problem.experiments) > 1:
-                arrow = evaluator.arrow(theta, side)
+                arrow = evaluator(theta, side, arrow=True)
                 wrong += compare(kinds, f"{where}, arrow", replace(arrow, hessian=arrow.hessian.dense()), expected)
             if problem.constraint_names:
                 wrong += compare_constrained(kinds, f"{where}, constrained", evaluator, theta, side, expected)

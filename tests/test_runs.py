@@ -207,7 +207,7 @@ def test_by_blocks_a_fit_is_the_same(monkeypatch):
     monkeypatch.setattr(solution, "MANY_RUNS", 6)
     blocks = minimize_cost(evaluator, problem.initial_theta, "exact", 1e-7, 200)
     np.testing.assert_allclose(blocks.theta, full.theta, rtol=1e-8, atol=1e-9)
-    at, arrow = evaluator(full.theta), evaluator.arrow(full.theta)
+    at, arrow = evaluator(full.theta), evaluator(full.theta, arrow=True)
     np.testing.assert_allclose(arrow.gradient, at.gradient, rtol=1e-14, atol=1e-10)
     np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
 
@@ -329,7 +329,7 @@ def test_a_run_takes_the_entries_that_it_reads(engine):
     assert named[1] == ["k[0]", "k[1]", "k[2]", "k[3]", "starts[1,0]", "starts[1,1]", "gain[1]", "sigma"]
     assert named[2] == ["k[0]", "k[1]", "k[2]", "others[2,0]", "others[2,1]", "gain[2]", "sigma"]
     theta = few.initial_theta * np.linspace(0.97, 1.03, len(few.theta_names))
-    (one, arrow), (other, _) = ((each(theta), each.arrow(theta)) for each in map(evaluator_of, (few, whole)))
+    (one, arrow), (other, _) = ((each(theta), each(theta, arrow=True)) for each in map(evaluator_of, (few, whole)))
     for name in ("cost", "gradient", "hessian"):
         expected = getattr(other, name)
         np.testing.assert_allclose(getattr(one, name), expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())

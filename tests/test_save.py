@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
-from switchfit.estimation.estimator import FORMAT, VERSION, load_saved, save_fit
+from switchfit.estimation.estimator import FORMAT, VERSION, Estimate, save_fit
 from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
 from switchfit.problem.unknowns import ActiveConstraint
@@ -54,7 +54,13 @@ def assert_same(a, b):
 
 def round_trip(fit: Fit, folder: Path) -> tuple[Fit, Certificate]:
     save_fit(fit, CERTIFICATE, folder / "fit.json")
-    return load_saved(folder / "fit.json")[:2]
+    found = Estimate.load(folder / "fit.json")
+    return get_fit(found), found.certificate
+
+
+def get_fit(estimate: Estimate) -> Fit:
+    """Return what a file holds of an estimate."""
+    return Fit(**{f.name: getattr(estimate, f.name) for f in fields(Fit)})
 
 
 def without_numbers() -> Fit:
@@ -158,7 +164,7 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
     path = tmp_path / "fit.json"
     path.write_bytes(text)
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{message}"):
-        load_saved(path)
+        Estimate.load(path)
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(12_000, marks=pytest.mark.fuzz)])
@@ -178,7 +184,7 @@ def test_a_file_with_damaged_bytes_is_refused_or_the_same(count, tmp_path):
         path.write_bytes(data)
         refusal = f"{path} is whole"
         try:
-            assert_same(made(), load_saved(path)[0])
+            assert_same(made(), get_fit(Estimate.load(path)))
         except ValueError as error:
             refusal = str(error)
         assert refusal.startswith(f"{path} is "), f"damage {number}"
@@ -197,8 +203,8 @@ def test_what_is_not_as_it_was_written(change, tmp_path):
     save_fit(made(), CERTIFICATE, path)
     content = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps(content))
-    assert load_saved(path)[0].cost == 28.0, "in another layout"
+    assert Estimate.load(path).cost == 28.0, "in another layout"
     change(content)
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="is damaged: its content is not what was written"):
-        load_saved(path)
+        Estimate.load(path)

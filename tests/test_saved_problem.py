@@ -14,7 +14,7 @@ from test_cli import PROBLEM, ROOM
 from test_many_logs import log_of, run
 
 import switchfit as sf
-from switchfit.estimation.estimator import describe_python_problem
+from switchfit.estimation.estimator import Provenance
 from switchfit.io.command_line import list_changed_models, load_with_problem
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
@@ -208,7 +208,7 @@ def test_an_estimate_of_python_keeps_versions(project):
     fit = sf.Estimate.load("heater.json")
     found = fit.provenance
     assert (found.problem_file, found.text, found.files) == ("", "", ())
-    assert found == describe_python_problem()
+    assert found == Provenance()
     assert "does not have its problem, which was built in Python: functions are not saved" in refuse_to_build(
         "heater.json"
     )

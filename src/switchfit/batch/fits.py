@@ -76,10 +76,7 @@ def load_best(content: Any) -> Estimate | None:
     content : mapping or None
         As `describe_best` returned it.
     """
-    if content is None:
-        return None
-    fit, certificate = parse_fit(content)
-    return Estimate(**vars(fit), saved_certificate=certificate)
+    return None if content is None else parse_fit(content)
 
 
 @dataclass(frozen=True, eq=False)

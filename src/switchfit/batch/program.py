@@ -433,8 +433,10 @@ class Batch:
         """Return the evaluator with the data of the k-th fit."""
         with use_float64():
             values = [jnp.asarray(value[k]) for value in self.varying.values()]
-            self.evaluator.replace_arguments(replace_leaves(self._base, self.varying, values))
-        return self.evaluator
+            arguments = replace_leaves(self._base, self.varying, values)
+        given = zip(self.evaluator.meshes, arguments, strict=True)
+        meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in given]
+        return Evaluator(self.evaluator.problem, meshes=meshes, arguments=arguments)
 
     def _run_program(self, starts: FloatArray) -> Outcome:
         """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""

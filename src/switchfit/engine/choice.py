@@ -55,7 +55,7 @@ SmoothEngine = NativeEngine | JaxEngine
 """Of a structure whose modes are smooth."""
 
 Build = Callable[[Structure], SmoothEngine]
-Evaluate = Callable[[Structure, FloatArray], DenseEvaluation]
+Evaluate = Callable[[Structure, SmoothEngine, FloatArray], DenseEvaluation]
 
 
 OWN = -2
@@ -153,7 +153,7 @@ class SplitEngine:
             found = split.engine.constrained(*at, np.zeros(len(found.constraints)))
         own, (T, multipliers) = found, self._eliminate(split, found)
         if method is not None:
-            own = method(split.structure, self._times)
+            own = method(split.structure, split.engine, self._times)
         elif matrix == "none" or (matrix == "gauss-newton" and not split.has_gauss_newton):
             own = split.engine.derivatives(*at, matrix)
         # T' D^2 (J + lam . g) T: the second derivatives of sigma(theta) enter by lam alone. `own` may be another matrix

@@ -21,23 +21,22 @@ import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, inverse_on
+from switchfit.fit.result import Fit, inverse_on, measure_quantile
 from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
-from switchfit.runtime import special
 from switchfit.runtime.files import from_json, read_document, to_json, write_atomically, write_document
 from switchfit.runtime.frames import Tabular, build_pandas, describe_frame
 from switchfit.runtime.presentation import (
@@ -58,7 +57,7 @@ from switchfit.uncertainty.prediction import (
     Sensitivity,
     build_gauss_newton,
     collect_sample_derivatives,
-    compute_sensitivity,
+    compute_sensitivities,
     predict,
 )
 from switchfit.uncertainty.profiles import Profile, profile
@@ -321,9 +320,7 @@ class Estimate(Fit, Tabular, Displayed):
     @cached_property
     def sensitivities(self) -> tuple[Sensitivity, ...]:
         """States and outputs with their derivatives in theta, one per experiment, on the meshes of the fit."""
-        evaluator = self.evaluator_at_solution()
-        meshes = enumerate(evaluator.meshes)
-        return tuple(compute_sensitivity(evaluator.problem, e, self.theta, mesh) for e, mesh in meshes)
+        return compute_sensitivities(self.evaluator_at_solution(), self.theta)
 
     def evaluator_at_solution(self) -> Evaluator:
         """Return the problem on the meshes of the fit; of a loaded estimate on meshes refined at the solution.
@@ -351,9 +348,9 @@ class Estimate(Fit, Tabular, Displayed):
             raise ValueError(
                 "This estimate was loaded without its model: load it with Estimate.load(path, problem=problem)."
             )
-        if self.evaluator is None:  # of a loaded estimate, whose meshes are not saved
-            object.__setattr__(self, "evaluator", Evaluator(self.problem, self.theta))
-        return cast(Evaluator, self.evaluator)
+        evaluator = self.evaluator or Evaluator(self.problem, self.theta)  # the meshes of an estimate are not saved
+        object.__setattr__(self, "evaluator", evaluator)
+        return evaluator
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return intervals of all unknowns, cut off at the bounds: (d, 2).
@@ -390,8 +387,7 @@ class Estimate(Fit, Tabular, Displayed):
         """
         intervals = super().confidence_intervals(level)
         if hessian != "exact":
-            by_t = float(special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
-            quantile = by_t if hessian == "sandwich" else self.quantile(level)
+            quantile = measure_quantile(level, max(self.freedom, 1), self.sigma_known and hessian != "sandwich")
             return self.build_intervals(quantile * np.sqrt(np.diag(self.covariance_from(hessian))))
         pieces, places = self._trace_profiles(level)
         return replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))
@@ -698,7 +694,7 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if given is not None:
             return as_instance(given, "provenance", Provenance, "the provenance of a problem file")
-        return self.provenance if self.saved_certificate is not None else describe_python_problem()
+        return self.provenance if self.saved_certificate is not None else Provenance()
 
     def save_report(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
@@ -792,7 +788,7 @@ class Estimate(Fit, Tabular, Displayed):
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:
-        """Read what `save` wrote.
+        """Read what `save` wrote: every field is equal, and arrays have the same bits, dtype and shape.
 
         Parameters
         ----------
@@ -802,8 +798,11 @@ class Estimate(Fit, Tabular, Displayed):
 
         Raises
         ------
+        OSError
+            If there is no such file (FileNotFoundError) or it cannot be read.
         ValueError
-            If the file is not one of switchfit's, or the problem has other unknowns or other time units.
+            If it is not valid JSON, not written by switchfit, of another version, or not as it was written, or the
+            problem has other unknowns or other time units.
 
         See Also
         --------
@@ -825,10 +824,19 @@ class Estimate(Fit, Tabular, Displayed):
         """
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        fit, certificate, provenance = load_saved(as_path(path, "path"))
+        file = as_path(path, "path")
+        content = read_document(file, "a saved estimate", FORMAT, VERSION)
+        try:
+            found = parse_fit(content)
+            provenance = from_json(Provenance | None, content.get("provenance"), "provenance")
+        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+            raise ValueError(f"{path} is damaged: {error}.") from error
+        if provenance is not None and provenance.folder:
+            folder = os.path.normpath(file.resolve().parent / provenance.folder)
+            provenance = replace(provenance, folder=folder)
         if problem is not None:
-            _check_loaded(fit, problem, path)
-        return cls(**vars(fit), saved_certificate=certificate, problem=problem, provenance=provenance)
+            _check_loaded(found, problem, path)
+        return replace(found, problem=problem, provenance=provenance)
 
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
@@ -856,6 +864,30 @@ PACKAGES = ("switchfit", "daqp", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
 """Whose versions are kept."""
 
 
+@cache
+def find_version(package: str) -> str:
+    """Return the version of a package.
+
+    Parameters
+    ----------
+    package : str
+    """
+    try:
+        return version(package)
+    except PackageNotFoundError:  # a copy of the sources that is not installed
+        return "not installed as a package"
+
+
+def find_versions() -> dict[str, str]:
+    """Return the versions of Python and of `PACKAGES`."""
+    return {"Python": platform.python_version(), **{package: find_version(package) for package in PACKAGES}}
+
+
+def describe_platform() -> str:
+    """Return operating system and processor."""
+    return f"{platform.platform()}, {platform.machine()}"
+
+
 @dataclass(frozen=True)
 class FileDigest:
     """A file that a fit was made from.
@@ -877,7 +909,7 @@ class FileDigest:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a fit was made from.
+    """What a fit was made from; by default a problem that was built in Python, here.
 
     Attributes
     ----------
@@ -899,14 +931,14 @@ class Provenance:
     platform : str
     """
 
-    problem_file: str
-    folder: str
-    text: str
-    log: str
-    options: Mapping[str, int | float | str]
-    files: tuple[FileDigest, ...]
-    versions: Mapping[str, str]
-    platform: str
+    problem_file: str = ""
+    folder: str = ""
+    text: str = ""
+    log: str = ""
+    options: Mapping[str, int | float | str] = field(default_factory=dict)
+    files: tuple[FileDigest, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=find_versions)
+    platform: str = field(default_factory=describe_platform)
 
 
 def make_relative(path: str | Path, folder: str | Path) -> str:
@@ -921,35 +953,6 @@ def make_relative(path: str | Path, folder: str | Path) -> str:
         return Path(os.path.relpath(whole, os.path.abspath(folder))).as_posix()
     except ValueError:
         return Path(whole).as_posix()
-
-
-def describe_python_problem() -> Provenance:
-    """Return what is known of a problem that was built in Python: versions and platform."""
-    return Provenance("", "", "", "", {}, (), find_versions(), describe_platform())
-
-
-def find_versions() -> dict[str, str]:
-    """Return the versions of Python and of `PACKAGES`."""
-    return {"Python": platform.python_version(), **{package: find_version(package) for package in PACKAGES}}
-
-
-@cache
-def find_version(package: str) -> str:
-    """Return the version of a package.
-
-    Parameters
-    ----------
-    package : str
-    """
-    try:
-        return version(package)
-    except PackageNotFoundError:  # a copy of the sources that is not installed
-        return "not installed as a package"
-
-
-def describe_platform() -> str:
-    """Return operating system and processor."""
-    return f"{platform.platform()}, {platform.machine()}"
 
 
 FORMAT = "switchfit fit"
@@ -1006,37 +1009,8 @@ def _compute_seal(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
 
 
-def load_saved(path: Path) -> tuple[Fit, Certificate, Provenance | None]:
-    """Return what `save_fit` wrote, with the provenance if it was saved.
-
-    Every field is equal, and arrays have the same bits, dtype and shape.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OSError
-        If there is no such file (FileNotFoundError) or it cannot be read.
-    ValueError
-        If it is not valid JSON, not written by switchfit, of another version, or not as it was written.
-    """
-    content = read_document(Path(path), "a saved estimate", FORMAT, VERSION)
-    try:
-        fit, certificate = parse_fit(content)
-        given = content.get("provenance")
-        if given is None:
-            return fit, certificate, None
-        found = from_json(Provenance, given, "provenance")
-        folder = found.folder and os.path.normpath(path.resolve().parent / found.folder)
-        return fit, certificate, replace(found, folder=folder)
-    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-        raise ValueError(f"{path} is damaged: {error}.") from error
-
-
-def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
-    """Return a fit and its certificate from the content of a file of this version.
+def parse_fit(content: Mapping[str, Any]) -> Estimate:
+    """Return an estimate, without its model, from the content of a file of this version.
 
     Parameters
     ----------
@@ -1049,4 +1023,5 @@ def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
     """
     if not isinstance(content, Mapping) or content.get("seal") != _compute_seal(content):
         raise ValueError("its content is not what was written")
-    return from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")
+    certificate = from_json(Certificate, content["certificate"], "certificate")
+    return Estimate(**vars(from_json(Fit, content["fit"], "fit")), saved_certificate=certificate)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower, constraint_errors, cost_error
-from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
+from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Termination, count_priors, count_samples, measure_variance, termination_of
 from switchfit.fit.solution import explain_nonfinite, minimize_cost
 from switchfit.optimize import IterationRecord, Result, Status
@@ -107,7 +107,8 @@ def fit_locally(
         values = [value for _, value, _ in result.equalities]
         multipliers = [multiplier for _, _, multiplier in result.equalities] or None
         first_meshes = not attempt and not followed
-        fine, fine_cost, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=first_meshes)
+        by_cells = first_meshes and start is None
+        fine, fine_cost, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, by_cells=by_cells)
         if _is_within_error(problem, result, abs(fine_cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
@@ -229,12 +230,12 @@ def judge_meshes(
     first_cost: float,
     constraints: Sequence[float],
     *,
-    first: bool,
+    by_cells: bool,
 ) -> tuple[Evaluator, float, float, str]:
     """Return the problem with all steps at theta halved, J there, the largest integration error and its output.
 
     The first meshes are mostly too coarse. Halved cells show this as well as halved rows do: they are tried first on
-    the problem's own meshes, for their evaluator is kept for the next fit of the same problem.
+    the problem's own meshes, for whose halved cells there is an evaluator that is kept for the next fit.
 
     Parameters
     ----------
@@ -244,10 +245,9 @@ def judge_meshes(
         J, guards and terminal constraints of the evaluator at theta.
     first_cost : float
         J at the start of the fit.
-    first : bool
-        Whether the meshes are those that the fit began with.
+    by_cells : bool
+        Whether to halve cells first.
     """
-    by_cells = first and is_kept(evaluator)
     problem = evaluator.problem
     outputs = ("J", *problem.constraint_names)
     for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not by_cells :]:

@@ -162,22 +162,26 @@ class Follower:
         self._accepted: _Point | None = None
         self._use(evaluator)
 
-    def __call__(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[FloatArray]:
+    def __call__(
+        self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact", arrow: bool = False
+    ) -> Evaluation[Any]:
         """Evaluate as `Evaluator` does; with the Gauss-Newton matrix where the exact Hessian is not accurate."""
-        found = self._evaluate(theta, lambda evaluator: evaluator(theta, side, matrix=self._choose(matrix)))
-        return self._keep(theta, side, matrix, found)
 
-    def arrow(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[Any]:
-        """Evaluate as `Evaluator.arrow` does, with the same exception."""
-        found = self._evaluate(theta, lambda evaluator: evaluator.arrow(theta, side, matrix=self._choose(matrix)))
-        return self._keep(theta, side, matrix, found)
+        def evaluate(evaluator: Evaluator) -> Evaluation[Any]:
+            is_rough = matrix == "exact" and self.has_rough_hessian
+            return evaluator(theta, side, matrix="gauss-newton" if is_rough else matrix, arrow=arrow)
+
+        found = self._evaluate(theta, evaluate)
+        # Kept, as its Hessian may be wrong, until its point is accepted. Only evaluations from the right of all kinks
+        # are compared: each step then joins two of one kind.
+        if self._doubts and side == 1 and matrix == "exact":
+            self._seen = theta, found
+            self._accepted = self._accepted or self._seen
+        return found
 
     def constrained(self, theta: FloatArray, side: int, multipliers: FloatArray) -> Evaluation[FloatArray]:
         """Evaluate as `Evaluator.constrained` does."""
         return self._evaluate(theta, lambda evaluator: evaluator.constrained(theta, side, multipliers))
-
-    def _choose(self, matrix: Matrix) -> Matrix:
-        return "gauss-newton" if matrix == "exact" and self.has_rough_hessian else matrix
 
     @property
     def has_rough_hessian(self) -> bool:
@@ -203,14 +207,6 @@ class Follower:
         engines = evaluator.engines if self._is_least_squares else []
         self._splits = [engine for engine in engines if isinstance(engine, SplitEngine)]
         self._doubts = self._is_least_squares and any(mesh.is_sharp for mesh in evaluator.meshes)
-
-    def _keep(self, theta: FloatArray, side: int, matrix: Matrix, found: Evaluation[Any]) -> Evaluation[Any]:
-        """Keep an evaluation whose Hessian may be wrong until its point is accepted, and return it."""
-        # Only evaluations from the right of all kinks are compared: each step then joins two of one kind.
-        if self._doubts and side == 1 and matrix == "exact":
-            self._seen = theta, found
-            self._accepted = self._accepted or self._seen
-        return found
 
     def _is_hessian_wrong(
         self, theta: FloatArray, found: Evaluation[Any], after: FloatArray, there: Evaluation[Any]

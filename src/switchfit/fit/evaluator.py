@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh, Stiffness
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh_of_run
-from switchfit.engine.choice import SplitEngine, engine_of, summarize
-from switchfit.engine.jax import JaxEngine
-from switchfit.engine.protocol import Engine, Evaluation, Matrix, Run, Simulation, runs_of
+from switchfit.engine.choice import SmoothEngine, SplitEngine, engine_of, summarize
+from switchfit.engine.native.engine import NativeEngine
+from switchfit.engine.protocol import DenseEvaluation, Engine, Evaluation, Matrix, Run, Simulation, runs_of
 from switchfit.optimize.matrix import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
@@ -50,20 +50,29 @@ class Evaluator:
         Points at which the meshes are refined; the problem's initial guess if left out.
     meshes : sequence of Mesh, optional
         Meshes to use instead of refined ones.
+    arguments : sequence of Arguments, optional
+        Data and constants on these meshes, where they are not the problem's own.
     finer : float
         Multiplies the number of cells of refined meshes.
     """
 
     def __init__(
-        self, problem: Problem, *thetas: FloatArray, meshes: Sequence[Mesh] | None = None, finer: float = 1.0
+        self,
+        problem: Problem,
+        *thetas: FloatArray,
+        meshes: Sequence[Mesh] | None = None,
+        arguments: Sequence[Arguments] | None = None,
+        finer: float = 1.0,
     ) -> None:
         self.problem = problem
         if meshes is None:
             points = thetas or (problem.initial_theta,)
             meshes = [refine_mesh_of_run(run, *points, finer=finer) for run in self.runs]
         self.meshes = list(meshes)
-        padded = self._pad_meshes()
-        self._set_arguments([run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)])
+        if arguments is None:
+            arguments = [run.build_arguments(mesh) for run, mesh in zip(self.runs, self._pad_meshes(), strict=True)]
+        self.arguments = list(arguments)
+        self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
 
     @cached_property
     def runs(self) -> tuple[Run, ...]:
@@ -94,9 +103,8 @@ class Evaluator:
 
     def halve_rows(self, theta: FloatArray) -> Evaluator:
         """Return the same problem with every step at theta cut in two, to estimate the integration error."""
-        times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
-        meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
-        return Evaluator(self.problem, meshes=meshes)
+        each = zip(self.meshes, self._vectors(theta), strict=True)
+        return Evaluator(self.problem, meshes=[mesh.halve_rows(tau) for mesh, (tau, _) in each])
 
     def stabilize(self, *thetas: FloatArray) -> Evaluator | None:
         """Return the same problem with implicit steps where explicit ones are unstable near the last of some thetas;
@@ -110,13 +118,14 @@ class Evaluator:
         return Evaluator(self.problem, meshes=[new or mesh for new, mesh in zip(found, self.meshes, strict=True)])
 
     def __call__(
-        self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
-    ) -> Evaluation[FloatArray]:
+        self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact", arrow: bool = False
+    ) -> Evaluation[Any]:
         """Return the cost, gradient and Hessian; for a transition time on a node, the derivatives on its `side`.
 
-        `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
+        `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN). As an `arrow`, it takes
+        time and memory that are linear in the number of experiments.
         """
-        whole = self._add_runs(self._evaluate_experiments(theta, side, method, matrix), len(theta))
+        whole = self._add_runs(self._evaluate_experiments(theta, side, method, matrix), len(theta), arrow)
         return self._add_priors(whole, theta, matrix)
 
     def constrained(self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0) -> Evaluation[FloatArray]:
@@ -127,21 +136,26 @@ class Evaluator:
         results = [engine.constrained(*at, side, own) for engine, at, own in each]
         return self._add_priors(self._add_runs(results, len(theta)), theta)
 
-    def _add_runs(self, results: list[Evaluation[FloatArray]], d: int) -> Evaluation[FloatArray]:
+    def _add_runs(self, results: list[Evaluation[FloatArray]], d: int, arrow: bool = False) -> Evaluation[Any]:
         """Return the sum of the evaluations of all experiments, which are in their own unknowns, in theta (d,)."""
-        if self.problem.one_to_one:
+        if self.problem.one_to_one and not arrow:
             return results[0]
-        cost, gradient, hessian, slopes = 0.0, np.zeros(d), np.zeros((d, d)), []
-        for one, (own, mine) in zip(results, self.problem.own_places, strict=True):
+        size = self.layout.own.shape[1] + len(self.layout.shared) if arrow else d
+        parts = np.zeros((len(results) if arrow else 1, size, size))
+        cost, gradient, slopes = 0.0, np.zeros(d), []
+        for e, (one, (own, mine)) in enumerate(zip(results, self.problem.own_places, strict=True)):
             cost += one.cost
             # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
             np.add.at(gradient, mine, one.gradient[own])
-            np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
+            part, places = (parts[e], self._slots[e]) if arrow else (parts[0], mine)
+            np.add.at(part, (places[:, None], places), one.hessian[own[:, None], own])
             slopes.append(np.zeros((len(one.constraints), d)))
             if len(one.constraints):
                 np.add.at(slopes[-1].T, mine, one.jacobian[:, own].T)
+        hessian = Arrow.of_runs(self.layout, parts) if arrow else parts[0]
         constraints, jacobian = np.concatenate([one.constraints for one in results]), np.concatenate(slopes)
-        return Evaluation(cost, gradient, hessian, constraints, jacobian, _join_errors(results))
+        row_errors = tuple(one.row_errors[0] if one.row_errors else np.nan for one in results)
+        return Evaluation(cost, gradient, hessian, constraints, jacobian, row_errors)
 
     def _add_priors(self, found: Evaluation[Any], theta: FloatArray, matrix: Matrix = "exact") -> Evaluation[Any]:
         """Return an evaluation with the priors in cost, gradient and Hessian."""
@@ -150,20 +164,6 @@ class Evaluator:
         J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
         hessian = found.hessian.plus_diagonal(h) if isinstance(found.hessian, Arrow) else found.hessian + np.diag(h)
         return replace(found, cost=found.cost + float(J), gradient=found.gradient + g, hessian=hessian)
-
-    def arrow(self, theta: FloatArray, side: int = 1, matrix: Matrix = "exact") -> Evaluation[Arrow]:
-        """Evaluate by the method "auto", in time and memory that are linear in the number of experiments."""
-        total, gradient, parts = 0.0, np.zeros(len(theta)), []
-        size = self.layout.own.shape[1] + len(self.layout.shared)
-        results = self._evaluate_experiments(theta, side, "auto", matrix)
-        for one, (own, mine), slots in zip(results, self.problem.own_places, self._slots, strict=True):
-            total += one.cost
-            np.add.at(gradient, mine, one.gradient[own])
-            part = np.zeros((size, size))
-            np.add.at(part, (slots[:, None], slots), one.hessian[own[:, None], own])
-            parts.append(part)
-        whole = Evaluation(total, gradient, Arrow.of_runs(self.layout, parts), row_errors=_join_errors(results))
-        return self._add_priors(whole, theta, matrix)
 
     @cached_property
     def layout(self) -> ArrowLayout:
@@ -189,19 +189,6 @@ class Evaluator:
         """Whether a mode of an experiment takes implicit steps."""
         return any(any(structure.implicit) for structure in self.structures)
 
-    def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
-        """Replace data and constants; the meshes are those of the new nodes."""
-        for name in ("halved", "structures", "sorted_breakpoints", "_jax_engines"):
-            self.__dict__.pop(name, None)
-        before = zip(self.meshes, arguments, strict=True)
-        self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
-        self._set_arguments(list(arguments))
-
-    def _set_arguments(self, arguments: list[Arguments]) -> None:
-        """Store the arguments on the meshes that the evaluator has, and choose the engines."""
-        self.arguments = arguments
-        self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
-
     def judge_rows(self) -> Evaluator:
         """Estimate the errors of rows in all evaluations from now on; return the evaluator."""
         for engine in self.engines:
@@ -218,10 +205,10 @@ class Evaluator:
         """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
         return summarize(self.engines, self.problem.run_names)
 
-    def simulate(self, theta: FloatArray) -> list[Simulation]:
-        """Simulate all experiments row by row."""
+    def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
+        """Simulate all experiments row by row, with the derivatives of rows if `tangents`."""
         each = zip(self.engines, self._vectors(theta), strict=True)
-        return [engine.simulate(*at, tangents=False) for engine, at in each]
+        return [engine.simulate(*at, tangents=tangents) for engine, at in each]
 
     def _vectors(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Return the transition times (N,) and parameters (M,) of each experiment."""
@@ -237,34 +224,25 @@ class Evaluator:
             return [engine.derivatives(*find(theta, e), side, matrix) for e, engine in enumerate(self.engines)]
         if method == "adjoint" and not is_covered_by_paper(self.problem):
             raise ValueError("the paper's equations have no TransitionCost: choose another method.")
+        by: Any = "forward" if method == "autodiff" else method
+
+        def evaluate(
+            e: int, p: FloatArray, structure: Structure, engine: SmoothEngine, tau: FloatArray
+        ) -> DenseEvaluation:
+            if method == "adjoint":
+                with use_float64(), use_compilation_cache():
+                    J, g, H = evaluate_paper(self.arguments[e], tau, p, float(side), structure=structure)
+                return Evaluation(float(J), np.array(g), np.array(H))
+            by_jax = engine.fallback if isinstance(engine, NativeEngine) else engine
+            return by_jax.derivatives(tau, p, side, matrix, by)
+
         found = []
-        for e, (tau, p) in enumerate(self._vectors(theta)):
-            engine, evaluate = self.engines[e], partial(self._evaluate_by, method, e, p=p, side=side, matrix=matrix)
+        for e, (engine, (tau, p)) in enumerate(zip(self.engines, self._vectors(theta), strict=True)):
             if isinstance(engine, SplitEngine):
-                found.append(engine.derivatives(tau, p, side, matrix, evaluate))
+                found.append(engine.derivatives(tau, p, side, matrix, partial(evaluate, e, p)))
             else:
-                found.append(evaluate(self.structures[e], tau))
+                found.append(evaluate(e, p, self.structures[e], engine, tau))
         return found
-
-    def _evaluate_by(
-        self, method: Any, e: int, structure: Structure, tau: FloatArray, p: FloatArray, side: int, matrix: Matrix
-    ) -> Evaluation[FloatArray]:
-        """Evaluate experiment e by the paper's equations or by JAX, which keeps its arguments on its device."""
-        if method == "adjoint":
-            with use_float64(), use_compilation_cache():
-                J, g, H = evaluate_paper(self.arguments[e], tau, p, float(side), structure=structure)
-            return Evaluation(float(J), np.array(g), np.array(H))
-        own = self.engines[e]
-        if not isinstance(own, JaxEngine):
-            key = e, structure
-            if key not in self._jax_engines:
-                self._jax_engines[key] = JaxEngine(structure, self.arguments[e], self.meshes[e])
-            own = self._jax_engines[key]
-        return own.derivatives(tau, p, side, matrix, "forward" if method == "autodiff" else method)
-
-    @cached_property
-    def _jax_engines(self) -> dict[tuple[int, Structure], JaxEngine]:
-        return {}
 
     @cached_property
     def sorted_breakpoints(self) -> Breakpoints:
@@ -281,11 +259,6 @@ class Evaluator:
         return points
 
 
-def _join_errors(results: Sequence[Evaluation[FloatArray]]) -> tuple[float, ...]:
-    """Return the errors of the rows of each experiment."""
-    return tuple(one.row_errors[0] if one.row_errors else np.nan for one in results)
-
-
 def is_covered_by_paper(problem: Problem) -> bool:
     """Return whether the paper's equations cover all terms of the cost."""
     return not any(any(f is not None for f in s.transition_costs) for s in problem.structures)
@@ -295,11 +268,6 @@ def is_covered_by_paper(problem: Problem) -> bool:
 def evaluator_of(problem: Problem) -> Evaluator:
     """Return the problem's own evaluator, built once and cached; its meshes are refined at the initial guess."""
     return Evaluator(problem)
-
-
-def is_kept(evaluator: Evaluator) -> bool:
-    """Return whether an evaluator is the one that its problem keeps, by `evaluator_of`."""
-    return evaluator is evaluator.problem.__dict__.get(evaluator_of.__name__)
 
 
 def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation[FloatArray]:
@@ -354,10 +322,8 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     evaluator = evaluator_of(problem)
     at = problem.check_theta(theta)
     found = evaluator(at, method=method)
-    if problem.constraint_names:
-        held = evaluator.constrained(at)
-        found = replace(found, constraints=held.constraints, jacobian=held.jacobian)
-    return replace(found, stiffness=evaluator.stiffness) if evaluator.stiffness else found
+    held = evaluator.constrained(at) if problem.constraint_names else found
+    return replace(found, constraints=held.constraints, jacobian=held.jacobian, stiffness=evaluator.stiffness)
 
 
 ITERATIONS = 60

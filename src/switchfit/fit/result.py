@@ -406,11 +406,10 @@ class Fit(Termination):
 
         They are `datetime.datetime`, which have a time zone and microseconds; the type of NumPy has no zone.
         """
-        found: list[tuple[datetime, ...] | None] = []
-        for trajectory, times in zip(self.trajectories, self.transition_times, strict=True):
-            origin = trajectory.origin
-            found.append(None if origin is None else tuple(origin.to_dates(times, trajectory.time_unit)))
-        return tuple(found)
+        each = zip(self.trajectories, self.transition_times, strict=True)
+        return tuple(
+            None if run.origin is None else tuple(run.origin.to_dates(times, run.time_unit)) for run, times in each
+        )
 
     @property
     def final_times(self) -> tuple[float, ...]:

@@ -73,8 +73,10 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     for group in _list_idle_groups(problem, theta):
         idle[group[0]] = True
     if parameters and any(_has_collapsed(problem, theta, e) for e in range(len(problem.experiments))):
+        base = evaluator.cost(theta)
         for i in _list_parameters(problem):
-            idle[i] = not _has_effect(evaluator, theta, i)
+            moved = map(evaluator.cost, list_changes(problem, theta, i, CHANGES))
+            idle[i] = all(abs(cost - base) <= NO_EFFECT * abs(base) for cost in moved)
     return idle
 
 
@@ -136,13 +138,6 @@ def _list_parameters(problem: Problem) -> list[int]:
     return [i for span in spans for i in range(span.start, span.stop) if problem.theta_names[i] not in without]
 
 
-def _has_effect(evaluator: Evaluator, theta: FloatArray, i: int) -> bool:
-    """Return whether J changes with unknown i."""
-    base = evaluator.cost(theta)
-    moved = map(evaluator.cost, list_changes(evaluator.problem, theta, i, CHANGES))
-    return any(not abs(cost - base) <= NO_EFFECT * abs(base) for cost in moved)
-
-
 MANY_RUNS = 16
 """Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
@@ -180,20 +175,17 @@ def minimize_cost(
     many = len(problem.experiments) >= MANY_RUNS and not names
     by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = problem.constraints if constraints is None else constraints
-    change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
+    change = None if unknowns.variables.identity else _Change.of(evaluator, constraints)
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
-
-    evaluate_theta: Callable[..., Evaluation[Any]] = source
-    if by_blocks and hessian not in ("none", "descent-first"):
-        evaluate_theta = source.arrow
+    arrow = by_blocks and hessian not in ("none", "descent-first")
 
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if change is None else change.to_theta(z)
         if multipliers is not None:
             here = source.constrained(theta, side, multipliers)
         else:
-            here = evaluate_theta(theta, side, matrix=matrix)
+            here = source(theta, side, matrix=matrix, arrow=arrow)
             if not seen:
                 seen.append(True)
                 # Unknowns that their bounds hold are not estimated: a search holds what acts in no mode.
@@ -213,18 +205,18 @@ def minimize_cost(
     posed = Minimization(
         evaluate=evaluate if natively else with_own_threads(evaluate),
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
-        breakpoints=evaluator.sorted_breakpoints if change is None else Breakpoints.of(change.points),
+        breakpoints=evaluator.sorted_breakpoints if change is None else change.breakpoints,
         hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
         labels=unknowns.is_time.astype(float) if hessian == "block-diagonal" else None,  # of (4)
         tolerance=tolerance,
         max_iterations=max_iterations,
-        size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
+        size=unknowns.variables.sizes_inward(problem.sizes),
         idle=None if names else idle if natively else with_own_threads(idle),
         reach=_compute_reach(problem),
         equalities=names,
         accuracy=None if follower is None else follower.get_accuracy,
     )
-    start = np.array(theta, dtype=float) if change is None else change.variables.inward(np.asarray(theta))
+    start = unknowns.variables.inward(np.asarray(theta, dtype=float))
     result = minimize(posed, start, None if follower is None and callback is None else report, multipliers)
     if change is None:
         return result
@@ -268,43 +260,42 @@ class _Change(NamedTuple):
     variables : Variables
     constraints : LinearConstraints
         Of theta.
-    points : list of (K,) arrays
-        Breakpoints of each variable.
-    nodes : dict of int -> (K,) array
-        What these are in theta, for times on a logarithmic scale: a transition is at a node where z is at its
-        breakpoint, and not beside it by the rounding of a logarithm.
+    breakpoints : Breakpoints
+        Of the variables.
+    nodes : dict of int -> two (K,) arrays
+        For times on a logarithmic scale, the breakpoints of z and what these are in theta: a transition is at a node
+        where z is at its breakpoint, and not beside it by the rounding of a logarithm.
     log_rows : list of (row, (d,))
         Rows of the constraints that join times on a logarithmic scale, and which.
     """
 
     variables: Variables
     constraints: LinearConstraints
-    points: list[FloatArray]
-    nodes: dict[int, FloatArray]
+    breakpoints: Breakpoints
+    nodes: dict[int, tuple[FloatArray, FloatArray]]
     log_rows: list[tuple[int, NDArray[np.intp]]]
 
     @classmethod
-    def of(cls, problem: Problem, constraints: LinearConstraints, points: Sequence[FloatArray]) -> _Change:
-        """Return the change of a problem's variables, given the breakpoints of each unknown."""
-        variables, log_times = problem.unknowns.variables, problem.unknowns.log_times
-        points, nodes, rows = list(points), {}, []
-        if log_times.any():
-            for i in np.flatnonzero(log_times).tolist():
-                away = points[i] - variables.origin[i]
-                logs, first = np.unique(np.log(away[away > 0]), return_index=True)
-                points[i], nodes[i] = logs, points[i][away > 0][first]
-            for k, row in enumerate(constraints.A):
-                where = np.flatnonzero((row != 0) & log_times)
-                if where.size:
-                    rows.append((k, where))
-        return cls(variables, constraints, points, nodes, rows)
+    def of(cls, evaluator: Evaluator, constraints: LinearConstraints) -> _Change:
+        """Return the change of the variables of an evaluator's problem."""
+        variables, log_times = evaluator.problem.unknowns.variables, evaluator.problem.unknowns.log_times
+        if not log_times.any():
+            return cls(variables, constraints, evaluator.sorted_breakpoints, {}, [])
+        points, nodes = evaluator.breakpoints(), {}
+        for i in np.flatnonzero(log_times).tolist():
+            away = points[i] - variables.origin[i]
+            logs, first = np.unique(np.log(away[away > 0]), return_index=True)
+            points[i], nodes[i] = logs, (logs, points[i][away > 0][first])
+        joined = (constraints.A != 0) & log_times
+        rows = [(k, np.flatnonzero(joined[k])) for k in np.flatnonzero(joined.any(axis=1)).tolist()]
+        return cls(variables, constraints, Breakpoints.of(points), nodes, rows)
 
     def to_theta(self, z: FloatArray) -> FloatArray:
         """Return theta at z, inside its bounds whatever the rounding, and on the nodes that z is on."""
         theta = np.asarray(np.clip(self.variables.outward(z), self.constraints.lower, self.constraints.upper))
-        for i, nodes in self.nodes.items():
-            k = int(np.searchsorted(self.points[i], z[i]))
-            if k < len(nodes) and self.points[i][k] == z[i]:
+        for i, (logs, nodes) in self.nodes.items():
+            k = int(np.searchsorted(logs, z[i]))
+            if k < len(nodes) and logs[k] == z[i]:
                 theta[i] = nodes[k]
         return theta
 
@@ -355,12 +346,8 @@ class _Change(NamedTuple):
 
     def _convert_finding(self, z: FloatArray, found: Finding) -> Finding:
         """Return why the line search failed, in theta instead of the variables z (d,)."""
-        places = []
-        for i, value in found.places:
-            there = z.copy()
-            there[i] = value
-            places.append((i, float(self.variables.outward(there)[i])))
-        return found._replace(places=tuple(places))
+        moved = ((i, np.where(np.arange(len(z)) == i, value, z)) for i, value in found.places)
+        return found._replace(places=tuple((i, float(self.variables.outward(there)[i])) for i, there in moved))
 
 
 def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
@@ -285,7 +285,7 @@ def compare(
     problem, simulations = evaluator.problem, evaluator.simulate(theta)
     trajectories = tuple(_build_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
     pairs = enumerate(zip(simulations, trajectories, strict=True))
-    return trajectories, tuple(_build_comparisons(problem, e, theta, *pair) for e, pair in pairs)
+    return trajectories, tuple(tuple(_list_comparisons(problem, e, theta, *pair)) for e, pair in pairs)
 
 
 def replace_values(problem: Problem, values: Mapping[tuple[int, int], FloatArray]) -> Problem:
@@ -338,14 +338,13 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
     )
 
 
-def _build_comparisons(
+def _list_comparisons(
     problem: Problem, e: int, theta: FloatArray, simulation: Simulation, trajectory: Trajectory
-) -> tuple[Comparison, ...]:
+) -> Iterator[Comparison]:
     """Compare measured with fitted for each reference signal and each Measurements."""
     run, times = problem.experiments[e], trajectory.times
     curves = select_visible(simulation, simulation.y_before, simulation.y_after)
     known = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
-    comparisons = []
     first = measured = 0
     for item in (*run.references, *run.measurements):
         q = item.signal.channels if isinstance(item, ReferenceSignal) else item.values.shape[1]
@@ -357,7 +356,7 @@ def _build_comparisons(
         units = tuple(item.units or ()) or tuple(known.get(name, "") for name in label)
         if isinstance(item, ReferenceSignal):
             weights = np.diag(item.weights).copy()
-            here = Comparison(
+            yield Comparison(
                 "reference", label, times, item.signal(times), curve, None, times, curve, None, weights, units
             )
         else:
@@ -370,8 +369,6 @@ def _build_comparisons(
             if item.loss != "linear" and sigma is not None:
                 beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
             moments = times + delay  # time stamps of the sensor
-            here = Comparison(
+            yield Comparison(
                 "measurements", label, item.times, item.values, fitted, sigma, moments, curve, beyond, None, units
             )
-        comparisons.append(here)
-    return tuple(comparisons)

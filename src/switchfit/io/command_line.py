@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate, Provenance, load_saved
+from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.experiment_design import Design, DesignRecord
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
@@ -640,7 +640,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     InputError
         If the problem cannot be built again, or its data are no longer those that were fitted.
     """
-    given = load_saved(path)[2]
+    given = Estimate.load(path).provenance
     loaded = rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):

@@ -334,11 +334,10 @@ class Arrow(SymmetricMatrix):
     corner: FloatArray
 
     @classmethod
-    def of_runs(cls, layout: ArrowLayout, parts: Sequence[FloatArray]) -> Arrow:
-        """Return the sum of symmetric matrices (k + s, k + s), one a run, in the order of `ArrowLayout.slots`."""
+    def of_runs(cls, layout: ArrowLayout, parts: FloatArray) -> Arrow:
+        """Return the sum of symmetric matrices (R, k + s, k + s), one a run, in the order of `ArrowLayout.slots`."""
         k = layout.own.shape[1]
-        stacked = np.asarray(parts)
-        stacked = 0.5 * (stacked + np.swapaxes(stacked, 1, 2))
+        stacked = 0.5 * (parts + np.swapaxes(parts, 1, 2))
         blocks = stacked[:, :k, :k].copy()
         # Ones where a run is padded: its block stays regular, and the unknown that is not there stays zero.
         padded = layout.own == layout.size

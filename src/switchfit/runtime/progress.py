@@ -42,47 +42,29 @@ class Line:
     known; removed at the end of the call.
 
     A thread of its own draws it, so that it is updated while machine code runs or a program is compiled. In a notebook
-    it stands below the cell, with a bar.
+    it stands below the cell, with a bar. Unless it `is_shown`, nothing draws it.
     """
 
     def __init__(self, text: str) -> None:
         self.text, self.detail, self.lowest = text, "", math.inf
         self.done = self.total = 0
-        self._began, self._ended = time.monotonic(), threading.Event()
-        self._thread: threading.Thread | None = None
+        self.is_shown, self.began, self.ended = False, time.monotonic(), threading.Event()
 
     def write(self, text: str, lowest: float = math.inf) -> None:
         """Replace the text, and the lowest J so far; infinity shows none."""
         self.text, self.detail, self.lowest = text, "", lowest
 
-    @property
-    def is_started(self) -> bool:
-        """Whether the line is shown if the call takes longer than `DELAY`."""
-        return self._thread is not None
-
-    def start(self) -> None:
-        """Show the line after `DELAY` seconds."""
-        # ipykernel finds the cell of an output by a context variable.
-        self._thread = threading.Thread(target=copy_context().run, args=(self._draw,), daemon=True)
-        self._thread.start()
-
-    def end(self) -> None:
-        """Remove the line."""
-        self._ended.set()
-        if self._thread is not None:
-            self._thread.join()
-
-    def _draw(self) -> None:
-        """Draw the line until the call ends."""
-        if self._ended.wait(DELAY):
+    def draw(self) -> None:
+        """Draw the line, after `DELAY` seconds, until the call ends."""
+        if self.ended.wait(DELAY):
             return
         with _show_below(self) if is_notebook() else _show_on_terminal(self) as redraw:
-            while not self._ended.wait(REDRAW):
+            while not self.ended.wait(REDRAW):
                 redraw()
 
     def describe(self) -> str:
         """Return what is shown."""
-        seconds = time.monotonic() - self._began
+        seconds = time.monotonic() - self.began
         parts = [self.text, f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else "", self.detail]
         if self.total:
             parts.append(
@@ -132,14 +114,19 @@ def show_line(text: str) -> Iterator[Line]:
     """
     line = Line(text)
     is_first = _current.get() is None and threading.current_thread() is threading.main_thread()
+    line.is_shown = is_first and (is_terminal(sys.stderr) or is_notebook())
     token = _current.set(line)
-    if is_first and (is_terminal(sys.stderr) or is_notebook()):
-        line.start()
+    # ipykernel finds the cell of an output by a context variable.
+    thread = threading.Thread(target=copy_context().run, args=(line.draw,), daemon=True)
+    if line.is_shown:
+        thread.start()
     try:
         yield line
     finally:
         _current.reset(token)
-        line.end()
+        line.ended.set()
+        if line.is_shown:
+            thread.join()
 
 
 @contextmanager

@@ -300,7 +300,7 @@ def _write_to(
     line: Line, name: str, callback: Callable[[IterationRecord], object] | None
 ) -> Callable[[IterationRecord], object] | None:
     """Return the callback of a fit, which writes to the line of progress as well if that can be shown."""
-    if not line.is_started:
+    if not line.is_shown:
         return callback
 
     def report(record: IterationRecord) -> object:

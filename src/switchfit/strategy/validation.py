@@ -54,7 +54,7 @@ from switchfit.uncertainty.prediction import (
     Sensitivity,
     build_prediction,
     collect_sample_derivatives,
-    compute_sensitivity,
+    compute_sensitivities,
 )
 from switchfit.uncertainty.residuals import (
     CLEARLY_OFF,
@@ -456,11 +456,8 @@ class Validation(Displayed):
         """The predicted curves with their bands, one for each experiment; empty if the fit has no covariance."""
         if not np.isfinite(self.covariance).all():
             return ()
-        evaluator = Evaluator(self.problem, self.theta)
-        return tuple(
-            build_prediction(self, self.problem, e, compute_sensitivity(self.problem, e, self.theta, mesh).nodes)
-            for e, mesh in enumerate(evaluator.meshes)
-        )
+        found = enumerate(compute_sensitivities(Evaluator(self.problem, self.theta), self.theta))
+        return tuple(build_prediction(self, self.problem, e, each.nodes) for e, each in found)
 
     def quantile(self, level: float) -> float:
         """Return the two-sided quantile of bands, that of the fit.
@@ -548,7 +545,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
         theta[np.isin(problem.theta_names, found.theta_names)] = found.theta
     evaluator = Evaluator(problem, theta)
     trajectories, comparisons = compare(evaluator, theta)
-    sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
+    sensitivities = compute_sensitivities(evaluator, theta)
     noise = _choose_noise(estimate, problem)
     whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, found, noise)
     residuals, chi_square, freedom, covariance = whitened

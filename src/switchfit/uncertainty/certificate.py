@@ -535,29 +535,25 @@ def analyse(
     cost : callable ``theta -> J``, or None
         NaN where theta is not feasible. With None, J is not evaluated along the directions.
     """
-    names = about.theta_names
+    names = np.array(about.theta_names, dtype=object)
     free = np.abs(basis).max(1, initial=0.0) > 1e-9
-    held = tuple(n for n, f in zip(names, free, strict=True) if not f)
-    about = replace(about, held=held, tried=cost is not None)
+    about = replace(about, held=tuple(names[~free]), tried=cost is not None)
     if not free.any() or not np.isfinite(hessian).all():
         return about
-    flat = np.all(hessian == 0.0, axis=1).tolist()
-    without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
-    values, vectors, size = compute_scaled_spectrum(hessian, basis)
     # Unknowns on which the cost does not depend at all are reported separately.
-    dead = np.array([n in without for n in names])
-    kept = [k for k in range(len(values)) if not np.sum(vectors[dead, k] ** 2) > 0.5]
+    without = free & np.all(hessian == 0.0, axis=1)
+    values, vectors, size = compute_scaled_spectrum(hessian, basis)
+    kept = ~(np.sum(vectors[without] ** 2, axis=0) > 0.5)
     values, vectors = values[kept], vectors[:, kept]
-    weak = [k for k in range(len(values)) if values[k] < WEAK][:MOST] or list(range(min(1, len(values))))
+    shown = min(max(int(np.sum(values < WEAK)), 1), MOST)  # the worst in any case
     directions = []
-    for k in weak:
-        v = vectors[:, k]
+    for value, v in zip(values[:shown].tolist(), vectors.T[:shown], strict=True):
         # An eigenvector has no sign of its own: the largest entry is made positive.
         v = v * np.sign(v[np.argmax(np.abs(v))])
-        change, rises = _try_direction(size * v, float(values[k]), theta, cost, about.rise)
+        change, rises = _try_direction(size * v, value, theta, cost, about.rise)
         strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
-        directions.append(Direction(float(values[k]), v, change, rises, tuple(names[i] for i in strong)))
-    return replace(about, eigenvalues=values, without=without, directions=tuple(directions))
+        directions.append(Direction(value, v, change, rises, tuple(names[strong])))
+    return replace(about, eigenvalues=values, without=tuple(names[without]), directions=tuple(directions))
 
 
 def _try_direction(

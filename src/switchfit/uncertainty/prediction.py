@@ -40,6 +40,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import read_times, select_visible
 from switchfit.problem.data import FloatArray, influence
@@ -137,6 +138,18 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
     engine = engine_of(run, run.build_arguments(mesh), mesh)
     simulation = engine.simulate(*run.vectors(theta), tangents=True)
     return Sensitivity(simulation, problem.places[e], theta)
+
+
+def compute_sensitivities(evaluator: Evaluator, theta: FloatArray) -> tuple[Sensitivity, ...]:
+    """Return the same of each experiment on the meshes of an evaluator.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    """
+    each = zip(evaluator.simulate(theta, tangents=True), evaluator.problem.places, strict=True)
+    return tuple(Sensitivity(simulation, places, theta) for simulation, places in each)
 
 
 class SampleDerivatives(NamedTuple):
@@ -372,8 +385,7 @@ class Prediction(Tabular):
         >>> len(fit.predict(np.linspace(0.0, 9.0, 200)).plot().axes)
         1
         """
-        figure: Figure = draw_figure(self, level=as_level(level))
-        return figure
+        return draw_figure(self, level=as_level(level))
 
 
 def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:
@@ -454,8 +466,12 @@ def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Pred
     e : int, from 0
     points : Points
     """
-    covariance = _require_covariance(fit)
-    trajectory = fit.trajectories[e]
+    if not np.isfinite(fit.covariance).all():
+        raise ValueError(
+            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
+            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
+        )
+    covariance, trajectory = fit.corrected_covariance, fit.trajectories[e]
     names = [name for comparison in fit.comparisons[e] for name in comparison.names]
     return Prediction(
         points.times,
@@ -473,16 +489,6 @@ def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Pred
         trajectory.origin,
         not np.array_equal(covariance, fit.covariance),
     )
-
-
-def _require_covariance(fit: Any) -> FloatArray:
-    """Return the corrected covariance of a fit; raise ValueError if it has none."""
-    if not np.isfinite(fit.covariance).all():
-        raise ValueError(
-            "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
-            "than unknowns, and the Hessian must be positive definite. The report says what is missing."
-        )
-    return np.asarray(fit.corrected_covariance)
 
 
 def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, times: FloatArray) -> Points:

@@ -90,19 +90,16 @@ def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
     unknowns = problem.unknowns
     low, high = unknowns.lower.copy(), unknowns.upper.copy()
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        times, places = experiment.initial_times, where.tolist()
-        gaps = [problem.durations[mode] for mode in experiment.mode_sequence]  # before each time
+        free, times = where >= 0, experiment.initial_times
+        gaps = np.array([problem.durations[mode] for mode in experiment.mode_sequence])  # before each time
         latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
-        for i in reversed(range(len(places))):
-            latest = min(latest, times[i] if places[i] < 0 else high[places[i]])
-            if places[i] >= 0:
-                high[places[i]] = latest
-            latest -= gaps[i]
-        earliest = experiment.t0
-        for i, place in enumerate(places):
-            earliest = max(earliest + gaps[i], times[i] if place < 0 else low[place])
-            if place >= 0:
-                low[place] = earliest
+        first, last = np.where(free, [low[where], high[where]], times)
+        # Without the gaps before them, times are in order.
+        ahead = np.cumsum(gaps)[: len(where)]
+        earlier = np.maximum.accumulate(np.maximum(first - ahead, experiment.t0)) + ahead
+        later = np.minimum.accumulate(np.minimum(last - ahead, latest - ahead[-1:])[::-1])[::-1] + ahead
+        own = where[free]
+        low[own], high[own] = np.maximum(first, earlier)[free], np.minimum(last, later)[free]
     return low, high
 
 

@@ -485,7 +485,7 @@ class NativeEngine:
     """
 
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, fallback: JaxEngine) -> None:
-        self._structure, self._arguments, self._mesh, self._fallback = structure, arguments, mesh, fallback
+        self._structure, self._arguments, self._mesh, self.fallback = structure, arguments, mesh, fallback
         self._second = second_order(structure)
         self._experiments: dict[Order, NativeExperiment | None] = {}
         self._judges_rows = False
@@ -520,17 +520,17 @@ class NativeEngine:
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
-        return self._try(Order.COST, NativeExperiment.cost, self._fallback.cost, tau, p)
+        return self._try(Order.COST, NativeExperiment.cost, self.fallback.cost, tau, p)
 
     def derivatives(self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix) -> DenseEvaluation:
         """Return J and its derivatives."""
-        by_jax = partial(self._fallback.derivatives, matrix=matrix)
+        by_jax = partial(self.fallback.derivatives, matrix=matrix)
         return self._try(ORDERS[matrix], NativeExperiment.__call__, by_jax, tau, p, side)
 
     def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> DenseEvaluation:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         given = tau, p, side, multipliers
-        return self._try(self._second, NativeExperiment.__call__, self._fallback.constrained, *given)
+        return self._try(self._second, NativeExperiment.__call__, self.fallback.constrained, *given)
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
@@ -539,15 +539,15 @@ class NativeEngine:
             found, costates, _ = native.simulate(*given)
             return Costates.of_rows(self._structure, found.first_row, found.start, found.before, costates)
 
-        return self._try(self._second, find, self._fallback.costates, tau, p, multipliers)
+        return self._try(self._second, find, self.fallback.costates, tau, p, multipliers)
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
-        return self._try(Order.COST, NativeExperiment.slopes, self._fallback.slopes, times, cells, states, p)
+        return self._try(Order.COST, NativeExperiment.slopes, self.fallback.slopes, times, cells, states, p)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
-        by_jax = partial(self._fallback.simulate, tangents=tangents)
+        by_jax = partial(self.fallback.simulate, tangents=tangents)
         return self._try(self._second if tangents else Order.COST, self._simulate, by_jax, tau, p)
 
     def _simulate(self, native: NativeExperiment, tau: FloatArray, p: FloatArray) -> Simulation:

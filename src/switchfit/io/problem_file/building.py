@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.estimation.estimator import FileDigest, Provenance, describe_platform, find_versions, make_relative
+from switchfit.estimation.estimator import FileDigest, Provenance, make_relative
 from switchfit.io.logs import find_logs
 from switchfit.io.logs.log import Log
 from switchfit.io.problem_file import tables
@@ -112,8 +112,6 @@ def build_problem(
         log="" if log is None else make_relative(log, folder),
         options=options,
         files=tuple(digest_file(folder, file) for file in _list_files(folder, contents)),
-        versions=find_versions(),
-        platform=describe_platform(),
     )
     used = contents.model_copy(update={"experiments": list(runs.tables)})
     return ProblemFile(path, problem, options, provenance, runs.issues, library, used)

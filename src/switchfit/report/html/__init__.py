@@ -11,7 +11,7 @@ from html import escape
 from typing import Any
 
 from switchfit.batch.fits import Fits
-from switchfit.estimation.estimator import Estimate, Provenance, describe_python_problem
+from switchfit.estimation.estimator import Estimate, Provenance
 from switchfit.problem.problem import Problem
 from switchfit.report import style
 from switchfit.runtime.errors import import_library
@@ -43,7 +43,7 @@ def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> s
         import_library(library, "an HTML report", "'switchfit[report]'")
     from switchfit.report.html.page import build_page
 
-    return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem())
+    return build_page(estimate, estimate.describe_provenance(provenance) or Provenance())
 
 
 @format_html.register(Problem)
