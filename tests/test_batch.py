@@ -194,7 +194,7 @@ def test_fits_that_do_not_converge_are_listed():
     assert [run for run, _ in study.failures] == list(range(5))
     assert "Stopped after 1 iteration " in study.failures[0][1]
     assert study.verdict.level == "bad"
-    assert study.plot().axes[0].get_title() == "Fewer than two fits converged: no statistics."
+    assert study.plot().legends[0].get_title().get_text() == "Fewer than two fits converged: no statistics."
 
 
 def test_the_intervals_cover_the_truth():
