@@ -43,7 +43,7 @@ NAMES = {
     "fit": "estimate following finiteness starts strategy guards verdict",
     "io": "io saved_problem init tables_out files many_logs",
     "io/logs": "logs log_formats units real_logs gps_drive dates",
-    "io/problem_file": "io files dates saved_problem bad_input cli_modes jumps",
+    "io/problem_file": "io init files dates saved_problem bad_input cli_modes jumps",
     "models": "vehicles vehicle_mechanics",
     "modes": "modes schedule insertion",
     "online": "online online_cli",

@@ -114,6 +114,16 @@ def test_curvature_on_the_face_of_active_constraints_is_kept(seed):
     assert Z.shape[1] == 11 - len(chosen)
 
 
+def test_curvature_beside_bounds_needs_no_full_matrix(monkeypatch):
+    bounds = np.eye(11)[[3, 9]]
+    arrow, none = arrow_of(random_matrix(np.random.default_rng(1), lowest=0.2)), np.zeros(11, dtype=bool)
+    expected = Dense(arrow.dense()).curvature(bounds, none, NO_FLOOR)
+    monkeypatch.delattr(Arrow, "dense")
+    found = arrow.curvature(bounds, none, NO_FLOOR)
+    np.testing.assert_allclose(found.basis @ found.basis.T, expected.basis @ expected.basis.T, atol=1e-12)
+    assert found.spectrum.smallest > 0.0 < expected.spectrum.smallest
+
+
 # --- the whole optimiser ----------------------------------------------------------------------------------------------
 
 

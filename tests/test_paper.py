@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import switchfit as sf
 from switchfit.cli import app
 from switchfit.paper import PARTS, Part, algorithms, run, studies, table, tyres
-from switchfit.paper.vehicle import NAMES, TRUTH, Row, wheel_speeds
+from switchfit.paper.vehicle import NAMES, TRUTH, Row, compute_vehicle, draw_vehicle, wheel_speeds
 
 COEFFICIENTS = ("eigenvalues", "undetermined", "worst")
 """What is found of the Hessian in the 16 coefficients of the Magic Formula."""
@@ -28,6 +28,16 @@ def found_by(name):
         for ax in figure.axes:
             assert ax.get_ylabel() or ax.get_xlabel()
     return found
+
+
+def test_the_vehicle_is_drawn_inside_its_axes():
+    (figure,) = draw_vehicle(compute_vehicle(True, print)).values()
+    figure.draw_without_rendering()
+    (ax,) = figure.axes
+    for patch in ax.patches:
+        box = patch.get_window_extent()
+        assert ax.bbox.x0 < box.x0 < box.x1 < ax.bbox.x1
+        assert ax.bbox.y0 < box.y0 < box.y1 < ax.bbox.y1
 
 
 @pytest.mark.slow
