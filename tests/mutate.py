@@ -48,7 +48,7 @@ TESTS = {
             "tests/test_corners.py",
             "-k",
             "once or stays_on or leaves_out or closed_forms or differences or order or rest or predicts "
-            "or level or filled or cascade or nearly_shuts",
+            "or level or filled or cascade or nearly_shuts or saturate or rounded",
         ]
     ],
     "online": [["tests/test_online.py"]],
@@ -285,6 +285,9 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             CORNERS, "found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))"
         ),
         "corners that are one": swap(CORNERS, "tuple(sorted(pair))", "pair"),
+        "a rounded state that jumps": swap(
+            CORNERS, "_choose(is_even, odd, even) + more", "_choose(is_even, odd, even)"
+        ),
         "corners of two states that are not one": swap(CORNERS, '"argument", k, i', '"argument", k, 0'),
         "the margin of a steep corner": swap(CORNERS, "if sides[k] == side:", "if False:"),
         "rates at a steep corner": swap(COURSE, "if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:"),

@@ -915,3 +915,30 @@ def test_two_forces_saturate_one_after_the_other(clip, vector):
     problem = problem_of(mode, [0.0, 0.0, -0.5], {"w": 1.0}, tf=3.5)
     np.testing.assert_allclose(sf.simulate(problem, times=[3.5]).states[0], [2.5, 1.5, 3.0], rtol=1e-8)
     assert find_corners(problem.structures[0].modes[0]).count in (3, 4)  # an upper limit may be another lower one
+
+
+@pytest.mark.parametrize(
+    ("rounded", "crossed"),
+    [
+        (jnp.floor, [-1.0, 0.0, 1.0]),
+        (jnp.ceil, [-1.0, 0.0, 1.0]),
+        (jnp.round, [-1.5, -0.5, 0.5]),
+        (jnp.trunc, [-1.0, 1.0]),
+    ],
+)
+def test_a_rounded_state_jumps_at_each_integer(rounded, crossed):
+    """x' = w - r(x) / 4 is constant between the jumps of r, whose times move with w."""
+
+    def cost(w):
+        x, left = -1.75, 5.0
+        for bound in (*crossed, np.inf):
+            slope = w - 0.25 * float(rounded(x + 0.1))
+            if x + slope * left < bound:
+                return 0.5 * (x + slope * left - 1.0) ** 2
+            x, left = bound, left - (bound - x) / slope
+
+    data = sf.Measurements([5.0], [1.0], sigma=1.0)
+    problem = problem_of(lambda t, x, p: p["w"] - 0.25 * rounded(x), [-1.75], {"w": 0.6}, tf=5.0, data=data)
+    found = sf.evaluate(problem)
+    np.testing.assert_allclose(found.cost, cost(0.6), rtol=1e-9)
+    np.testing.assert_allclose(found.gradient, (cost(0.6 + 1e-6) - cost(0.6 - 1e-6)) / 2e-6, rtol=1e-6)

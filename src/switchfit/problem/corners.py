@@ -38,14 +38,17 @@ Sides = tuple[int, ...]
 Margins = tuple[tuple[tuple[int, int], float], ...]
 """Corners that are steep with the side on which they are, and the |g| of their margins."""
 
-CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
+ROUNDED = {"floor": (0.0, 0.0), "ceil": (0.0, 1.0), "round": (0.5, 0.0)}
+"""Operations that are ``floor(x + shift) + more`` between their jumps: shift and more."""
+
+CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge", *ROUNDED)
 """Primitives of JAX that have a corner."""
 
 BY_ENTRY = frozenset(
     {"neg", "abs", "sign", "sqrt", "rsqrt", "cbrt", "square", "integer_pow", "pow", "exp", "exp2", "expm1", "log"}
     | {"log1p", "logistic", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh"}
     | {"acosh", "atanh", "add", "sub", "mul", "div", "max", "min", "clamp", "lt", "le", "gt", "ge", "eq", "ne"}
-    | {"and", "or", "not", "select_n", "convert_element_type", "copy"}
+    | {"and", "or", "not", "select_n", "convert_element_type", "copy", *ROUNDED}
 )
 """Operations that make each entry of the same entry of their operands."""
 
@@ -213,6 +216,14 @@ class _Walk(Walk):
         """Return the result of an operation on the sides given."""
         shape = np.broadcast_shapes(*(np.shape(each.value) for each in given))
         given = [each._replace(value=_broadcast(each.value, shape)) for each in given]
+        if name in ROUNDED:
+            shift, more = ROUNDED[name]
+            x, v = given[0].names.ravel().tolist(), given[0].value + shift
+            names = self._list_names(shape, (("sine", shift, own) for own in x))
+            # The integer below v is even where sin(pi v) > 0. A side goes on by 1/2 beyond its ends as it is between.
+            is_even = self._meet(_Value(jnp.sin(np.pi * v), True, names), self.constant(np.zeros(())), origin)
+            odd, even = 2.0 * jnp.floor((v - 0.5) / 2.0) + 1.0, 2.0 * jnp.floor((v + 0.5) / 2.0)
+            return _choose(is_even, odd, even) + more
         if name == "clamp":  # of the lowest value, the state, and the highest
             low, x, high = given
             above, below = self._meet(x, low, origin), self._meet(x, high, origin)
