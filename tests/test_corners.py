@@ -942,3 +942,19 @@ def test_a_rounded_state_jumps_at_each_integer(rounded, crossed):
     found = sf.evaluate(problem)
     np.testing.assert_allclose(found.cost, cost(0.6), rtol=1e-9)
     np.testing.assert_allclose(found.gradient, (cost(0.6 + 1e-6) - cost(0.6 - 1e-6)) / 2e-6, rtol=1e-6)
+
+
+def test_corners_inside_cases_are_found_whichever_is_taken():
+    def by_cases(t, x, p):
+        slope = jax.lax.cond(x[0] > 0.3, lambda: jnp.abs(x[1]), lambda: jnp.maximum(x[1] - 0.2, 0.0) + 0.1 * t)
+        return jnp.stack([p["w"] * jnp.cos(t), slope])
+
+    def by_entries(t, x, p):
+        slope = jnp.where(x[0] > 0.3, jnp.abs(x[1]), jnp.maximum(x[1] - 0.2, 0.0) + 0.1 * t)
+        return jnp.stack([p["w"] * jnp.cos(t), slope])
+
+    problems = [problem_of(mode, [0.0, -0.1], {"w": 1.1}) for mode in (by_cases, by_entries)]
+    assert [find_corners(problem.structures[0].modes[0]).count for problem in problems] == [3, 3]
+    found, expected = map(sf.evaluate, problems)
+    for name in ("cost", "gradient", "hessian"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-7)

@@ -410,8 +410,7 @@ class Course:
         """Return whether the field leads back from a steep corner, which is passed by an error of the solver then."""
         k, _ = self.corners.list_ends(self.sides)[crossing.end]
         rates = self.corners.rates(self.sides)
-        steep = self._is_steep(k) and self.sides[k] != 0
-        return steep and self.sides[k] * self.evaluate(rates, crossing.time, crossing.state, inside)[k] > 0
+        return self._is_steep(k) and self.sides[k] * self.evaluate(rates, crossing.time, crossing.state, inside)[k] > 0
 
     def leaves(self, mode: int, sides: Sides, times: FloatArray, states: FloatArray, limits: FloatArray) -> bool:
         """Return whether the functions of the ends of a branch fall below `limits` in a step between two states."""

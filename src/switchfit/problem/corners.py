@@ -166,9 +166,14 @@ class _Walk(Walk):
         values = [each.value for each in joined]
         made = self._evaluate(equation, joined, origin)
         if made is None and name == "cond" and isinstance(values[0], np.ndarray):
-            branch = params["branches"][int(np.clip(values[0], 0, len(params["branches"]) - 1))]
-            results = self.run(branch.jaxpr, branch.consts, moving[1:])
-            return [each._replace(names=own) for each, own in zip(results, names, strict=True)]
+            chosen = int(np.clip(values[0], 0, len(params["branches"]) - 1))
+            # The corners are those of all branches, whichever is taken.
+            results = {
+                k: self.run(branch.jaxpr, branch.consts, moving[1:])
+                for k, branch in enumerate(params["branches"])
+                if k == chosen or _has_corners(branch)
+            }
+            return [each._replace(names=own) for each, own in zip(results[chosen], names, strict=True)]
         is_call = made is None and name not in ("scan", "while")
         inner = params.get("jaxpr", params.get("call_jaxpr")) if is_call else None
         # Functions inside are walked through where they have corners or are decided by one; else they are bound as they
@@ -218,8 +223,8 @@ class _Walk(Walk):
         given = [each._replace(value=_broadcast(each.value, shape)) for each in given]
         if name in ROUNDED:
             shift, more = ROUNDED[name]
-            x, v = given[0].names.ravel().tolist(), given[0].value + shift
-            names = self._list_names(shape, (("sine", shift, own) for own in x))
+            operands, v = given[0].names.ravel().tolist(), given[0].value + shift
+            names = self._list_names(shape, (("sine", shift, own) for own in operands))
             # The integer below v is even where sin(pi v) > 0. A side goes on by 1/2 beyond its ends as it is between.
             is_even = self._meet(_Value(jnp.sin(np.pi * v), True, names), self.constant(np.zeros(())), origin)
             odd, even = 2.0 * jnp.floor((v - 0.5) / 2.0) + 1.0, 2.0 * jnp.floor((v + 0.5) / 2.0)
