@@ -54,7 +54,7 @@ NAMES = {
     "report/html": "html",
     "runtime": "progress save files threads bad_input",
     "strategy": "validate strategy beam validation starts final_time",
-    "uncertainty": "uncertainty profile prediction verdict",
+    "uncertainty": "uncertainty profile prediction verdict validate",
 }
 TESTS = {room: names.split() for room, names in NAMES.items()}
 """What must notice the mistakes of each room: files of tests, one after the other until something does."""

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import switchfit as sf
 from switchfit.io.command_line import write_unknowns
 from switchfit.models import heater_problem
-from switchfit.report.style import FIT, TRANSITION
+from switchfit.report.style import FIT, TRANSITION, turn_off_formulas
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -184,3 +184,11 @@ def test_figures_of_several_panels(heater, starts):
     for figure in (validation, fits, forecast, *(study.plot() for study in studies)):
         assert all(ax.has_data() for ax in figure.axes)
         assert figure._repr_png_()[:4] == b"\x89PNG"
+
+
+def test_names_with_dollars_are_no_formulas():
+    figure = Figure()
+    name, tick = figure.text(0.1, 0.1, "price $k$ of $m$"), figure.text(0.2, 0.2, r"$\mathdefault{10^{1}}$")
+    turn_off_formulas(figure)
+    assert not name.get_parse_math()
+    assert tick.get_parse_math()
