@@ -8,6 +8,8 @@ import shutil
 import subprocess
 import sys
 from functools import cache
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 
 import matplotlib
@@ -220,3 +222,12 @@ def test_no_page_loads_anything_from_a_network(site):
         loaded = [tag for tag in tags if "rel=" not in tag or re.search(r'rel="[^"]*(stylesheet|icon|preload)', tag)]
         sources = [re.search(r'\b(?:src|href)="([^"]*)"', tag) for tag in loaded]
         assert not [source[1] for source in sources if source and "//" in source[1]], page.name
+
+
+def test_what_the_reference_names_is_there():
+    module = None
+    for line in (ROOT / "docs" / "api.rst").read_text().splitlines():
+        if line.startswith(".. currentmodule:: "):
+            module = import_module(line.split()[-1])
+        elif re.fullmatch(r"   [A-Za-z_][\w.]*", line):
+            assert attrgetter(line.strip())(module) is not None
