@@ -958,3 +958,7 @@ def test_corners_inside_cases_are_found_whichever_is_taken():
     found, expected = map(sf.evaluate, problems)
     for name in ("cost", "gradient", "hessian"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-7)
+
+
+def test_jumps_of_rounding_and_of_the_integer_below_are_two_corners():
+    assert corners_of(stacked(lambda x, p: jnp.floor(x[0]) + jnp.ceil(x[0]) + jnp.round(x[0]))).count == 2
