@@ -47,7 +47,7 @@ TESTS = {
         [
             "tests/test_corners.py",
             "-k",
-            "once or stays_on or leaves_out or closed_forms or differences or order or rest or predicts "
+            "once or stays_on or what_slides or leaves_out or closed_forms or differences or order or rest or predicts "
             "or level or filled or cascade or nearly_shuts or saturate or rounded or cases",
         ]
     ],
@@ -277,7 +277,9 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "sliding": swap(COURSE, "\n            )\n        return 0", "\n            )\n        return 1"),
         "a jump of the input": swap(COURSE, "if after != self.sides:", "if False:"),
         "the end of sliding": swap(CORNERS, "[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]"),
-        "motion of a corner in time": swap(CORNERS, "(jnp.ones_like(t), f)", "(jnp.zeros_like(t), f)"),
+        "motion of a corner in time": swap(CORNERS, "[jnp.ones_like(t), f]", "[jnp.zeros_like(t), f]"),
+        "motion of a corner with the input": swap(CORNERS, "jnp.stack([u[1], ", "jnp.stack([0.0 * u[1], "),
+        "left on the wrong side": swap(COURSE, "2.0 * np.minimum(self._last[0], 0.0)", "0.0 * self._last[0]"),
         "both corners in the convex combination": swap(
             CORNERS, "(b[0] * e - c * b[1]) / whole", "(b[0] * e + c * b[1]) / whole"
         ),

@@ -457,6 +457,31 @@ def test_a_relay_keeps_the_state_on_a_set_point_that_moves():
     assert evaluator.engines[0]._split.path.sides == (((-1,), (0,), (1,), (0,), (1,)),)
 
 
+def test_what_slides_along_an_input_moves_with_it():
+    """A servo with a limited speed reaches a position that is measured, follows it, and falls behind where that is
+    faster.
+    """
+
+    def servo(t, x, p, u):
+        return p["v"] * jnp.sign(u - x)
+
+    position = sf.Input([0.0, 1.0, 3.0], [0.5, 1.0, -5.0], kind="linear")
+    problem = problem_of(servo, [0.0], {"v": 2.0}, 3.0, inputs=position, **TIGHT)
+    times = np.linspace(0.1, 3.0, 30)
+    expected = np.select([times < 1 / 3, times < 1.0], [2.0 * times, 0.5 + 0.5 * times], 3.0 - 2.0 * times)
+    np.testing.assert_allclose(sf.simulate(problem, times=times).states[:, 0], expected, rtol=0, atol=1e-9)
+    assert check_derivatives(problem).engines[0]._split.path.sides == (((1,), (0,), (-1,)),)
+
+
+def test_what_slides_leaves_at_a_tangent():
+    """The solver takes long steps while it slides, and leaves from a state that is a little on the wrong side."""
+    problem = problem_of(lambda t, x, p: p["v"] * jnp.sign(jnp.sin(2 * t) - x), [0.0], {"v": 1.5}, 2.3)
+    times, left = np.linspace(0.7, 2.3, 30), 0.5 * np.arccos(-0.75)
+    expected = np.where(times < left, np.sin(2 * times), np.sin(2 * left) - 1.5 * (times - left))
+    np.testing.assert_allclose(sf.simulate(problem, times=times).states[:, 0], expected, rtol=0, atol=1e-7)
+    assert np.isfinite(sf.evaluate(problem).gradient).all()
+
+
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8])
 def test_costs_do_not_depend_on_what_was_evaluated_before(rtol):
     """The spring just reaches a stiffer part, and leaves it before a step is over: the dip must be found at a path that
@@ -764,7 +789,8 @@ def test_a_branch_that_only_jax_evaluates_takes_an_input_too():
     problem = problem_of(pushed, [1.5, 1.0], {"mu": 0.3}, 1.0, inputs=sf.Input([0.0, 1.0], [[0.5], [2.0]]))
     branch = find_corners(problem.structures[0].modes[0]).branch((1,))
     function, states = trace_for_numpy(branch), np.array([[1.5, 1.0], [2.0, 0.7]])
-    found = function(np.array([0.1, 0.2]), [states, np.array([[0.5], [2.0]])], [np.array(0.3)])
+    inputs = np.array([[0.5, 0.0], [2.0, 0.0]])  # with their rates
+    found = function(np.array([0.1, 0.2]), [states, inputs], [np.array(0.3)])
     np.testing.assert_allclose(found, [[1.0, 0.5 - 0.3 * 2.25], [0.7, 2.0 - 0.3 * 4.0]])
 
 

@@ -50,6 +50,10 @@ class Piece(NamedTuple):
         """All channels at time t: (S,)."""
         return _polynomial(t - self.origin, self.coefficients)
 
+    def rate(self, t: Array) -> Array:
+        """The derivatives of all channels at time t: (S,)."""
+        return _polynomial(t - self.origin, jnp.arange(1.0, 4.0)[:, None] * self.coefficients[1:])
+
 
 @jax.custom_jvp
 def _polynomial(s: Array, c: Array) -> Array:
@@ -112,14 +116,18 @@ class Model:
     def field(self, mode: int, piece: Piece) -> Field:
         """Return the vector field of a mode inside one cell."""
         function = self.structure.modes[mode]
-        return lambda t, x, p: function(t, x, self.parameters(p), *self.inputs(t, piece))
+        return lambda t, x, p: function(t, x, self.parameters(p), *self.inputs(function, t, piece))
 
-    def inputs(self, t: Array, piece: Piece) -> tuple[Array, ...]:
-        """Return the input u of modes at a time inside one cell, as a tuple of one; an empty one without inputs."""
-        shape = self.structure.input_shape
-        if shape is None:
+    def inputs(self, function: Function, t: Array, piece: Piece) -> tuple[Array, ...]:
+        """Return what a function takes of the input at a time inside one cell, as a tuple of one: u, or u and du/dt, as
+        branches of modes do; an empty one if it takes none.
+        """
+        if not function.takes_input:
             return ()
-        return (piece(t)[piece.coefficients.shape[-1] - int(np.prod(shape)) :].reshape(shape),)
+        shape, size = function.structs[2].shape, int(np.prod(self.structure.input_shape or ()))
+        own = Piece(piece.origin, piece.coefficients[:, piece.coefficients.shape[1] - size :])
+        both = own(t) if shape == self.structure.input_shape else jnp.stack([own(t), own.rate(t)])
+        return (both.reshape(shape),)
 
     def find_piece(self, t: Array) -> Piece:
         """Return the signals in the cell that ends at a time or holds it."""
@@ -263,7 +271,7 @@ def get_transition_function(model: Model, kind: str, i: int, piece: Piece | None
     function = getattr(model.structure, kind)[i]
     if not function.takes_input:
         return lambda t, x, p: function(t, x, model.parameters(p))
-    return lambda t, x, p: function(t, x, model.parameters(p), *model.inputs(t, piece or model.find_piece(t)))
+    return lambda t, x, p: function(t, x, model.parameters(p), *model.inputs(function, t, piece or model.find_piece(t)))
 
 
 def list_transition_functions(model: Model, kind: str) -> list[tuple[int, NodeFunction]]:

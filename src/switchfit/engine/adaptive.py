@@ -445,10 +445,10 @@ class _Solve:
 
     def _find_operation(self, mode: int, t: float, x: FloatArray, piece: Piece) -> str:
         """Return which operation of the mode is not finite at t and x (n,), " (log at tank.py:5)"; empty if all are."""
-        model = Model(self._structure, self._arguments)
-        given = [np.asarray(a)[None] for a in (t, x, *model.inputs(t, piece))]  # type: ignore[arg-type]  # of NumPy
+        model, function = Model(self._structure, self._arguments), self._structure.modes[mode]
+        points = t, x, *model.inputs(function, t, piece)  # type: ignore[arg-type]  # of NumPy
         parameters = model.parameters(self._p)  # type: ignore[arg-type]
-        found = find_undefined(self._structure.modes[mode], given, parameters, derivatives=False)
+        found = find_undefined(function, [np.asarray(a)[None] for a in points], parameters, derivatives=False)
         return "" if found is None else f" ({' at '.join(filter(None, (found.operation, found.line)))})"
 
 

@@ -47,8 +47,8 @@ def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
     """Return a function of a mode's arguments as NumPy evaluates it, from the graph of its scalars; by JAX if it has
     none.
 
-    It takes times () or (L,), what moves with them, states (n,) or (L, n) and maybe the input (size,) or (L, size), and
-    the parameters.
+    It takes times () or (L,), what moves with them, states (n,) or (L, n) and maybe the input (size,) or (L, size), for
+    branches with its rate behind it, and the parameters.
     """
     call = lambda *given: jax.core.eval_jaxpr(function.jaxpr, function.consts, *given)  # noqa: E731
     shapes = [struct.shape for struct in function.structs]
@@ -265,6 +265,7 @@ class Course:
         self._mode, self._scale = 0, np.zeros(0)
         self._largest: FloatArray | float = 0.0
         self._last: FloatArray | None = None
+        self._beyond = np.zeros(0)
 
     @property
     def path(self) -> Path:
@@ -289,10 +290,11 @@ class Course:
         if function.takes_input:
             cells = np.clip(self._nodes.searchsorted(inside, "right") - 1, 0, len(self._signals) - 1)
             size = int(np.prod(self._structure.input_shape or ()))
-            s, u = np.expand_dims(np.subtract(t, self._nodes[cells]), -1), np.zeros(size)
+            s, u, rate = np.expand_dims(np.subtract(t, self._nodes[cells]), -1), np.zeros(size), np.zeros(size)
             for power in reversed(range(self._signals.shape[1])):
-                u = u * s + self._signals[cells, power, self._signals.shape[-1] - size :]
-            moving.append(u)
+                rate, u = rate * s + u, u * s + self._signals[cells, power, self._signals.shape[-1] - size :]
+            has_rate = function.structs[2].shape != self._structure.input_shape
+            moving.append(np.concatenate([u, rate], axis=-1) if has_rate else u)
         found = trace_for_numpy(function)(t, moving, [self._named[name] for name in function.parameters])
         return found if found.shape == shape else np.broadcast_to(found, shape)  # it may be constant
 
@@ -384,6 +386,8 @@ class Course:
         self._largest = np.maximum(self._largest, np.abs(states).max(axis=0))
         if self._last is None:
             self._last = self.evaluate(function, times[:1], states[:1], inside)
+            # A corner along which the trajectory slid is left from a state on a cubic: it may be a little beyond.
+            self._beyond = 2.0 * np.minimum(self._last[0], 0.0)
         known = len(self._last)
         values = np.concatenate([self._last, self.evaluate(function, times[1:], states[1:], inside)])
         dips, values = np.asarray(find_dips(values))[known - 1 :], values[known - 1 :]
@@ -391,7 +395,7 @@ class Course:
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
         steep = np.array([self._is_steep(k) for k in of_end])
-        limits = -np.where(steep, PASSED_STEEP, PASSED) * np.where(slides, 1.0, scale)
+        limits = np.minimum(-np.where(steep, PASSED_STEEP, PASSED) * np.where(slides, 1.0, scale), self._beyond)
         # Negative at the end of the step, or possibly in between: only these are looked at on the cubic.
         suspects = (dips | (values[1:] < limits)).any(axis=1)
         last = len(times) - 2

@@ -448,7 +448,8 @@ def _list_stages(model: Model, p: Any, simulation: Simulation, mode: int, rows: 
         if not tableau.coupled:
             field = model.field(mode, piece)
             times, states, _ = stages(tableau, lambda t, x: field(t, x, p), start, end, before)
-        points = [(t, x, *model.inputs(t, piece)) for t, x in zip(times, states, strict=True)]
+        function = model.structure.modes[mode]
+        points = [(t, x, *model.inputs(function, t, piece)) for t, x in zip(times, states, strict=True)]
         return [jnp.stack(each) for each in zip(*points, strict=True)]
 
     given = (simulation.start, simulation.end, simulation.before, simulation.after)

@@ -5,9 +5,9 @@ is a smooth function: its *branch*. On a surface that attracts from both sides t
 0 the branch is the convex combination that stays on the surface (Filippov, 1988): with f_0 the field where all sliding
 corners have the side -1, and f_k the same with the side +1 at corner k,
 
-    ``f = f_0 + sum_k s_k (f_k - f_0)``,  ``dg_k/dt = D_t g_k + D_x g_k . f = 0``  for all sliding corners k,
+    ``f = f_0 + sum_k s_k (f_k - f_0)``,  ``dg_k/dt = D_t g_k + D_x g_k . f + D_u g_k . du/dt = 0``,
 
-which is left where s_k leaves [0, 1].
+for all sliding corners k, which is left where s_k leaves [0, 1]. So a branch takes the input u with its rate, (2, ...).
 
 A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the side +1 where x < 0, with an infinite
 slope at the corner. Such a corner is *steep*: nearer to it than a small *margin*, and beyond it, the field of a side is
@@ -402,7 +402,9 @@ class Corners:
         """Return f (n,), and g of each corner."""
         # Members of a group compare the same two numbers, maybe in the other order: `o` is -1 then.
         members = [o * sides[g] for g, o in zip(self._group, self._orientation, strict=True)]
-        walk, f = self._run(members, given)
+        t, x, *others = given
+        own = [others[0][0], *others[1:]] if self.function.takes_input else others  # of u and du/dt, the mode takes u
+        walk, f = self._run(members, [t, x, *own])
         return f, [a - b for a, b in (walk.values[k] for k in self._firsts)]
 
     def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
@@ -437,11 +439,15 @@ class Corners:
         return x - (g - target) * gradient / jnp.where(square > 0, square, 1.0)
 
     def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
-        """Return D_t g + D_x g . f of all corners: (count,)."""
+        """Return D_t g + D_x g . f + D_u g . du/dt of all corners: (count,)."""
         t, x, *others = given
-        # D_t g + D_x g . f is the derivative of g along (1, f): one forward pass.
-        surfaces = lambda t, x: jnp.stack(self._evaluate(_settle(sides), [t, x, *others])[1])  # noqa: E731
-        return jax.jvp(surfaces, (t, x), (jnp.ones_like(t), f))[1]
+        moving, rates = [t, x], [jnp.ones_like(t), f]
+        if self.function.takes_input:
+            u, *others = others
+            moving, rates = [*moving, u], [*rates, jnp.stack([u[1], jnp.zeros_like(u[1])])]
+        # The derivative of g along (1, f, du/dt): one forward pass.
+        surfaces = lambda *moving: jnp.stack(self._evaluate(_settle(sides), [*moving, *others])[1])  # noqa: E731
+        return jax.jvp(surfaces, moving, rates)[1]
 
     def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
         g = self._evaluate(_settle(sides), given)[1]

@@ -229,8 +229,13 @@ class Function:
         return len(self.structs) - len(self.parameters) > 2
 
     def derive(self, evaluate: Callable[..., Any]) -> Function:
-        """Return another function of the same arguments; `evaluate` takes those of the jaxpr."""
-        return Function(jax.make_jaxpr(evaluate)(*self.structs), self.parameters)
+        """Return another function of the same arguments, with its rate beside the input; `evaluate` takes those of the
+        jaxpr.
+        """
+        structs = list(self.structs)
+        if self.takes_input:
+            structs[2] = jax.ShapeDtypeStruct((2, *structs[2].shape), structs[2].dtype)
+        return Function(jax.make_jaxpr(evaluate)(*structs), self.parameters)
 
     def __hash__(self) -> int:
         return hash(self._key)
