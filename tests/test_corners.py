@@ -473,6 +473,20 @@ def test_what_slides_along_an_input_moves_with_it():
     assert check_derivatives(problem).engines[0]._split.path.sides == (((1,), (0,), (-1,)),)
 
 
+def test_what_slides_goes_on_where_the_input_bends():
+    """A block on a belt of measured speed: that it sticks to the belt is true to the errors of the solver."""
+
+    def block(t, x, p, u):
+        return jnp.stack([x[1], -p["k"] * x[0] - 0.2887 * x[1] - p["mu"] * jnp.sign(x[1] - u)])
+
+    times = np.linspace(0.0, 10.0, 101)
+    speed = sf.Input(times, 0.4 + 0.25 * np.sin(0.9 * times) + 0.1 * np.sin(2.7 * times), kind="linear")
+    data = sf.Measurements(np.linspace(0.1, 10.0, 100), np.zeros(100), lambda t, x, p: x[:1], sigma=1.0)
+    parameters = {"k": 2.7161, "mu": 3.0794}
+    evaluator = check_derivatives(problem_of(block, [0.0, 0.0], parameters, 10.0, data, inputs=speed))
+    assert evaluator.engines[0]._split.path.sides == (((-1,), (0,), (-1,), (0,), (-1,)),)
+
+
 def test_what_slides_leaves_at_a_tangent():
     """The solver takes long steps while it slides, and leaves from a state that is a little on the wrong side."""
     problem = problem_of(lambda t, x, p: p["v"] * jnp.sign(jnp.sin(2 * t) - x), [0.0], {"v": 1.5}, 2.3)
@@ -611,6 +625,13 @@ def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monk
     for _ in range(2):
         assert np.isfinite(evaluator.cost(problem.initial_theta))
         assert np.isnan([evaluator(np.array(theta)).cost, evaluator.cost(np.array(theta))]).all()
+
+
+def test_where_a_corner_is_just_touched_there_are_no_derivatives():
+    engine = Evaluator(problem_of(spring, [1.0, 0.0], {"k": 4.0, "c": 0.3})).engines[0]
+    split, found = engine._solve(np.zeros(0), np.array([4.0, 0.3]), 1.0)
+    flat = replace(found, jacobian=np.zeros_like(found.jacobian))  # no guard changes with the time of its crossing
+    assert np.isnan(engine._eliminate(split, flat)[0][split.guarded]).all()
 
 
 def test_a_solver_that_is_stuck_makes_no_corner_steep_beyond_which_the_field_is_defined():

@@ -221,8 +221,11 @@ class SplitEngine:
         # g_sigma is lower triangular in exact arithmetic, a guard depending on the crossings before it; S =
         # -g_sigma^-1 g_theta.
         square = A[rows[:, None], times]
-        T[times] = -np.linalg.solve(square, A[rows[:, None], others])
-        every[rows] = -np.linalg.solve(square.T, slope[times])
+        try:
+            T[times] = -np.linalg.solve(square, A[rows[:, None], others])
+            every[rows] = -np.linalg.solve(square.T, slope[times])
+        except np.linalg.LinAlgError:  # a corner is just touched: J has no derivatives
+            T[times], every[rows] = np.nan, np.nan
         return T, every
 
     def _solve(self, tau: FloatArray, p: FloatArray, side: float, m: int = 0) -> tuple[_Split | None, DenseEvaluation]:
