@@ -280,7 +280,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "motion of a corner in time": swap(CORNERS, "[jnp.ones_like(t), f]", "[jnp.zeros_like(t), f]"),
         "motion of a corner with the input": swap(CORNERS, "jnp.stack([u[1], ", "jnp.stack([0.0 * u[1], "),
         "sliding ends where the input bends": swap(
-            COURSE, "near = np.where(slides, np.inf, near)", "near = near * 1.0"
+            COURSE, "near + 2.0 * np.where(slides", "near + 0.0 * np.where(slides"
         ),
         "left on the wrong side": swap(COURSE, "2.0 * np.minimum(self._last[0], 0.0)", "0.0 * self._last[0]"),
         "both corners in the convex combination": swap(

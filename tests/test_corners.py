@@ -458,9 +458,7 @@ def test_a_relay_keeps_the_state_on_a_set_point_that_moves():
 
 
 def test_what_slides_along_an_input_moves_with_it():
-    """A servo with a limited speed reaches a position that is measured, follows it, and falls behind where that is
-    faster.
-    """
+    """A servo with a limited speed reaches a position, follows it, and falls behind where that is faster or jumps."""
 
     def servo(t, x, p, u):
         return p["v"] * jnp.sign(u - x)
@@ -471,6 +469,9 @@ def test_what_slides_along_an_input_moves_with_it():
     expected = np.select([times < 1 / 3, times < 1.0], [2.0 * times, 0.5 + 0.5 * times], 3.0 - 2.0 * times)
     np.testing.assert_allclose(sf.simulate(problem, times=times).states[:, 0], expected, rtol=0, atol=1e-9)
     assert check_derivatives(problem).engines[0]._split.path.sides == (((1,), (0,), (-1,)),)
+    problem = problem_of(servo, [0.0], {"v": 2.0}, 3.0, inputs=sf.Input([0.0, 1.0], [0.5, 9.0], kind="hold"))
+    found = sf.simulate(problem, times=times).states[:, 0]
+    np.testing.assert_allclose(found, np.minimum(2.0 * times, 0.5) + 2.0 * np.maximum(times - 1.0, 0.0), atol=1e-9)
 
 
 def test_what_slides_goes_on_where_the_input_bends():

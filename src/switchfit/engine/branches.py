@@ -458,14 +458,15 @@ class Course:
 
         `sides` are those to begin with; at a corner that repels to both sides, the trajectory takes that one.
         """
+        # Where it slides g is zero up to errors of the solver, which g just before t shows: an input may jump at t.
         slides = np.array([side == 0 for side in sides])
+        before = self.evaluate(self.corners.surfaces(sides), t, x, np.nextafter(t, -np.inf)) if slides.any() else 0.0
         for _ in range(2 * len(sides) + 2):
-            # Sides from the signs of g; where it is zero up to rounding, or to errors of the solver as it slides, from
-            # its rates on both sides. One decision may change the field, and with it another: repeated until nothing
-            # changes.
+            # Sides from the signs of g; where g is zero up to rounding, from its rates on both sides. One decision may
+            # change the field, and with it another: repeated until nothing changes.
             g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
             near = AT_CORNER * self._scale if crossed is None else AT_CORNER * self._scale + 2.0 * abs(g[crossed])
-            near = np.where(slides, np.inf, near)
+            near = near + 2.0 * np.where(slides, np.abs(before), 0.0)
             after = tuple(
                 self._decide(sides, k, t, x, inside) if abs(g[k]) <= near[k] else (1 if g[k] > 0 else -1)
                 for k in range(len(sides))
