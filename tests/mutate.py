@@ -279,9 +279,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "the end of sliding": swap(CORNERS, "[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]"),
         "motion of a corner in time": swap(CORNERS, "[jnp.ones_like(t), f]", "[jnp.zeros_like(t), f]"),
         "motion of a corner with the input": swap(CORNERS, "jnp.stack([u[1], ", "jnp.stack([0.0 * u[1], "),
-        "sliding ends where the input bends": swap(
-            COURSE, "near + 2.0 * np.where(slides", "near + 0.0 * np.where(slides"
-        ),
+        "sliding ends where the input bends": swap(COURSE, "== 0, drift, 0.0)", "== 2, drift, 0.0)"),
         "left on the wrong side": swap(COURSE, "2.0 * np.minimum(self._last[0], 0.0)", "0.0 * self._last[0]"),
         "both corners in the convex combination": swap(
             CORNERS, "(b[0] * e - c * b[1]) / whole", "(b[0] * e + c * b[1]) / whole"

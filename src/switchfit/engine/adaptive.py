@@ -261,10 +261,12 @@ class _Solve:
             self._watch.enter(name, self._find_row_work(name, is_explicit))
             if self._course is not None:
                 self._course.enter(mode, ends[i], x, 0.5 * (stops[0] + stops[1]))
+            middle = ends[i]
             for start, end in pairwise(stops.tolist()):
                 if end > start:
+                    before, middle = middle, 0.5 * (start + end)
                     if self._course is not None and start > ends[i]:
-                        self._course.resume(start, x, 0.5 * (start + end))
+                        self._course.resume(start, x, middle, before)
                     accepted, x = self._follow(_Stretch(mode, start, end, x, is_explicit))
                     steps += accepted
                     if self._settings.watch is not None:

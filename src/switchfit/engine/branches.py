@@ -302,7 +302,7 @@ class Course:
         """Begin a segment in a mode from a time and a state."""
         self._mode, self._last = mode, None
         self._scale = self._guess_scale(t, x, inside)
-        self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
+        self._sides.append([self._choose((1,) * self.corners.count, t, x, inside, np.zeros(self.corners.count))])
         self._ends.append([])
 
     def _is_steep(self, corner: int) -> bool:
@@ -319,9 +319,13 @@ class Course:
             g = self.evaluate(surfaces, np.full(len(points), t), points, np.full(len(points), inside))
             return np.nan_to_num(np.abs(g[1:] - g[0]).max(axis=0), posinf=0.0)
 
-    def resume(self, t: float, x: FloatArray, inside: float) -> None:
-        """Go on where an input may jump: if the branch changes there, it does so at a known time."""
-        after = self._choose(self.sides, t, x, inside)
+    def resume(self, t: float, x: FloatArray, inside: float, before: float) -> None:
+        """Go on where an input may jump, from its value in the cell of a time before it: if the branch changes there,
+        it does so at a known time.
+        """
+        # Where it slides g is zero up to errors of the solver: as large as it was before the input jumps.
+        drift = np.abs(self.evaluate(self.corners.surfaces(self.sides), t, x, before)) if self.sides else np.zeros(0)
+        after = self._choose(self.sides, t, x, inside, np.where(np.array(self.sides) == 0, drift, 0.0))
         if after != self.sides:
             self._add(t, -1, after)
 
@@ -331,7 +335,8 @@ class Course:
         # The branch behind the end that was passed, unless the rates of other corners there say another one.
         k, side = self.corners.list_ends(self.sides)[end]
         behind = (*self.sides[:k], side, *self.sides[k + 1 :])
-        after = self._choose(behind, t, x, inside, k)
+        drift = np.abs(self.evaluate(self.corners.surfaces(self.sides), t, x, inside))
+        after = self._choose(behind, t, x, inside, np.where(np.array(self.sides) == 0, drift, drift[k]))
         self._add(t, end, behind if after == self.sides else after)
 
     def _add(self, t: float, end: int, after: Sides) -> None:
@@ -453,20 +458,17 @@ class Course:
         part = low + (high - low) * min(max(below / (below - above), 0.0), 1.0) if below > above else high
         return Crossing(t0 + h * float(part), state_at(np.array([part]))[0], end)
 
-    def _choose(self, sides: Sides, t: float, x: FloatArray, inside: float, crossed: int | None = None) -> Sides:
+    def _choose(self, sides: Sides, t: float, x: FloatArray, inside: float, drift: FloatArray) -> Sides:
         """Return the sides of the branch in which a trajectory goes on; at corners from the rates of both sides.
 
-        `sides` are those to begin with; at a corner that repels to both sides, the trajectory takes that one.
+        `sides` are those to begin with; at a corner that repels to both sides, the trajectory takes that one. `drift`
+        is the error of g of each corner.
         """
-        # Where it slides g is zero up to errors of the solver, which g just before t shows: an input may jump at t.
-        slides = np.array([side == 0 for side in sides])
-        before = self.evaluate(self.corners.surfaces(sides), t, x, np.nextafter(t, -np.inf)) if slides.any() else 0.0
         for _ in range(2 * len(sides) + 2):
             # Sides from the signs of g; where g is zero up to rounding, from its rates on both sides. One decision may
             # change the field, and with it another: repeated until nothing changes.
             g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
-            near = AT_CORNER * self._scale if crossed is None else AT_CORNER * self._scale + 2.0 * abs(g[crossed])
-            near = near + 2.0 * np.where(slides, np.abs(before), 0.0)
+            near = AT_CORNER * self._scale + 2.0 * drift
             after = tuple(
                 self._decide(sides, k, t, x, inside) if abs(g[k]) <= near[k] else (1 if g[k] > 0 else -1)
                 for k in range(len(sides))
