@@ -677,15 +677,20 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     return inverse
 
 
+def moves_by_itself(basis: FloatArray) -> NDArray[np.bool_]:
+    """Return which unknowns may change alone, others being as they are: (d,); of an orthonormal basis (d, k)."""
+    return np.asarray(np.sum(basis**2, axis=1) > 1.0 - PART)
+
+
 def list_without_effect(fit: Fit) -> tuple[str, ...]:
     """Return the free parameters and initial states on which J does not depend, to second order.
 
     Those that no function reads which acts, and any other whose row of the Hessian is exactly 0, such as an entry of an
-    array that no function reads. Those that a bound, a kink or a collapsed mode holds are not among them.
+    array that no function reads. Those that a bound, a kink, a guard or a collapsed mode holds are not among them.
     """
     flat = np.all(fit.hessian == 0.0, axis=1) & ~fit.is_time
     flat |= np.isin(fit.theta_names, (*fit.unread, *fit.absent))
-    flat &= np.abs(fit.free_basis).max(axis=1, initial=0.0) > PART
+    flat &= moves_by_itself(fit.free_basis)
     return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
 
 

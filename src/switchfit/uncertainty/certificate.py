@@ -27,10 +27,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
-from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum
+from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum, moves_by_itself
 from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.fit.trajectory import compare, replace_values
 from switchfit.optimize import Status
+from switchfit.optimize.matrix import null_space
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.inspection import find_unread
 from switchfit.problem.problem import Problem, require_unknowns
@@ -504,7 +505,9 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
         rise, meaning = 0.01 * abs(here.cost), "1 % of J"
     subject = unknowns.names, unknowns.units, unknowns.is_time
     about = Identifiability(*subject, rise, meaning, "first guess", base, **find_unread(problem)._asdict())
-    return analyse(about, hessian, np.eye(len(theta)), theta, _limit_cost(evaluator, theta))
+    # J of clean data has no slope, and guards no multipliers: its own curvature counts, along the guards.
+    basis = null_space(own.constrained(theta).jacobian) if problem.constraint_names else np.eye(len(theta))
+    return analyse(about, hessian, basis, theta, _limit_cost(evaluator, theta))
 
 
 def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Cost:
@@ -541,7 +544,7 @@ def analyse(
     if not free.any() or not np.isfinite(hessian).all():
         return about
     # Unknowns on which the cost does not depend at all are reported separately.
-    without = free & np.all(hessian == 0.0, axis=1)
+    without = moves_by_itself(basis) & np.all(hessian == 0.0, axis=1)
     values, vectors, size = compute_scaled_spectrum(hessian, basis)
     kept = ~(np.sum(vectors[without] ** 2, axis=0) > 0.5)
     values, vectors = values[kept], vectors[:, kept]
