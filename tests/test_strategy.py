@@ -609,6 +609,27 @@ def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found():
     assert not again.steps, "of two minima that are known the lower one is left as it is"
 
 
+@pytest.mark.parametrize(("seed", "status"), [(0, Status.CONVERGED_AT_KINK), (1, Status.CONVERGED)])
+def test_a_narrow_minimum_far_away_is_found_from_a_kink_too(seed, status):
+    """A lag is driven in steps and leaks faster from 5.2 s on. It is at rest from 5.6 to 7.2 s: a switch there or a
+    little later leaves noise of the right size."""
+    times, steps = np.linspace(0.1, 10.0, 67), [0.0, 0.7, 1.9, 3.3, 4.1, 5.6, 7.2, 8.8, 9.5]
+    command = sf.Input(steps, [0.0, 1.0, 2.0, 1.0, -1.0, 0.0, 2.0, 3.0, 1.0])
+    leaks = {name: (lambda t, x, p, u, k=name: p["gain"] * u - p[k] * x) for name in ("slow", "fast")}
+
+    def build(values, switch, guesses):
+        log = sf.Measurements(times, values, sigma=0.03)
+        run = sf.Experiment(log, ("slow", "fast"), (switch,), 0.0, 10.0, inputs=command)
+        return sf.Problem(sf.HybridSystem(leaks, [0.0]), run, dict(zip(("gain", "slow", "fast"), guesses, strict=True)))
+
+    exact = sf.simulate(build(times, 5.2, (1.2, 0.5, 1.5)), times=times).states[:, 0]
+    problem = build(exact + 0.03 * np.random.default_rng(seed).normal(size=67), 7.5, (0.6, 1.0, 1.0))
+    near = sf.estimate(problem, strategy="local")
+    assert (near.status, near.verdict.level) == (status, "good")
+    assert near.theta[0] > 7.2
+    assert sf.estimate(problem).theta[0] == pytest.approx(5.2, abs=0.15)
+
+
 def test_starts_are_drawn_where_an_unknown_has_no_effect():
     """At the guess the level does not reach the weir: no derivative, and no hypothesis of the beam, leads there."""
     times = np.arange(0.0, 60.0, 1.0)

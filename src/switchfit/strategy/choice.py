@@ -288,7 +288,7 @@ def find_other_minimum(fit: Estimate) -> FloatArray | None:
     """
     evaluator = fit.evaluator_at_solution()
     corners = any(run.branches is not None for run in evaluator.runs)
-    if corners or not evaluator.problem.is_sigma_known or fit.status is not Status.CONVERGED:
+    if corners or not evaluator.problem.is_sigma_known or not fit.status.is_strict_minimum:
         return None
     try:
         return next(iter(choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)

@@ -54,7 +54,8 @@ ROUNDS = 12
 
 SCAN_FIRST, SCAN_RATIO = 3.0, 1.6
 """Distance of the first place of a scan of J over a time, in standard errors, and of each place to that before it.
-Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other."""
+Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other.
+Farther away, where others may be narrower, places are those of `PLACES`, with which a scan from a kink begins."""
 
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
@@ -199,14 +200,16 @@ def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -
     problem = evaluator.problem
     where, run = problem.unknowns.times[e], problem.experiments[e]
     ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
+    step = (ends[-1] - ends[0]) / PLACES
     for i, place in enumerate(where.tolist()[: len(ends) - 2]):  # without a free tf
-        nearest = SCAN_FIRST * errors[place] if place >= 0 else 0.0
+        nearest = SCAN_FIRST * errors[place] or step
         for end in (ends[i], ends[i + 2]):
-            room = abs(end - theta[place])
-            if not 0.0 < nearest < room:
+            room, far = abs(end - theta[place]), [nearest]
+            if place < 0 or not nearest < room:
                 continue
-            count = int(np.log(room / nearest) / np.log(SCAN_RATIO)) + 1
-            times = theta[place] + np.copysign(nearest * SCAN_RATIO ** np.arange(count), end - theta[place])
+            while far[-1] < room:
+                far.append(far[-1] + min((SCAN_RATIO - 1.0) * far[-1], step))
+            times, count = theta[place] + np.copysign(far[:-1], end - theta[place]), len(far) - 1
             costs = np.empty(count)
             for j, t in enumerate(times.tolist()):
                 moved = theta.copy()
