@@ -165,6 +165,7 @@ def test_constraints_that_cannot_be_met_are_named():
 
 
 HIGH = ball_system(guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
+BELOW = ball_system(guards={("air", "air"): lambda t, x, p: x[0] < 0.0})
 FIXED = guarded_ball((sf.Parameter(3.2, fixed=True),))
 WRONG = {
     "No transition times near .* put tau_1 on their": lambda: sf.evaluate_on_guards(ball((3.0,), system=HIGH)),
@@ -173,6 +174,7 @@ WRONG = {
     r"hessian must be ('auto' or 'exact'|one of)": lambda: sf.estimate(tank(), hessian="none"),
     "guards names the unknown mode 'c'; the modes are air": lambda: ball_system(guards={("air", "c"): abs}),
     r"guard \('air', 'air'\) must be a function g\(t, x, p\)": lambda: ball_system(guards={("air", "air"): 3.0}),
+    r"guard \('air', 'air'\): .* not a comparison": lambda: sf.estimate(ball((3.0,), system=BELOW)),
     r"TerminalConstraint must be a function psi\(x, p\); got 3": lambda: sf.TerminalConstraint(3),
     r"must return a number or \(m,\) of them; got \(2, 2\)": lambda: constrain(lambda x, p: jnp.ones((2, 2)) * x[0]),
 }

@@ -469,6 +469,8 @@ def call_for_vector(call: Call, arguments: tuple[Any, ...]) -> Array:
         if not array.size == int(np.prod(shape)) == 1:
             raise ValueError(f"{what}: {form} must return an array of shape {shape}; got shape {array.shape}.")
         array = array.reshape(shape)
+    if array.dtype == jnp.bool_ and what.startswith("guard"):
+        raise ValueError(f"{what}: {form} must return a number that is 0 at the transition: a - b, not a comparison.")
     if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
         return array.astype(jnp.float64)
     if array.dtype != jnp.float64:
