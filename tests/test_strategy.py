@@ -630,6 +630,28 @@ def test_a_narrow_minimum_far_away_is_found_from_a_kink_too(seed, status):
     assert sf.estimate(problem).theta[0] == pytest.approx(5.2, abs=0.15)
 
 
+def test_where_chi_square_is_rather_large_a_beam_has_the_last_word():
+    """A motor is shorted, and coasts from 6.4 on. Where shorting it changes nothing, it may as well coast from 2.3 on,
+    and a scan over that time shows nothing; what is left looks like noise."""
+    times = np.linspace(0.05, 10.0, 200)
+    modes = {
+        "on": lambda t, x, p: p["u"] - (p["short"] + p["loss"]) * x,
+        "short": lambda t, x, p: -(p["short"] + p["loss"]) * x,
+        "coast": lambda t, x, p: -p["loss"] * x,
+    }
+
+    def build(values, switches, guesses):
+        run = sf.Experiment(sf.Measurements(times, values, sigma=0.035), tuple(modes), switches, 0.0, 10.0)
+        return sf.Problem(sf.HybridSystem(modes, [0.0]), run, dict(zip(("u", "short", "loss"), guesses, strict=True)))
+
+    exact = sf.simulate(build(times, (1.6, 6.4), (8.0, 0.25, 0.5)), times=times).states[:, 0]
+    problem = build(exact + 0.035 * np.random.default_rng(4).normal(size=200), (4.0, 8.7), (23.0, 0.12, 0.63))
+    near, fit = sf.estimate(problem, strategy="local"), sf.estimate(problem)
+    assert (near.verdict.level, near.theta[1] < 3.0) == ("good", True)
+    assert fit.cost < near.cost - 15.0
+    assert abs(fit.theta[1] - 6.4) < 3 * fit.standard_errors[1]
+
+
 def test_starts_are_drawn_where_an_unknown_has_no_effect():
     """At the guess the level does not reach the weir: no derivative, and no hypothesis of the beam, leads there."""
     times = np.arange(0.0, 60.0, 1.0)

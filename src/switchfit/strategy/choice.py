@@ -69,7 +69,9 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
     if len(steps) < 2:
         if not any(run.transition_times for run in problem.experiments):
             return not is_doubted(fit)
-        if problem.is_least_squares and not is_explained(problem, fit.cost):  # a verdict takes as long as many steps
+        # A verdict takes as long as many steps, and so does a beam, which finds other minima that leave nearly noise.
+        is_noise = not problem.is_least_squares or is_explained(problem, fit.cost, 1.0)
+        if not is_noise and not (is_explained(problem, fit.cost) and explain_no_beam(problem)):
             return False
         answer = fit.verdict.answers[-1]
         return not is_doubted(fit) and answer.kind == "fits" and answer.figures.get("known") == 1.0
