@@ -180,6 +180,19 @@ def test_an_estimated_sigma_confirms_no_fit():
     assert [fit.verdict.answers[-1].figures["known"] for fit in (estimated, given)] == [0.0, 1.0]
 
 
+def test_the_resolution_of_times_beside_a_kink_is_no_doubt():
+    """Seconds since 1970 have 24 bits behind the point: the slope in one time stays at 1e-4, the other is at a kink."""
+    times, epoch = np.linspace(0.25, 10.0, 40), 1.7e9
+
+    def run(tau, seed):
+        log = temperature(times, tau, 1.0, 0.3) + noise(0.02, 40, seed)
+        return sf.Experiment(sf.Measurements(epoch + times, log, sigma=0.02), ("on", "off"), (epoch + 2.0,), epoch)
+
+    fit = sf.estimate(sf.Problem(heated_room(), [run(3.0, 4), run(4.1, 104)], {"power": 2.0, "k": 0.1}))
+    assert (fit.status, fit.verdict.level) == (sf.Status.CONVERGED_AT_KINK, "good")
+    assert fit.optimality > fit.tolerance
+
+
 def test_one_wrong_run_of_many_is_found_and_named():
     """Its chi-square is lost in that of all."""
     times = np.linspace(0.25, 6.0, 24)

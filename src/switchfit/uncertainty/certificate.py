@@ -705,7 +705,8 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
 
 def _find_failures(fit: Fit, smallest: float, check: DerivativeCheck) -> Iterator[Issue]:
     """Return the checks that failed."""
-    if fit.status is not Status.CONVERGED_PRECISION and not fit.optimality <= fit.tolerance:
+    as_precise_as_possible = fit.status.successful and fit.status is not Status.CONVERGED
+    if not as_precise_as_possible and not fit.optimality <= fit.tolerance:
         yield Issue("optimality", figures={"optimality": fit.optimality, "tolerance": fit.tolerance})
     if smallest < NEGATIVE:
         yield Issue("negative curvature", figures={"eigenvalue": smallest})
