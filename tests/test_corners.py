@@ -635,6 +635,13 @@ def test_where_a_corner_is_just_touched_there_are_no_derivatives():
     assert np.isnan(engine._eliminate(split, flat)[0][split.guarded]).all()
 
 
+def test_a_branch_that_is_not_defined_where_it_begins_is_refused():
+    """SciPy looks for a first step without end."""
+    problem = problem_of(lambda t, x, p: p["c"] * jnp.log(-jnp.abs(x) - 1.0), [1.0], {"c": 0.1})
+    with pytest.raises(NotIntegrableError, match=r"mode 'm' returned \[nan\] at t = 0 .*\(log at test_corners.py"):
+        refine_mesh(problem, 0, problem.initial_theta)
+
+
 def test_a_solver_that_is_stuck_makes_no_corner_steep_beyond_which_the_field_is_defined():
     """A sensor whose time constant is all but zero; the relay of all later fits would be without its corner."""
     problem = sharp.relay().build_problem()

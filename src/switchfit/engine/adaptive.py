@@ -338,7 +338,10 @@ class _Solve:
 
                 def slope(t: float, y: FloatArray) -> FloatArray:
                     """Return the slope in a branch that is not in the library yet, without running costs."""
-                    return np.append(course.evaluate(branch, t, y[:-1], stretch.middle), 0.0)
+                    value = course.evaluate(branch, t, y[:-1], stretch.middle)
+                    if t == stretch.start and np.isnan(value).any():  # SciPy would look for a first step without end
+                        raise BranchError
+                    return np.append(value, 0.0)
 
                 return self._take_steps(stretch, _PythonSteps(slope, stretch, self._tolerances), Watch(), MOST_FOUND)
             mode = place
