@@ -1,5 +1,6 @@
 """Online estimation: against batch fits, closed forms and brute force."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -228,6 +229,13 @@ def test_a_file_of_something_else_is_refused(problem, log, tmp_path):
     online.save(tmp_path / "state")
     with pytest.raises(ValueError, match="other settings"):
         sf.OnlineEstimator.load(tmp_path / "state", problem, width=10)
+    modes = dict(reversed(problem.system.modes.items()))
+    swapped = replace(problem, system=replace(problem.system, modes=modes))
+    with pytest.raises(ValueError, match="another problem"):
+        sf.OnlineEstimator.load(tmp_path / "state", swapped)
+    (tmp_path / "cut off").write_bytes((tmp_path / "state").read_bytes()[:100])
+    with pytest.raises(ValueError, match="not a saved"):
+        sf.OnlineEstimator.load(tmp_path / "cut off", problem)
 
 
 @pytest.mark.parametrize("settings", [{}, {"window": 4.0}])

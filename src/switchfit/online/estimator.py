@@ -555,7 +555,7 @@ class OnlineEstimator:
             raise StoppedError(self._stopped)
         names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold", "spacing")
         others = {name: getattr(self, name) for name in names}
-        others["held"] = None if self.held is None else self.held.tolist()
+        others |= {"held": None if self.held is None else self.held.tolist(), "shape": self._shape}
         write_atomically(self._tracker.pack(others), as_path(path, "path"))
         if self._journal is not None:
             write_atomically(b"", self._journal)  # the saved state has what was in it
@@ -593,6 +593,14 @@ class OnlineEstimator:
             with suppress(ValueError):  # the update that was refused then
                 self.update(t, y, u=u)
         self._journal = file
+
+    @property
+    def _shape(self) -> list[Any]:
+        """What has to be the same where the hypotheses are taken up again."""
+        problem, settings, engine = self.problem, self._settings, self._tracker.beam.engine
+        channels = [list(item.names or ()) for item in self._sensors]
+        names = [list(problem.system.modes), list(problem.parameters), channels]
+        return [*names, settings.width, settings.births, engine.record_size]
 
     @classmethod
     def load(cls, path: str | Path, problem: Problem, **settings: Any) -> OnlineEstimator:
@@ -638,7 +646,9 @@ class OnlineEstimator:
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
         online._tracker.step(births=False)  # gives the engine its settings
-        online._tracker.unpack(numbers, arrays, file)
+        if numbers["shape"] != online._shape:
+            raise ValueError(f"{file} was saved for another problem, or with other settings: give the same ones.")
+        online._tracker.unpack(numbers, arrays)
         if online._tracker.kept:  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
         online._fitted, online._lost, online._recent = (numbers[name] for name in ("_fitted", "_lost", "_recent"))

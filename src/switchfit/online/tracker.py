@@ -27,6 +27,7 @@ from itertools import accumulate
 from math import nextafter
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -685,18 +686,13 @@ class Tracker:
 
     # --- files -----------------------------------------------------------------------------------------------------
 
-    @property
-    def _shape(self) -> list[int]:
-        """What has to be the same where the hypotheses are taken up again."""
-        return [self.settings.width, self.settings.births, self.beam.engine.record_size]
-
     def pack(self, others: dict[str, Any]) -> bytes:
         """Return all arrays, and other numbers, as a file."""
         arrays: dict[str, Any] = {f"feed {name}": array for name, array in self.feed.copy_arrays().items()}
         for k, (sequences, found, shift) in enumerate(self.kept):
             own = sequences._asdict() | {"records": found.records, "shift": shift}
             arrays |= {f"kept {k} {name}": array for name, array in own.items()}
-        arrays |= {"shift": self.shift, "declared": self.declared, "shape": self._shape}
+        arrays |= {"shift": self.shift, "declared": self.declared}
         if self.start is not None:
             arrays |= {f"start {name}": np.asarray(array) for name, array in self.start._asdict().items()}
         numbers = others | {"format": FORMAT, "first": self.first, "node": self.node, "left": self.left}
@@ -704,10 +700,8 @@ class Tracker:
         np.savez(buffer, numbers=np.frombuffer(json.dumps(numbers).encode(), dtype=np.uint8), **arrays)
         return buffer.getvalue()
 
-    def unpack(self, numbers: dict[str, Any], arrays: dict[str, FloatArray], path: Path) -> None:
-        """Take what was saved; ValueError if that is of another problem or other settings."""
-        if arrays["shape"].tolist() != self._shape:
-            raise ValueError(f"{path} was saved for another problem, or with other settings: give the same ones.")
+    def unpack(self, numbers: dict[str, Any], arrays: dict[str, FloatArray]) -> None:
+        """Take what was saved."""
 
         def part(name: str) -> dict[str, Any]:
             begin = f"{name} "
@@ -748,7 +742,7 @@ def invert(matrix: FloatArray) -> FloatArray:
     return found
 
 
-FORMAT = "switchfit online 3"
+FORMAT = "switchfit online 4"
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
@@ -757,7 +751,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         numbers = json.loads(arrays.pop("numbers").tobytes())
-    except (ValueError, KeyError, EOFError) as error:
+    except (ValueError, KeyError, EOFError, BadZipFile) as error:
         raise ValueError(f"{path} is not a saved online estimator ({error}).") from error
     if numbers.get("format") != FORMAT:
         raise ValueError(f"{path} is of another version: it has {numbers.get('format')!r}, not {FORMAT!r}.")
