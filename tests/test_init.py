@@ -1,6 +1,7 @@
 """Problems to begin with: `switchfit init` and `switchfit examples`."""
 
 import re
+import shlex
 import shutil
 import tomllib
 from pathlib import Path
@@ -31,14 +32,14 @@ def write_log(path, header="t,level,idle,count", rows=list):
 
 def test_without_a_log_an_example_is_written_that_can_be_fitted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    result = run("init", "room")
+    result = run("init", "my room")
     assert result.exit_code == 0, result.output
-    written = {path.name for path in Path("room").iterdir()} - {"__pycache__"}
+    written = {path.name for path in Path("my room").iterdir()} - {"__pycache__"}
     assert written == {"log.csv", "model.py", "problem.toml"}
     for command in re.findall(r"^  switchfit (.*)$", result.stdout, re.MULTILINE):
-        done = run(*command.split())
+        done = run(*shlex.split(command))
         assert done.exit_code == 0, done.output
-    fit = sf.Estimate.load("room/out/estimate.json")
+    fit = sf.Estimate.load("my room/out/estimate.json")
     assert fit.verdict.level == "good"
     np.testing.assert_allclose(fit.theta, [5.3, 5.0, 0.2, 15.0], rtol=0.02)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 import os
+import shlex
 import shutil
 import tomllib
 from pathlib import Path
@@ -41,10 +42,9 @@ def init(name: NewFolder, log: FirstLog = None) -> None:
     loaded = terminal.load(folder / "problem.toml")
     terminal.print_text("\n".join(["Written", *(f"  {path}" for path in written), ""]))
     terminal.print_text(write_experiments(loaded.problem.experiments))
-    terminal.print_text(
-        f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
-        f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
-    )
+    problem, out = shlex.quote(str(folder / "problem.toml")), shlex.quote(str(folder / "out"))
+    terminal.print_text(f"\nNext\n  switchfit check {problem}\n  switchfit fit {problem} --out {out}\n")
+    terminal.print_text(f"Then put your own modes into {folder / 'model.py'}.")
 
 
 def _complete_examples(incomplete: str) -> list[str]:
@@ -85,8 +85,8 @@ def examples(name: ExampleName = None, folder: ExampleFolder = None) -> None:
     else:
         target.mkdir(parents=True, exist_ok=True)
         shutil.copy(source, target)
-    commands = [f"switchfit {_choose_command(path)} {path}" for path in sorted(target.glob("*.toml"))]
-    commands = commands or [f"python {path}" for path in sorted(target.glob("*.py"))]
+    commands = [f"switchfit {_choose_command(path)} {shlex.quote(str(path))}" for path in sorted(target.glob("*.toml"))]
+    commands = commands or [f"python {shlex.quote(str(path))}" for path in sorted(target.glob("*.py"))]
     terminal.print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
 
 
