@@ -192,3 +192,13 @@ def test_names_with_dollars_are_no_formulas():
     turn_off_formulas(figure)
     assert not name.get_parse_math()
     assert tick.get_parse_math()
+
+
+def test_a_long_name_of_a_channel_is_not_wider_than_its_panel(heater):
+    (run,) = heater.problem.experiments
+    data = replace(run.data[0], names=("temperature of the pipe in the cellar behind the boiler",))
+    fit = sf.estimate(replace(heater.problem, experiments=replace(run, data=data)))
+    for figure in (fit.plot(), fit.plot_residuals()):
+        figure.draw_without_rendering()
+        ax = figure.axes[0]
+        assert ax.yaxis.label.get_window_extent().height < ax.bbox.height

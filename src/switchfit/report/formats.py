@@ -67,6 +67,16 @@ def label_quantity(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
+def wrap_quantity(name: str, unit: str = "") -> str:
+    """Return the label of an upright axis, as `label_quantity`, in lines no longer than a panel is high.
+
+    Parameters
+    ----------
+    name, unit : str
+    """
+    return textwrap.fill(label_quantity(name, unit), 20)
+
+
 def get_unit(comparison: Comparison, channel: int, trajectory: Trajectory) -> str:
     """Return the unit of a channel as it is shown: its own, or that of the state of the same name.
 

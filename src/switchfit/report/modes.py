@@ -516,7 +516,7 @@ def plot_log(log: OnlineLog) -> Figure:
     plot_statistic(log, axes[1])
     for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
         _plot_value(log.times, value, error, ax)
-        ax.set_ylabel(formats.label_quantity(name, unit))
+        ax.set_ylabel(formats.wrap_quantity(name, unit))
     for ax in axes:
         style.label_axis(ax, log)
         ax.label_outer()

@@ -21,7 +21,7 @@ from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
-from switchfit.report.formats import count_worst, format_unit, label_quantity
+from switchfit.report.formats import count_worst, format_unit, label_quantity, wrap_quantity
 from switchfit.report.style import DATA, FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
 from switchfit.strategy.validation import Validation
@@ -183,7 +183,7 @@ def plot_comparison(comparison: Comparison, channel: int, ax: Axes, *, label: st
     _mark_outliers(comparison, measured, channel, ax)
     times, curve = break_at_transitions(comparison.curve_times, replace_infinities(comparison.curve[:, channel]))
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
-    ax.set_ylabel(label_quantity(comparison.names[channel], comparison.units[channel]))
+    ax.set_ylabel(wrap_quantity(comparison.names[channel], comparison.units[channel]))
 
 
 def plot_residuals(comparison: Comparison, channel: int, ax: Axes) -> None:

@@ -382,7 +382,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
     for row, (label, channel) in zip(axes, shown, strict=True):
         for ax, draw in zip(row, (draw_in_time, draw_autocorrelation, draw_quantiles), strict=True):
             draw(channel, ax)
-        row[0].set_ylabel(f"{label}\nresidual / {'sigma' if channel.sigma_known else 'rms'}")
+        row[0].set_ylabel(f"{formats.wrap_quantity(label)}\nresidual / {'sigma' if channel.sigma_known else 'rms'}")
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):

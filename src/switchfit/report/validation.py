@@ -8,7 +8,7 @@ from switchfit.experiment_design import Design
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import formats, plot, style
-from switchfit.report.formats import Table, format_table, join_sections, label_quantity, wrap_text
+from switchfit.report.formats import Table, format_table, join_sections, label_quantity, wrap_quantity, wrap_text
 from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, SMALL, THIN, TRANSITION
 from switchfit.report.uncertainty import format_probability
@@ -47,7 +47,7 @@ def plot_prediction(prediction: Prediction, *, level: float = 0.95) -> Figure:
             ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
         style.label_axis(ax, prediction)
         ax.set_xlim(min(times[0], begin), max(times[-1], end))
-        ax.set_ylabel(label_quantity(comparison.names[k], comparison.units[k]))
+        ax.set_ylabel(wrap_quantity(comparison.names[k], comparison.units[k]))
         ax.label_outer()
     figure.draw_legend(style.collect_handles(axes), loc="outside upper right")
     return style.turn_off_formulas(figure)
