@@ -238,6 +238,21 @@ def test_a_file_of_something_else_is_refused(problem, log, tmp_path):
         sf.OnlineEstimator.load(tmp_path / "cut off", problem)
 
 
+@pytest.mark.parametrize(("seed", "sigma"), [(20, 0.035), (1, 0.025)], ids=["moved far", "no time"])
+def test_alarms_by_noise_that_is_larger_than_sigma_are_refuted(seed, sigma):
+    """What is left without them is fitted anew, and no mode lasts less than no time."""
+    times, noise = np.arange(60.0), 0.05 * np.random.default_rng(seed).normal(size=60)
+    peak = 16.0 - 15.0 * np.exp(-np.minimum(times, 22.3) / 20.0)
+    levels = np.where(times < 22.3, peak, (peak + 2.0) * np.exp(-(times - 22.3) / 20.0) - 2.0) + noise
+    fields = {m: lambda t, x, p, m=m: (p[m] - x) / p["T"] for m in ("before", "after")}
+    data = sf.Measurements(times, levels, sigma=sigma)
+    run = sf.Experiment(data, ("before",), initial_state=[sf.Parameter(1.0)])
+    guesses = {"before": sf.Parameter(7.0), "after": sf.Parameter(0.8), "T": sf.Parameter(3.0, lower=0.1)}
+    log = sf.replay(sf.Problem(sf.HybridSystem(fields, [0.0]), run, guesses))
+    assert log.now.mode_sequence == ("before", "after")
+    assert log.now.since == pytest.approx(22.3, abs=0.1)
+
+
 @pytest.mark.parametrize("settings", [{}, {"window": 4.0}])
 @pytest.mark.parametrize("late", [3, 35])
 def test_samples_that_come_late_change_nothing_in_the_end(problem, log, batch, settings, late):
@@ -348,7 +363,7 @@ def test_a_second_sensor_at_a_time_that_there_is():
 def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
     online = sf.OnlineEstimator(problem, threshold=8.0)
     wrong = log.copy()
-    wrong[40:44] += [0.25, 0.25, 0.0]
+    wrong[40:44] -= [0.1, 0.1, 0.0]
     said = feed_all(online, wrong[:58])
     alarms, retracted = [now.alarm for now in said if now.alarm], [now.retracted for now in said if now.retracted]
     assert retracted[0] == alarms[0]

@@ -444,14 +444,18 @@ class Tracker:
         value: FloatArray = found.scores + self.settings.penalty * switches
         return value
 
-    def find_best(self, kept: Sequences, value: FloatArray) -> tuple[int, int | None, int | None]:
+    def find_best(self, kept: Sequences, found: Hypotheses) -> tuple[int, int | None, int | None]:
         """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
-        which of those that have more after it.
+        which of those that have more after it: none in which a mode would last less than no time, unless declared.
         """
-        last = len(self.declared) - 1
+        last, A = len(self.declared) - 1, self.settings.entries
         same = (kept.modes[:, : last + 1] == self.declared).all(1)
-        ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
-        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in ways)
+        times = kept.times + found.moved[:, A : A + self.settings.births]
+        times = np.where(self._slots < kept.switches[:, None], times, self.feed.nodes[self.node])
+        ordered = (np.diff(times, append=self.feed.nodes[self.node]) >= 0).all(1)
+        ways = [same & (kept.switches == last), same & (kept.switches > last) & ordered]
+        value = np.where(ordered | ways[0], self.value(kept.switches, found), np.inf)
+        exact, more = (int(np.where(own, value, np.inf).argmin()) if own.any() else None for own in ways)
         return int(value.argmin()), exact, more
 
     def advance(self, changed: int, births: bool) -> None:
@@ -496,10 +500,10 @@ class Tracker:
     def _select(self, value: FloatArray, code: Integers, switches: Integers) -> Integers:
         """Return the best hypotheses, those that are always kept among them."""
         chosen = select_lowest(value, code, switches, self.settings.width, PER_SEQUENCE)
-        # What was declared, and where there is more than one mode in the window, that without the last one.
+        # What was declared, and where there are more modes in the window, that without the last one or two.
         modes = [*(each.mode for each in self.left), *self.declared.tolist()]
         there = code[chosen].tolist()  # if any of a sequence, then its best
-        for own in [encode(modes), encode(modes[:-1])][: len(self.declared)]:
+        for own in [encode(modes), encode(modes[:-1]), encode(modes[:-2])][: len(self.declared)]:
             if own not in there:
                 same = np.flatnonzero((code == own) & np.isfinite(value))
                 chosen = np.append(chosen, same[value[same].argsort(kind="stable")[:1]])
@@ -540,8 +544,13 @@ class Tracker:
         if last <= self.first:
             return
         kept, found = self.latest
-        best = self.find_best(kept, self.value(kept.switches, found))
-        chosen = np.array(sorted({b for b in best if b is not None}))
+        value = self.value(kept.switches, found)
+        best = {b for b in self.find_best(kept, found) if b is not None}
+        # A change can be refuted only where the modes before it fit as well as they can.
+        for modes in (self.declared[:-1], self.declared[:-2]):
+            own = ((kept.modes[:, : len(modes)] == modes).all(1) & (kept.switches == len(modes) - 1)).nonzero()[0]
+            best |= set(own[value[own].argsort()[:1]].tolist())
+        chosen = np.array(sorted(best))
         own, moved = kept.take(chosen), found.moved[chosen]
         times, latest = self._place_births(own, moved, float(self.feed.nodes[last]))
         anew = self._propagate(own, moved, times, own.switches, last, recentres=True)
