@@ -73,6 +73,13 @@ def test_a_log_that_is_out_of_order_is_repaired_as_the_file_says(tmp_path):
     assert problem.system.state_names == ('a "b" {c} \\d', "count")
 
 
+def test_a_log_in_another_multiple_of_a_state_s_unit_is_refused(tmp_path):
+    write_first_problem(tmp_path / "new", write_log(tmp_path / "log.csv", "t,level (cm),idle,count"))
+    write_log(tmp_path / "new" / "log.csv", "t,level (mm),idle,count")
+    with pytest.raises(ValueError, match=r"column 'level' is in mm, but the model has the state 'level' in cm"):
+        load_problem(tmp_path / "new" / "problem.toml")
+
+
 def test_a_large_log_is_referred_to(tmp_path, monkeypatch):
     log = write_log(tmp_path / "log.csv")
     monkeypatch.setattr(writing, "LARGEST_COPY", 100)

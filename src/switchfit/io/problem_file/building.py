@@ -256,6 +256,24 @@ def _add_first_sequence(
     return table.model_copy(update={"mode_sequence": [first], "transition_times": []})
 
 
+PREFIXES = "pnµmcdhkMGT"
+"""Of units that differ by a power of ten."""
+
+
+def _check_units(item: DataTable, units: Sequence[str], system: HybridSystem) -> None:
+    """Refuse a column in the unit of the state that it measures, but for its prefix: nothing converts it."""
+    states, simple = system.state_names or (), str.maketrans("uμ", "µµ")
+    known = dict(zip(states, system.state_units or (), strict=False))
+    for column, state, unit in zip(item.columns, item.observe or states, units, strict=False):
+        pair = [found.translate(simple) for found in (unit, known.get(state, ""))]
+        bare, other = ({name, name[name[:1] in PREFIXES :]} - {""} for name in pair)
+        if pair[0] != pair[1] and bare & other:
+            raise ValueError(
+                f"column {column!r} is in {unit}, but the model has the state {state!r} in {known[state]}, and nothing "
+                "converts it: change that unit in state_units, with the guesses, or the column of the log."
+            )
+
+
 OWN = {"measurements": ("sigma", "loss", "delay"), "reference": ("lowpass_hz", "weights")}
 """Of each kind of data, the keys that the other one does not have."""
 
@@ -328,6 +346,8 @@ class _Run:
         kind = Measurements if item.kind == "measurements" else ReferenceSignal
         times, values, units = cut_log(log, item, self.contents, self.table, kind.__name__)
         q = len(item.columns)
+        if self.system is not None and not isinstance(item.observe, str):
+            _check_units(item, units, self.system)
         names = tuple(item.observe if isinstance(item.observe, list) else item.columns)
         more: dict[str, Any] = {"observe": observe, "names": names, "units": units[:q]}
         if kind is ReferenceSignal:
