@@ -47,7 +47,7 @@ TESTS = {
         [
             "tests/test_corners.py",
             "-k",
-            "once or stays_on or what_slides or leaves_out or closed_forms or differences or order or rest or predicts "
+            "once or stays_on or what_slides or infinite_slope or leaves_out or closed_forms or differences or order or rest or predicts "
             "or level or filled or cascade or nearly_shuts or saturate or rounded or cases",
         ]
     ],
@@ -280,6 +280,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "motion of a corner in time": swap(CORNERS, "[jnp.ones_like(t), f]", "[jnp.zeros_like(t), f]"),
         "motion of a corner with the input": swap(CORNERS, "jnp.stack([u[1], ", "jnp.stack([0.0 * u[1], "),
         "sliding ends where the input bends": swap(COURSE, "== 0, drift, 0.0)", "== 2, drift, 0.0)"),
+        "an output beyond its corner": swap(STRUCTURE, "return choose_sides(trace(", "return (trace("),
         "left on the wrong side": swap(COURSE, "2.0 * np.minimum(self._last[0], 0.0)", "0.0 * self._last[0]"),
         "both corners in the convex combination": swap(
             CORNERS, "(b[0] * e - c * b[1]) / whole", "(b[0] * e + c * b[1]) / whole"

@@ -721,6 +721,28 @@ def test_a_tank_that_empties_has_a_right_and_finite_gradient():
     np.testing.assert_allclose(states, value_of(tank_at, times, [1.5, 0.8]), rtol=0, atol=1e-9)
 
 
+def outflow(t, x, p):
+    return p["k"] * jnp.sqrt(jnp.maximum(x, 0.0))
+
+
+def outflow_both_ways(t, x, p):
+    return p["k"] * jnp.sign(x) * jnp.sqrt(jnp.abs(x))
+
+
+@pytest.mark.parametrize("output", [outflow, outflow_both_ways])
+def test_an_output_with_an_infinite_slope_at_a_corner_has_derivatives_beyond(output):
+    """The flow out of a tank, which is measured: k max(sqrt(x0) - k t / 2, 0), is 0 once it is empty."""
+    times = np.linspace(0.1, 4.5, 45)
+    data = sf.Measurements(times, np.cos(times), output, sigma=1.0)
+    problem = problem_of(tank, lambda p: jnp.stack([p["x0"]]), {"x0": 1.5, "k": 0.8}, 4.5, data, rtol=1e-12, atol=1e-12)
+    (J, g, *_), found = (
+        expect(lambda t, q: q[1] * jnp.maximum(jnp.sqrt(q[0]) - 0.5 * q[1] * t, 0.0), problem),
+        sf.evaluate(problem),
+    )
+    assert found.cost == pytest.approx(J, rel=1e-4)
+    np.testing.assert_allclose(found.gradient, g, rtol=0, atol=1e-3 * np.abs(g).max())
+
+
 # --- random systems ---------------------------------------------------------------------------------------------------
 
 

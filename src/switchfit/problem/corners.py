@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from itertools import count, islice
+from itertools import count, islice, product
 from typing import Any, NamedTuple
 
 import jax
@@ -456,6 +456,42 @@ class Corners:
         # combination.
         ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides)]
         return [value for each in ends for value in each]
+
+
+    def choose(self, t: Array, x: Array, *others: Array) -> Array:
+        """Return the function on the sides on which x is: others are evaluated where they are defined, and left out."""
+        g, chosen = self._evaluate((1,) * self.count, [t, x, *others])[1], jnp.zeros(self.function.shape)
+        for sides in product((1, -1), repeat=self.count):
+            is_here, there = jnp.array(True), x
+            for k, side in enumerate(sides):
+                is_inside, target = side * g[k] > 0, side * (abs(g[k]) + TOUCHED)
+                there = jnp.where(is_inside, there, self._move(sides, k, target, [t, there, *others]))
+                is_here &= (g[k] > 0) == (side > 0)
+            chosen = jnp.where(is_here, self._evaluate(sides, [t, there, *others])[0], chosen)
+        return chosen
+
+
+STEEP = frozenset({"sqrt", "rsqrt", "cbrt", "log", "log1p", "pow", "acos", "asin", "acosh", "atanh"})
+"""Operations whose slope may be infinite where they begin to be defined."""
+
+MOST_CHOSEN = 3
+"""Most corners of a function that is written as a choice among its branches."""
+
+TOUCHED = 1e-12
+"""|g| at which an output is evaluated at a corner."""
+
+
+def choose_sides(function: Function) -> Function:
+    """Return an output h(t, x, p) that has derivatives on both sides of its corners.
+
+    Those of ``sqrt(maximum(x, 0))`` are NaN for x < 0, where an infinite slope is multiplied by 0.
+    """
+    names = {equation.primitive.name for each in list_jaxprs(function.jaxpr) for equation in each.eqns}
+    corners = find_corners(function) if names & STEEP else None
+    if corners is None or not 0 < corners.count <= MOST_CHOSEN:
+        return function
+    with use_float64():
+        return function.derive(corners.choose)
 
 
 def _settle(sides: Sides) -> Sides:

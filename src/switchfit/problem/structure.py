@@ -18,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.problem.corners import choose_sides
 from switchfit.problem.data import (
     Measurements,
     ReferenceSignal,
@@ -352,7 +353,7 @@ def _trace_initial_state(trace: _Tracer, initial: Any) -> tuple[Function | None,
 def _trace_observe(trace: _Tracer, item: Measurements | ReferenceSignal, channels: int, n: int) -> Function | None:
     """Return the observation h(t, x, p) of one of the data; None if the whole state is compared."""
     if item.observe is not None:
-        return trace(item.observe, ((), (n,), None), (channels,), "observe", "h(t, x, p)")
+        return choose_sides(trace(item.observe, ((), (n,), None), (channels,), "observe", "h(t, x, p)"))
     if channels != n:
         raise ValueError(
             f"Without observe=h(t, x, p) -> ({channels},) the whole state is compared: its {n} entries; got {channels}."
