@@ -47,8 +47,8 @@ TESTS = {
         [
             "tests/test_corners.py",
             "-k",
-            "once or stays_on or what_slides or infinite_slope or leaves_out or closed_forms or differences or order or rest or predicts "
-            "or level or filled or cascade or nearly_shuts or saturate or rounded or cases",
+            "once or stays_on or what_slides or infinite_slope or leaves_out or closed_forms or differences or order "
+            "or rest or predicts or level or filled or cascade or nearly_shuts or saturate or rounded or cases",
         ]
     ],
     "online": [["tests/test_online.py"]],

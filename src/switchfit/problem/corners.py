@@ -457,7 +457,6 @@ class Corners:
         ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides)]
         return [value for each in ends for value in each]
 
-
     def choose(self, t: Array, x: Array, *others: Array) -> Array:
         """Return the function on the sides on which x is: others are evaluated where they are defined, and left out."""
         g, chosen = self._evaluate((1,) * self.count, [t, x, *others])[1], jnp.zeros(self.function.shape)
