@@ -54,8 +54,10 @@ ROUNDS = 12
 
 SCAN_FIRST, SCAN_RATIO = 3.0, 1.6
 """Distance of the first place of a scan of J over a time, in standard errors, and of each place to that before it.
-Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other.
-Farther away, where others may be narrower, places are those of `PLACES`, with which a scan from a kink begins."""
+Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other."""
+
+SCAN_STEP = 1 / 40
+"""Largest distance of two places, as a part of the horizon: other minima may be narrow. A scan from a kink begins so."""
 
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
@@ -200,7 +202,7 @@ def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -
     problem = evaluator.problem
     where, run = problem.unknowns.times[e], problem.experiments[e]
     ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
-    step = (ends[-1] - ends[0]) / PLACES
+    step = SCAN_STEP * (ends[-1] - ends[0])
     for i, place in enumerate(where.tolist()[: len(ends) - 2]):  # without a free tf
         nearest = SCAN_FIRST * errors[place] or step
         for end in (ends[i], ends[i + 2]):
