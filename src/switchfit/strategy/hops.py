@@ -57,7 +57,7 @@ SCAN_FIRST, SCAN_RATIO = 3.0, 1.6
 Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other."""
 
 SCAN_STEP = 1 / 40
-"""Largest distance of two places, as a part of the horizon: other minima may be narrow. A scan from a kink begins so."""
+"""Largest distance of two places, as a part of the horizon: others may be narrow. A scan from a kink begins with it."""
 
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
