@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import io
 import json
+import operator
 from collections import deque
 from itertools import accumulate
 from math import nextafter
@@ -315,6 +316,9 @@ PER_SEQUENCE = 8
 """Hypotheses with the same sequence that are kept, at most. Of fewer, those that fit the noise of the last second best
 leave no room for a change that begins."""
 
+CERTAIN = 200.0
+"""Rise of 2 J without a change from which on it is not looked at anew: what is not fitted anew is too high by less."""
+
 LONGEST_APART = 2.0
 """How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
 
@@ -448,15 +452,23 @@ class Tracker:
         """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
         which of those that have more after it: none in which a mode would last less than no time, unless declared.
         """
-        last, A = len(self.declared) - 1, self.settings.entries
+        last, value = len(self.declared) - 1, self.value(kept.switches, found)
         same = (kept.modes[:, : last + 1] == self.declared).all(1)
-        times = kept.times + found.moved[:, A : A + self.settings.births]
-        times = np.where(self._slots < kept.switches[:, None], times, self.feed.nodes[self.node])
-        ordered = (np.diff(times, append=self.feed.nodes[self.node]) >= 0).all(1)
-        ways = [same & (kept.switches == last), same & (kept.switches > last) & ordered]
-        value = np.where(ordered | ways[0], self.value(kept.switches, found), np.inf)
-        exact, more = (int(np.where(own, value, np.inf).argmin()) if own.any() else None for own in ways)
-        return int(value.argmin()), exact, more
+        exact = (same & (kept.switches == last)).nonzero()[0]
+        others = value.argsort().tolist()  # those that have failed come last
+        best = next((b for b in others if self._is_ordered(kept, found, b)), others[0])
+        further = (same & (kept.switches > last)).tolist()
+        more = (b for b in others if further[b] and self._is_ordered(kept, found, b))
+        if not len(exact):
+            return best, None, next(more, None)
+        own = int(exact[value[exact].argmin()])
+        return own if value[own] < value[best] else best, own, next(more, None)
+
+    def _is_ordered(self, kept: Sequences, found: Hypotheses, b: int) -> bool:
+        """Return whether the births of a hypothesis follow one another, and are not after now."""
+        count, A = int(kept.switches[b]), self.settings.entries
+        times = (kept.times[b, :count] + found.moved[b, A : A + count]).tolist()
+        return all(map(operator.le, times, [*times[1:], float(self.feed.nodes[self.node])]))
 
     def advance(self, changed: int, births: bool) -> None:
         """Take all hypotheses to the last node of the feed, of which those from `changed` on are new, or have samples
@@ -547,9 +559,11 @@ class Tracker:
         value = self.value(kept.switches, found)
         best = {b for b in self.find_best(kept, found) if b is not None}
         # A change can be refuted only where the modes before it fit as well as they can.
+        doubted = 2.0 * (value - value.min()) < CERTAIN
         for modes in (self.declared[:-1], self.declared[:-2]):
-            own = ((kept.modes[:, : len(modes)] == modes).all(1) & (kept.switches == len(modes) - 1)).nonzero()[0]
-            best |= set(own[value[own].argsort()[:1]].tolist())
+            same = doubted & (kept.switches == len(modes) - 1) & (kept.modes[:, : len(modes)] == modes).all(1)
+            if same.any():
+                best.add(int(np.where(same, value, np.inf).argmin()))
         chosen = np.array(sorted(best))
         own, moved = kept.take(chosen), found.moved[chosen]
         times, latest = self._place_births(own, moved, float(self.feed.nodes[last]))
