@@ -697,3 +697,30 @@ def test_a_guess_at_which_a_cost_has_no_slope_later_on_is_a_bad_start():
     assert alone.reason.kind == "undefined"
     assert 3.0 < alone.reason.figures["t"] < 8.0
     np.testing.assert_allclose(sf.estimate(build(values, *guess)).theta, [6.0, 0.5, 0.4], rtol=0.05)
+
+
+def test_times_at_which_what_is_measured_jumps_are_found():
+    """Gear shifts, and the speed of the engine: a sample between a birth of the beam and a shift is off by 40 sigma."""
+    ratios = {"first": 3.0, "second": 2.0, "third": 1.3}
+
+    def drive(ratio):
+        rate = lambda x, p: p["a"] * ratio - p["c"] * x[0] ** 2  # noqa: E731
+        return lambda t, x, p: jnp.stack([rate(x, p), 10.0 * ratio * rate(x, p)])
+
+    def shift(ratio):
+        return lambda t, x, p: jnp.stack([x[0], 10.0 * ratio * x[0]])
+
+    resets = {("first", "second"): shift(2.0), ("second", "third"): shift(1.3)}
+    system = sf.HybridSystem({name: drive(ratio) for name, ratio in ratios.items()}, [1.0, 30.0], resets)
+    times = np.linspace(0.1, 20.0, 200)
+
+    def build(values, shifts, a, c):
+        log = sf.Measurements(times, values, lambda t, x, p: x[1:], sigma=3.0)
+        parameters = {"a": sf.Parameter(a, lower=0.0), "c": sf.Parameter(c, lower=0.0)}
+        return sf.Problem(system, sf.Experiment(log, tuple(ratios), shifts, 0.0, 20.0), parameters)
+
+    exact = sf.simulate(build(np.zeros(200), (4.03, 10.07), 1.0, 0.002), times=times).states[:, 1]
+    fit = sf.estimate(build(exact + 3.0 * np.random.default_rng(0).normal(size=200), (4.4, 11.0), 0.5, 0.003))
+    assert fit.verdict.level == "good"
+    assert [step.strategy for step in fit.steps] == ["local", "beam along the log"]
+    np.testing.assert_allclose(fit.theta, [4.05, 10.05, 1.0, 0.002], atol=0.06)
