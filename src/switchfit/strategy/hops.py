@@ -170,7 +170,9 @@ def _minimize(
     """Return the lowest value of a quadratic model with the unknown at `place` between two values, and the step (d,);
     None if it has no minimum.
     """
-    step, places = np.zeros(len(gradient)), np.flatnonzero(free | (np.arange(len(free)) == place))
+    # What acts through a guard alone stays: J of times that are free does not depend on it.
+    moves = free & (np.diag(hessian) != 0.0) | (np.arange(len(free)) == place)
+    step, places = np.zeros(len(gradient)), np.flatnonzero(moves)
     factor, step[places], failed = lapack.dposv(hessian[places[:, None], places], -gradient[places])
     if failed:
         return None
