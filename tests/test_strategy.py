@@ -699,9 +699,20 @@ def test_a_guess_at_which_a_cost_has_no_slope_later_on_is_a_bad_start():
     np.testing.assert_allclose(sf.estimate(build(values, *guess)).theta, [6.0, 0.5, 0.4], rtol=0.05)
 
 
-@pytest.mark.parametrize("limit", [(), (350.0,)], ids=["anywhere", "at a speed"])
-def test_times_at_which_what_is_measured_jumps_are_found(limit):
-    """Gear shifts, and the speed of the engine: a sample between a birth of the beam and a shift is off by 40 sigma."""
+@pytest.mark.parametrize(
+    ("limit", "seed", "held"),
+    [
+        pytest.param((), 0, (), id="between samples"),
+        pytest.param((), 2, (10.1,), id="before a sample"),
+        pytest.param((), 6, (4.0, 10.0), id="after two samples"),
+        pytest.param((350.0,), 0, (3.7,), id="at a speed, before a sample"),
+        pytest.param((350.0,), 3, (7.4,), id="at a speed, after a sample"),
+    ],
+)
+def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held):
+    """Gear shifts, and the speed of the engine: a sample between a birth of the beam and a shift is off by 40 sigma. J
+    jumps where a time passes a sample, and may be lowest beside one.
+    """
     ratios = {"first": 3.0, "second": 2.0, "third": 1.3}
 
     def drive(ratio):
@@ -723,8 +734,14 @@ def test_times_at_which_what_is_measured_jumps_are_found(limit):
 
     truth = (*((3.67996, 7.41272) if limit else (4.03, 10.07)), 1.0, 0.002, *limit)
     exact = sf.simulate(build(np.zeros(200), truth[:2], *truth[2:]), times=times).states[:, 1]
-    values = exact + 3.0 * np.random.default_rng(0).normal(size=200)
+    values = exact + 3.0 * np.random.default_rng(seed).normal(size=200)
     fit = sf.estimate(build(values, (1.1 * truth[0], 1.1 * truth[1]), 0.5, 0.003, *(1.2 * each for each in limit)))
     assert fit.verdict.level == "good"
     assert [step.strategy for step in fit.steps] == ["local", "beam along the log"]
     np.testing.assert_allclose(fit.theta, truth, rtol=0.03)
+    assert [kink.value for kink in fit.kinks] == pytest.approx(held, abs=1e-7)
+    assert all(kink.left <= 0.0 <= kink.right for kink in fit.kinks)
+    assert not fit.active
+    for kink in fit.kinks:  # beyond the sample, J is that of a sample on the wrong side of the shift
+        beyond = np.where(np.array(fit.theta_names) == kink.unknown, 2.0 * round(kink.value, 6) - fit.theta, fit.theta)
+        assert sf.evaluate(fit.problem, beyond).cost > fit.cost + 100.0

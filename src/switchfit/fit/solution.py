@@ -35,7 +35,7 @@ from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.protocol import Evaluation, Matrix, Simulation
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.algebra import EPS
 from switchfit.optimize.matrix import Arrow
 from switchfit.optimize.problem import Breakpoints, HessianKind
@@ -219,9 +219,60 @@ def minimize_cost(
     start = unknowns.variables.inward(np.asarray(theta, dtype=float))
     result = minimize(posed, start, None if follower is None and callback is None else report, multipliers)
     if change is None:
-        return result
+        return _hold_at_jumps(evaluator if follower is None else follower.evaluator, posed, result)
     converted = change.convert_result(result)
     return converted if not names else _convert_constrained(evaluator, converted)
+
+
+BESIDE, NEAR = 1e-9, 1e-6
+"""Distance from a sample, as a part of the horizon, at which a time is held, and within which it is looked for."""
+
+
+def _hold_at_jumps(evaluator: Evaluator, posed: Minimization, result: Result) -> Result:
+    """Return the end of a fit with transition times held beside samples: as a time passes one, what is measured is that
+    before a reset map and not that behind it, and J jumps. The result itself where that is no minimum.
+    """
+    failed, theta, given = result.status is Status.LINE_SEARCH_FAILED, result.theta.copy(), posed.equalities
+    if not failed or not any(any(structure.reset_maps) for structure in evaluator.structures):
+        return result
+    lower, upper = posed.constraints.lower.copy(), posed.constraints.upper.copy()
+    held: list[tuple[int, float]] = []
+    for i, nodes in evaluator.sorted_breakpoints.of_coordinates:
+        node = min(nodes, key=lambda node: abs(node - theta[i]))
+        length, beside = nodes[-1] - nodes[0], np.repeat(theta[None], 2, axis=0)
+        beside[:, i] = node + BESIDE * length * np.array([-1.0, 1.0])
+        if not nodes[0] < node < nodes[-1] or abs(node - theta[i]) > NEAR * length:
+            continue
+        before, after = (posed.evaluate(each, 1, *[np.zeros(len(given))][: len(given)]).cost for each in beside)
+        if abs(after - before) > NEAR * abs(result.cost):
+            side = int(after < before)
+            (upper, lower)[side][i] = theta[i] = beside[side, i]
+            held.append((i, (before - after) / (BESIDE * length)))
+    if not held:
+        return result
+    constraints = posed.constraints
+    again = minimize(replace(posed, constraints=replace(constraints, lower=lower, upper=upper)), theta)
+    if not again.status.successful:
+        return result
+    multipliers, kinks, rows, d = again.multipliers.copy(), list(again.kinks), len(posed.constraints.b), len(theta)
+    at = [(i, steep) for i, steep in held if again.theta[i] == theta[i]]
+    bounds = [place + i for i, _ in at for place in (rows, rows + d)]
+    for i, steep in at:
+        slope = float(multipliers[rows + i] - multipliers[rows + d + i])  # of J, along the guards where there are any
+        left, right = sorted((slope, -steep))  # across the sample J rises steeply
+        kinks.append((i, left, right))
+    multipliers[bounds] = 0.0
+    named = [posed.constraints.names[place] for place in bounds]
+    return replace(
+        again,
+        status=Status.CONVERGED_AT_KINK if at else again.status,
+        active=tuple(each for each in again.active if each not in named),
+        multipliers=multipliers,
+        kinks=tuple(sorted(kinks)),
+        iterations=result.iterations + again.iterations,
+        evaluations=result.evaluations + again.evaluations,
+        history=(*result.history, *again.history[1:]),
+    )
 
 
 @keep_with_problem

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Evaluation
-from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.evaluator import Evaluator, place_on_guards
 from switchfit.optimize import lapack
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
@@ -71,6 +71,8 @@ def hop_over_samples(problem: Problem, best: End, known: Evaluator | None = None
         return best._replace(evaluations=0)
     for _ in range(ROUNDS):
         for start in choose_hops(evaluator, best.theta, best.cost):
+            with suppress(ValueError):  # no guards
+                start = place_on_guards(problem, start)[1]
             end = fit_briefly(problem, make_feasible(problem, start), evaluator=evaluator)
             evaluations += end.evaluations
             if is_lower(end.cost, best.cost):
