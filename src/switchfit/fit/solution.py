@@ -224,38 +224,41 @@ def minimize_cost(
     return converted if not names else _convert_constrained(evaluator, converted)
 
 
-BESIDE, NEAR = 1e-9, 1e-6
-"""Distance from a sample, as a part of the horizon, at which a time is held, and within which it is looked for."""
+BESIDE, NEAR = 2e-9, 1e-6
+"""Distance from a sample, as a part of the horizon, at which a time is held, and within which it is looked for. It is
+just not at the sample for intervals."""
 
 
 def _hold_at_jumps(evaluator: Evaluator, posed: Minimization, result: Result) -> Result:
     """Return the end of a fit with transition times held beside samples: as a time passes one, what is measured is that
     before a reset map and not that behind it, and J jumps. The result itself where that is no minimum.
     """
-    failed, theta, given = result.status is Status.LINE_SEARCH_FAILED, result.theta.copy(), posed.equalities
-    if not failed or not any(any(structure.reset_maps) for structure in evaluator.structures):
+    if not any(any(structure.reset_maps) for structure in evaluator.structures):
         return result
+    again, held = result, dict[int, float]()
     lower, upper = posed.constraints.lower.copy(), posed.constraints.upper.copy()
-    held: list[tuple[int, float]] = []
-    for i, nodes in evaluator.sorted_breakpoints.of_coordinates:
-        node = min(nodes, key=lambda node: abs(node - theta[i]))
-        length, beside = nodes[-1] - nodes[0], np.repeat(theta[None], 2, axis=0)
-        beside[:, i] = node + BESIDE * length * np.array([-1.0, 1.0])
-        if not nodes[0] < node < nodes[-1] or abs(node - theta[i]) > NEAR * length:
-            continue
-        before, after = (posed.evaluate(each, 1, *[np.zeros(len(given))][: len(given)]).cost for each in beside)
-        if abs(after - before) > NEAR * abs(result.cost):
-            side = int(after < before)
-            (upper, lower)[side][i] = theta[i] = beside[side, i]
-            held.append((i, (before - after) / (BESIDE * length)))
-    if not held:
+    while again.status is Status.LINE_SEARCH_FAILED:
+        theta, count = again.theta.copy(), len(held)
+        for i, nodes in evaluator.sorted_breakpoints.of_coordinates:
+            node = min(nodes, key=lambda node: abs(node - theta[i]))
+            length, beside = nodes[-1] - nodes[0], np.repeat(theta[None], 2, axis=0)
+            if i in held or not nodes[0] < node < nodes[-1] or abs(node - theta[i]) > NEAR * length:
+                continue
+            beside[:, i] = node + BESIDE * length * np.array([-1.0, 1.0])
+            given = [np.zeros(len(posed.equalities))] if posed.equalities else []
+            before, after = (posed.evaluate(each, 1, *given).cost for each in beside)
+            if abs(after - before) > NEAR * abs(again.cost):
+                side = int(after < before)
+                (upper, lower)[side][i] = theta[i] = beside[side, i]
+                held[i] = (before - after) / (BESIDE * length)
+        if len(held) == count:
+            return result
+        constraints = replace(posed.constraints, lower=lower, upper=upper)
+        again = minimize(replace(posed, constraints=constraints), theta)
+    if not (held and again.status.successful):
         return result
-    constraints = posed.constraints
-    again = minimize(replace(posed, constraints=replace(constraints, lower=lower, upper=upper)), theta)
-    if not again.status.successful:
-        return result
-    multipliers, kinks, rows, d = again.multipliers.copy(), list(again.kinks), len(posed.constraints.b), len(theta)
-    at = [(i, steep) for i, steep in held if again.theta[i] == theta[i]]
+    multipliers, kinks, rows, d = again.multipliers.copy(), list(again.kinks), len(posed.constraints.b), len(lower)
+    at = [(i, steep) for i, steep in held.items() if again.theta[i] in (lower[i], upper[i])]
     bounds = [place + i for i, _ in at for place in (rows, rows + d)]
     for i, steep in at:
         slope = float(multipliers[rows + i] - multipliers[rows + d + i])  # of J, along the guards where there are any

@@ -443,7 +443,8 @@ def is_any_near(samples: FloatArray, values: FloatArray, errors: FloatArray) -> 
 def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArray:
     """Return where profiles first reach thresholds above the estimate; where the last piece ends if they do not.
 
-    A piece is the cubic that also has the rise with which the piece after it begins; the last one is a parabola.
+    A piece is the cubic that also has the rise with which the piece after it begins; the last one is a parabola, and so
+    is one behind which J jumps, as where a transition with a reset map passes a sample.
 
     Parameters
     ----------
@@ -461,6 +462,8 @@ def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArr
         with np.errstate(invalid="ignore", divide="ignore"):
             parabola = find_first_root(height, slope, curvature)
             cubic = np.where(after >= thresholds, _bisect(after - rise, slope, curvature, length, height), np.inf)
+            jumps = (after >= thresholds) & (after - rise - length * (slope + 0.5 * curvature * length) > thresholds)
+            cubic = np.where(jumps, np.minimum(parabola, length), cubic)
             reach = np.where(height <= 0, 0.0, np.where(last, parabola, cubic))
         searched &= ~np.isnan(start)
         found = np.where(searched, start + side * np.minimum(reach, length), found)
