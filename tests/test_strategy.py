@@ -745,3 +745,27 @@ def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held):
     for kink in fit.kinks:  # beyond the sample, J is that of a sample on the wrong side of the shift
         beyond = np.where(np.array(fit.theta_names) == kink.unknown, 2.0 * round(kink.value, 6) - fit.theta, fit.theta)
         assert sf.evaluate(fit.problem, beyond).cost > fit.cost + 100.0
+    if held and not limit:
+        np.testing.assert_allclose(fit.confidence_intervals()[1], [10.0, 10.1], atol=1e-6)
+    if held == (10.1,):
+        np.testing.assert_allclose(fit.profile("tau_2").interval(), [10.0, 10.1], atol=1e-6)
+
+
+def test_the_impacts_of_a_ball_whose_speed_is_measured_are_found():
+    """A sample on the wrong side of an impact is off by 240 sigma: a beam takes the spread of speeds for noise."""
+    bounce = lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])  # noqa: E731
+    fall = lambda t, x, p: jnp.stack([x[1], -p["g"] - p["drag"] * x[1]])  # noqa: E731
+    pairs, times = [("up", "down"), ("down", "up")], np.linspace(0.02, 2.0, 100)
+    guards = dict.fromkeys(pairs, lambda t, x, p: x[0])
+    system = sf.HybridSystem({"up": fall, "down": fall}, [2.0, 0.0], dict.fromkeys(pairs, bounce), guards=guards)
+
+    def build(values, impacts, *guess):
+        log = sf.Measurements(times, values, lambda t, x, p: x[1:], sigma=0.05)
+        parameters = {n: sf.Parameter(v, lower=0.0) for n, v in zip(("g", "drag", "e"), guess, strict=True)}
+        return sf.Problem(system, sf.Experiment(log, ("up", "down", "up"), impacts, 0.0, 2.0), parameters)
+
+    truth = (0.64541959, 1.6293388, 9.81, 0.1, 0.8)
+    exact = sf.simulate(build(np.zeros(100), truth[:2], *truth[2:]), times=times).states[:, 1]
+    fit = sf.estimate(build(exact + 0.05 * np.random.default_rng(0).normal(size=100), (0.8, 1.4), 7.0, 0.15, 0.6))
+    assert fit.verdict.level == "good"
+    assert (np.abs(fit.theta - truth) < 4.0 * fit.standard_errors + 1e-3).all()

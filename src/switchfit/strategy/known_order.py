@@ -136,9 +136,11 @@ PASSES = 2
 starts end right after one, all after two. A third lowers J in none of 17 problems of the benchmark, and took a quarter
 of the time of ten joint tosses."""
 
-SOFTER = 10.0
-"""Part of sigma as which a beam takes it where transitions reset the state and nothing good is found otherwise. Births
-are on a grid, and each sample between one and where the state jumps is off by all of the jump, not by noise."""
+SOFTER = 1.0
+"""Standard deviations of a channel that a beam takes for noise where transitions reset the state and nothing good is
+found otherwise. Births are on a grid, and each sample between one and where the state jumps is off by all of the jump.
+Of the shifts of a gearbox 16 of 16 starts then end right with 1 and with 0.25, of a ball whose speed is measured 16 and
+5."""
 
 KNOWN = 2
 """Runs after which the others begin at the parameters that follow from what has been said of them. The few replays do
@@ -299,7 +301,9 @@ def _soften(problem: Problem) -> Problem:
     """Return the problem as a beam follows it, with more noise where its size is known."""
 
     def soften(run: Experiment, item: Measurements) -> Measurements:
-        return item if item.sigma is None or item.sigma_names else replace(item, sigma=SOFTER * item.sigma)
+        if item.sigma is None or item.sigma_names:
+            return item
+        return replace(item, sigma=np.maximum(item.sigma, SOFTER * np.nanstd(item.values, axis=0)))
 
     return _replace_measurements(_fix_delays(problem), soften)
 

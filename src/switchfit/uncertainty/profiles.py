@@ -437,15 +437,20 @@ class Profile(Tabular, Displayed):
         return step if np.isfinite(step) else 1e-2 * float(span if np.isfinite(span) else abs(self.value) or 1.0)
 
     def _add_next(self, side: int, last: Point, step: float, most: float) -> Point | None:
-        """Return the next point outwards; the step is halved while a fit fails or zeta is above `most`."""
-        limit = self.limits[side]
+        """Return the next point outwards; the step is halved while a fit fails or zeta is above `most`, but where it
+        jumps.
+        """
+        limit, before = self.limits[side], np.inf
         for attempt in range(1, HALVINGS + 1):
             value = last.value + side * step
             if side * (value - limit) > -1e-3 * step:
                 value = limit
             new = self._add(value, last)
-            if new is not None and new.converged and (attempt == HALVINGS or self._measure_zeta(new.cost) <= most):
-                return new
+            if new is not None and new.converged:
+                zeta = self._measure_zeta(new.cost)
+                if attempt == HALVINGS or zeta <= most or zeta > 0.99 * before:  # as high as at twice the step
+                    return new
+                before = zeta
             self.points = [q for q in self.points if q is not new]
             step *= 0.5
         return None

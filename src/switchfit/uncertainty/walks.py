@@ -337,6 +337,9 @@ NEAR = 5.0
 most of what is known about a transition time comes from the samples next to it, its profile is far from a parabola
 before it reaches them."""
 
+JUMP = 0.9
+"""Part of the rise of J up to a piece of which the piece before it says nothing where J jumps between them."""
+
 BISECTIONS = 40
 """Halvings of a piece until its crossing of the threshold is known to rounding."""
 
@@ -462,7 +465,8 @@ def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArr
         with np.errstate(invalid="ignore", divide="ignore"):
             parabola = find_first_root(height, slope, curvature)
             cubic = np.where(after >= thresholds, _bisect(after - rise, slope, curvature, length, height), np.inf)
-            jumps = (after >= thresholds) & (after - rise - length * (slope + 0.5 * curvature * length) > thresholds)
+            said = rise + length * (slope + 0.5 * curvature * length)
+            jumps = (after >= thresholds) & (after - said > JUMP * after)
             cubic = np.where(jumps, np.minimum(parabola, length), cubic)
             reach = np.where(height <= 0, 0.0, np.where(last, parabola, cubic))
         searched &= ~np.isnan(start)
