@@ -700,23 +700,24 @@ def test_a_guess_at_which_a_cost_has_no_slope_later_on_is_a_bad_start():
 
 
 @pytest.mark.parametrize(
-    ("limit", "seed", "held"),
+    ("limit", "seed", "held", "unit"),
     [
-        pytest.param((), 0, (), id="between samples"),
-        pytest.param((), 2, (10.1,), id="before a sample"),
-        pytest.param((), 6, (4.0, 10.0), id="after two samples"),
-        pytest.param((350.0,), 0, (3.7,), id="at a speed, before a sample"),
-        pytest.param((350.0,), 3, (7.4,), id="at a speed, after a sample"),
+        pytest.param((), 0, (), 1.0, id="between samples"),
+        pytest.param((), 2, (10.1,), 1.0, id="before a sample"),
+        pytest.param((), 6, (4.0, 10.0), 1.0, id="after two samples"),
+        pytest.param((), 6, (4.0, 10.0), 1e4, id="with a small unknown"),
+        pytest.param((350.0,), 0, (3.7,), 1.0, id="at a speed, before a sample"),
+        pytest.param((350.0,), 3, (7.4,), 1.0, id="at a speed, after a sample"),
     ],
 )
-def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held):
+def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held, unit):
     """Gear shifts, and the speed of the engine: a sample between a birth of the beam and a shift is off by 40 sigma. J
     jumps where a time passes a sample, and may be lowest beside one.
     """
     ratios = {"first": 3.0, "second": 2.0, "third": 1.3}
 
     def drive(ratio):
-        rate = lambda x, p: p["a"] * ratio - p["c"] * x[0] ** 2  # noqa: E731
+        rate = lambda x, p: p["a"] * ratio - unit * p["c"] * x[0] ** 2  # noqa: E731
         return lambda t, x, p: jnp.stack([rate(x, p), 10.0 * ratio * rate(x, p)])
 
     def shift(ratio):
@@ -732,10 +733,12 @@ def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held):
         parameters = {n: sf.Parameter(v, lower=0.0) for n, v in zip(("a", "c", "limit"), guess, strict=False)}
         return sf.Problem(system, sf.Experiment(log, tuple(ratios), shifts, 0.0, 20.0), parameters)
 
-    truth = (*((3.67996, 7.41272) if limit else (4.03, 10.07)), 1.0, 0.002, *limit)
+    truth = (*((3.67996, 7.41272) if limit else (4.03, 10.07)), 1.0, 0.002 / unit, *limit)
     exact = sf.simulate(build(np.zeros(200), truth[:2], *truth[2:]), times=times).states[:, 1]
     values = exact + 3.0 * np.random.default_rng(seed).normal(size=200)
-    fit = sf.estimate(build(values, (1.1 * truth[0], 1.1 * truth[1]), 0.5, 0.003, *(1.2 * each for each in limit)))
+    fit = sf.estimate(
+        build(values, (1.1 * truth[0], 1.1 * truth[1]), 0.5, 0.003 / unit, *(1.2 * each for each in limit))
+    )
     assert fit.verdict.level == "good"
     assert [step.strategy for step in fit.steps] == ["local", "beam along the log"]
     np.testing.assert_allclose(fit.theta, truth, rtol=0.03)

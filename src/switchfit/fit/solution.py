@@ -218,8 +218,10 @@ def minimize_cost(
     )
     start = unknowns.variables.inward(np.asarray(theta, dtype=float))
     result = minimize(posed, start, None if follower is None and callback is None else report, multipliers)
+    if any(structure.has_resets for structure in evaluator.structures):
+        result = _hold_at_jumps(posed, result)
     if change is None:
-        return _hold_at_jumps(evaluator if follower is None else follower.evaluator, posed, result)
+        return result
     converted = change.convert_result(result)
     return converted if not names else _convert_constrained(evaluator, converted)
 
@@ -229,17 +231,15 @@ BESIDE, NEAR = 2e-9, 1e-6
 just not at the sample for intervals."""
 
 
-def _hold_at_jumps(evaluator: Evaluator, posed: Minimization, result: Result) -> Result:
+def _hold_at_jumps(posed: Minimization, result: Result) -> Result:
     """Return the end of a fit with transition times held beside samples: as a time passes one, what is measured is that
     before a reset map and not that behind it, and J jumps. The result itself where that is no minimum.
     """
-    if not any(any(structure.reset_maps) for structure in evaluator.structures):
-        return result
     again, held = result, dict[int, float]()
     lower, upper = posed.constraints.lower.copy(), posed.constraints.upper.copy()
     while again.status is Status.LINE_SEARCH_FAILED:
         theta, count = again.theta.copy(), len(held)
-        for i, nodes in evaluator.sorted_breakpoints.of_coordinates:
+        for i, nodes in posed.breakpoints.of_coordinates:
             node = min(nodes, key=lambda node: abs(node - theta[i]))
             length, beside = nodes[-1] - nodes[0], np.repeat(theta[None], 2, axis=0)
             if i in held or not nodes[0] < node < nodes[-1] or abs(node - theta[i]) > NEAR * length:

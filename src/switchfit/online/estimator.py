@@ -703,7 +703,7 @@ class OnlineEstimator:
         tracker, penalty = self._tracker, self._settings.penalty
         kept, found = tracker.latest
         value = tracker.value(kept.switches, found)
-        b, exact, more = tracker.find_best(kept, found)
+        b, exact, more = tracker.find_best(kept, found, value)
         without = np.inf if exact is None else float(value[exact])
         statistic = -np.inf if more is None else 2 * (without + penalty - float(value[more]))
         # Below the threshold nothing is declared; what was declared is retracted below half of it.

@@ -448,11 +448,11 @@ class Tracker:
         value: FloatArray = found.scores + self.settings.penalty * switches
         return value
 
-    def find_best(self, kept: Sequences, found: Hypotheses) -> tuple[int, int | None, int | None]:
+    def find_best(self, kept: Sequences, found: Hypotheses, value: FloatArray) -> tuple[int, int | None, int | None]:
         """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
         which of those that have more after it: none in which a mode would last less than no time, unless declared.
         """
-        last, value = len(self.declared) - 1, self.value(kept.switches, found)
+        last = len(self.declared) - 1
         same = (kept.modes[:, : last + 1] == self.declared).all(1)
         exact = (same & (kept.switches == last)).nonzero()[0]
         others = value.argsort().tolist()  # those that have failed come last
@@ -557,7 +557,7 @@ class Tracker:
             return
         kept, found = self.latest
         value = self.value(kept.switches, found)
-        best = {b for b in self.find_best(kept, found) if b is not None}
+        best = {b for b in self.find_best(kept, found, value) if b is not None}
         # A change can be refuted only where the modes before it fit as well as they can.
         doubted = 2.0 * (value - value.min()) < CERTAIN
         for modes in (self.declared[:-1], self.declared[:-2]):

@@ -169,6 +169,11 @@ class Structure:
         """The transitions (from 0) at which a reset map acts."""
         return tuple(i for i, reset in enumerate(self.reset_maps) if reset is not None)
 
+    @property
+    def has_resets(self) -> bool:
+        """Whether a reset map acts at a transition that is no jump: what is measured jumps as it passes a sample."""
+        return not set(self.resets) <= set(self.jumps)
+
     def fix_sides(self, side: Any, xp: Any) -> Any:
         """Return the side of each transition time at a node: `side` (), or an array (N,) with +1 for the jumps."""
         if not self.jumps:

@@ -77,11 +77,8 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
         return not is_doubted(fit) and answer.kind == "fits" and answer.figures.get("known") == 1.0
     if not is_doubted(fit):
         return True
-    # The beam has no derivative to follow where an unknown has no effect, as the height of a weir that is not reached,
-    # and where what is measured jumps.
-    resets = any(any(structure.reset_maps) for structure in problem.structures)
-    without_effect = any(issue.kind == "without effect" for issue in find_without_effect(fit))
-    is_blind = len(steps) == 2 and (resets or without_effect)
+    # The beam has no derivative to follow where an unknown has no effect, as the height of a weir that is not reached.
+    is_blind = len(steps) == 2 and any(issue.kind == "without effect" for issue in find_without_effect(fit))
     return steps[-1].cost == steps[-2].cost and not steps[-1].ended and not is_blind
 
 

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Evaluation
-from switchfit.fit.evaluator import Evaluator, place_on_guards
+from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize import lapack
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
@@ -71,8 +71,6 @@ def hop_over_samples(problem: Problem, best: End, known: Evaluator | None = None
         return best._replace(evaluations=0)
     for _ in range(ROUNDS):
         for start in choose_hops(evaluator, best.theta, best.cost):
-            with suppress(ValueError):  # no guards
-                start = place_on_guards(problem, start)[1]
             end = fit_briefly(problem, make_feasible(problem, start), evaluator=evaluator)
             evaluations += end.evaluations
             if is_lower(end.cost, best.cost):
@@ -172,9 +170,7 @@ def _minimize(
     """Return the lowest value of a quadratic model with the unknown at `place` between two values, and the step (d,);
     None if it has no minimum.
     """
-    # What acts through a guard alone stays: J of times that are free does not depend on it.
-    moves = free & (np.diag(hessian) != 0.0) | (np.arange(len(free)) == place)
-    step, places = np.zeros(len(gradient)), np.flatnonzero(moves)
+    step, places = np.zeros(len(gradient)), np.flatnonzero(free | (np.arange(len(free)) == place))
     factor, step[places], failed = lapack.dposv(hessian[places[:, None], places], -gradient[places])
     if failed:
         return None
