@@ -748,9 +748,9 @@ def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held, unit
     for kink in fit.kinks:  # beyond the sample, J is that of a sample on the wrong side of the shift
         beyond = np.where(np.array(fit.theta_names) == kink.unknown, 2.0 * round(kink.value, 6) - fit.theta, fit.theta)
         assert sf.evaluate(fit.problem, beyond).cost > fit.cost + 100.0
-    if held and not limit:
+    if not limit:
         np.testing.assert_allclose(fit.confidence_intervals()[1], [10.0, 10.1], atol=1e-6)
-    if held == (10.1,):
+    if not limit and len(held) < 2:  # a profile may end where another time is held
         np.testing.assert_allclose(fit.profile("tau_2").interval(), [10.0, 10.1], atol=1e-6)
 
 
