@@ -580,14 +580,17 @@ def test_a_beam_of_which_no_hypothesis_is_left_proposes_nothing():
     assert beam.follow_order(problem, 0, np.array([1e300, 1e300])) == []
 
 
-def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found():
+@pytest.mark.parametrize("friction", [0.0, 0.03])
+def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found(friction):
     """The fields of a mass on two springs differ by nothing where it passes 0, at 6.8 s: a switch as long before it
     as the right one is behind leaves noise of the right size, too, and is 16 standard errors off."""
     times = np.arange(0.0, 16.0, 0.1)
-    springs = {
-        "soft": lambda t, x, p: jnp.stack([x[1], -p["soft"] * x[0] - p["damping"] * x[1]]),
-        "hard": lambda t, x, p: jnp.stack([x[1], -p["hard"] * x[0] - p["damping"] * x[1]]),
-    }
+
+    def spring(kind):
+        dry = (lambda v: friction * jnp.sign(v)) if friction else (lambda v: 0.0)
+        return lambda t, x, p: jnp.stack([x[1], -p[kind] * x[0] - p["damping"] * x[1] - dry(x[1])])
+
+    springs = {kind: spring(kind) for kind in ("soft", "hard")}
 
     def build(values, switch, guesses):
         log = sf.Measurements(times, values, sigma=0.03, observe=lambda t, x, p: x[0])

@@ -284,13 +284,9 @@ def estimate(
 
 
 def find_other_minimum(fit: Estimate) -> FloatArray | None:
-    """Return a start at another minimum in a transition time that may be lower than the end of a fit to data, if any.
-
-    Not where the state meets corners: each place of a scan takes a search for where it does.
-    """
+    """Return a start at another minimum in a transition time that may be lower than the end of a good fit, if any."""
     evaluator = fit.evaluator_at_solution()
-    corners = any(run.branches is not None for run in evaluator.runs)
-    if corners or not evaluator.problem.is_sigma_known or not fit.status.is_strict_minimum:
+    if not evaluator.problem.is_sigma_known or not fit.status.is_strict_minimum:
         return None
     try:
         return next(iter(choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
