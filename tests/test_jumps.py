@@ -130,6 +130,15 @@ def test_a_transition_between_jumps_is_found(engine):
     assert [(t.before, t.after) for t in fit.transitions] == [("slow", "fast")]
 
 
+def test_room_for_more_transitions_changes_no_derivative():
+    """As many as there are jumps, whose times are no unknowns: the numbers of unknowns are then the same."""
+    values = simulate_changing(13.3)
+    found, expected = (Evaluator(make_changing(values, max_transitions=most)) for most in (5 + len(DOSES), None))
+    theta = expected.problem.initial_theta
+    for name in ("cost", "gradient", "hessian"):
+        np.testing.assert_allclose(getattr(found(theta), name), getattr(expected(theta), name), rtol=1e-9)
+
+
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_the_sample_at_a_jump_is_of_the_state_before_on_both_sides_of_a_kink(engine):
     """The derivative to the left of a kink must not put the jumps before the samples at the same times."""

@@ -211,7 +211,7 @@ class NativeExperiment:
         self._named["modes"][-1] = self._judged
         _, self._places, self._there = _find_own_directions(self.sizes, N, structure.jumps)
         # No jumps and no idle transitions: the unknowns of the program are those of the experiment, in their order.
-        self._has_all = len(self._places) == self.sizes.D
+        self._has_all = len(self._places) == self.sizes.D and not structure.jumps
         self._tau, self._begins = self._named["bounds"][1 : N + 1], self._named["first_cell"][1 : N + 1]
         self._constraint_rows = np.array([*structure.guarded, *range(rows["end"], rows["count"])], dtype=np.intp)
 
