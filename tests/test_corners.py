@@ -401,6 +401,28 @@ def test_the_lagrangian_of_guards_and_terminal_constraints_has_its_derivatives()
     assert measure_errors(problem.initial_theta, lagrangian, gradient, found.hessian).max() < 1e-6
 
 
+@pytest.mark.parametrize("t", [0.31, 2.5])
+def test_what_a_pulse_does_beside_a_corner_is_lost_as_it_slides_on(t):
+    """A point slides along x_1 = x_0 / 2, its field jumps askew, and it comes back behind a pulse of another mode;
+    at 0.31 it does not slide yet."""
+
+    def askew(t, x, p):
+        side = jnp.sign(x[1] - 0.5 * x[0])
+        return jnp.stack([0.6 - 0.4 * side, p["k"] * x[0] - side])
+
+    system = sf.HybridSystem({"askew": askew, "away": lambda t, x, p: jnp.stack([-p["k"], 0.7])}, [0.1, 0.8])
+
+    def pose(sequence, times):
+        return sf.Problem(system, sf.Experiment(samples(), sequence, times, 0.0, 4.0), {"k": 0.3}, **TIGHT)
+
+    found = sf.insertion(pose(("askew",), ()))
+    row = int(np.argmin(abs(found.times - t)))
+    begin, length = found.times[row], 1e-4
+    costs = [sf.evaluate(pose(("askew", "away", "askew"), (begin, begin + k * length))).cost for k in (1e-5, 1, 2)]
+    slope = (4 * costs[1] - 3 * costs[0] - costs[2]) / (2 * length)
+    assert found.rate[row, 1] == pytest.approx(slope, rel=1e-4)
+
+
 # --- order ------------------------------------------------------------------------------------------------------------
 
 

@@ -145,6 +145,11 @@ class Branches:
         """Return all branches; the rest after a free tf is the last, where programs expect it."""
         return sorted(self._modes, key=lambda each: structure.is_rest(each[0]))
 
+    def list_returns(self, structure: Structure) -> dict[int, Function]:
+        """Return what `Corners.returns` does for the branches that slide, by their places in the library."""
+        found = enumerate(self._list(structure))
+        return {place: self.corners[mode].returns(sides) for place, (mode, sides) in found if 0 in sides}
+
     def get_structure(self, structure: Structure, path: Path | None = None) -> Structure:
         """Return the structure in the library in which the crossings of a path are transitions.
 

@@ -179,8 +179,14 @@ class SplitEngine:
         if split is None:
             raise NotIntegrableError(LOST)
         inner = split.engine.costates(self._times, p, self._eliminate(split, found, multipliers)[1])
+        # psi of a branch that slides holds along its corners alone: the trajectory comes back to these.
+        psi, course = inner.costates.copy(), Course(self._branches, self._structure, self._arguments, p)
+        for branch, function in self._branches.list_returns(self._structure).items():
+            rows = inner.modes == branch
+            back = course.evaluate(function, inner.times[rows], inner.states[rows], inner.times[rows])
+            psi[rows] = np.einsum("rij,ri->rj", back, psi[rows])
         modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
-        return inner._replace(modes=modes)
+        return inner._replace(modes=modes, costates=psi)
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""

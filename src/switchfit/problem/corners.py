@@ -409,18 +409,36 @@ class Corners:
 
     def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return the field of a branch (n,), and s of its sliding corners."""
-        sliding = [k for k, side in enumerate(sides) if side == 0]
-        base = _settle(sides)
-        f = self._guard(base, given)
+        sliding, (f, *others) = self._slide(sides, given)
         if not sliding:
             return f, []
-        # f_k: side +1 at sliding corner k alone, all other sliding ones -1. dg_i/dt is linear in f, so that dg/dt = 0
-        # along f_0 + sum_k s_k (f_k - f_0) is A s = -rate_0 with A_ij = rate_j,i - rate_0,i.
-        others = [self._guard((*base[:k], 1, *base[k + 1 :]), given) for k in sliding]
-        rate = [self._rates(base, field, given)[jnp.array(sliding)] for field in (f, *others)]
+        # dg_i/dt is linear in f, so that dg/dt = 0 along f_0 + sum_k s_k (f_k - f_0) is A s = -rate_0 with
+        # A_ij = rate_j,i - rate_0,i.
+        rate = [self._rates(_settle(sides), field, given)[jnp.array(sliding)] for field in (f, *others)]
         A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
         s = _solve(A, [-rate[0][i] for i in range(len(sliding))])
         return f + sum(each * (other - f) for each, other in zip(s, others, strict=True)), s
+
+    def _slide(self, sides: Sides, given: Sequence[Any]) -> tuple[list[int], list[Array]]:
+        """Return the sliding corners; f_0 with side -1 at all of them, and f_k with side +1 at one of them alone."""
+        sliding, base = [k for k, side in enumerate(sides) if side == 0], _settle(sides)
+        every = base, *((*base[:k], 1, *base[k + 1 :]) for k in sliding)
+        return sliding, [self._guard(each, given) for each in every]
+
+    def returns(self, sides: Sides) -> Function:
+        """Return what is left of a small displacement from a branch that slides once the trajectory is back: (n, n).
+
+        Of x it is ``x - sum_k c_k (f_k - f_0)``, with c such that D_x g of the sliding corners along it is zero.
+        """
+
+        def evaluate(t: Array, x: Array, *others: Array) -> Array:
+            sliding, (f, *fields) = self._slide(sides, [t, x, *others])
+            g_x = jax.jacfwd(lambda x: jnp.stack(self._evaluate(_settle(sides), [t, x, *others])[1]))(x)
+            A = [[g_x[i] @ (field - f) for field in fields] for i in sliding]
+            c = _solve(A, [g_x[i] for i in sliding])
+            return jnp.eye(len(x)) - sum(jnp.outer(field - f, each) for field, each in zip(fields, c, strict=True))
+
+        return self._derive("returns", sides, evaluate)
 
     def _guard(self, sides: Sides, given: Sequence[Any]) -> Array:
         """Return f (n,) with these sides, at steep corners not nearer than their margins."""
