@@ -309,3 +309,22 @@ REFUSED = {
 def test_what_a_free_tf_does_not_allow_is_refused(cooled, message):
     with pytest.raises(ValueError, match=message):
         REFUSED[message](cooled)
+
+
+def test_a_fast_lag_is_followed_up_to_the_end():
+    """Its explicit steps are as long as stability allows, and none is needed behind tf: nodes that are less dense than
+    they are have J = 1e19 at the guess, and a minimum where the force vanishes."""
+
+    def drive(force):
+        return lambda t, x, p: jnp.stack([x[1], x[2], 100.0 * (force(p) - x[2])])
+
+    system = sf.HybridSystem({"push": drive(lambda p: p["F"]), "brake": drive(lambda p: -1.0)}, [0.0, 0.0, 0.0])
+    arrive = sf.TerminalCost(lambda x, p: 50.0 * ((x[0] - 2.0) ** 2 + x[1] ** 2))
+    hurry = sf.RunningCost(lambda t, x, p: 1.0 + 0.2 * x[2] ** 2)
+    run = sf.Experiment([arrive, hurry], ("push", "brake"), (1.2,), 0.0, sf.Parameter(2.6, lower=0.5, upper=10.0))
+    explicit, implicit = (sf.Problem(system, run, {"F": 1.0}, solver=solver) for solver in ("explicit", "stiff"))
+    found, expected = sf.evaluate(explicit), sf.evaluate(implicit)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-7)
+    np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-5, atol=1e-5)
+    theta = sf.estimate(implicit, strategy="local").theta
+    np.testing.assert_allclose(sf.estimate(explicit, strategy="local").theta, theta, rtol=1e-5)

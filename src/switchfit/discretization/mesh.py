@@ -87,11 +87,14 @@ class Mesh:
         Number of cells without the padding.
     stiffness : tuple of Stiffness
         The modes that take implicit steps on this mesh because ``solver="auto"`` has chosen them, and why.
+    has_rest : bool
+        Whether a free tf lies before its last node: a cell has steps up to it then, and rest behind.
     """
 
     nodes: FloatArray
     cells: int
     stiffness: tuple[Stiffness, ...] = ()
+    has_rest: bool = False
 
     @classmethod
     def from_times(cls, times: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
@@ -110,7 +113,8 @@ class Mesh:
         ends = np.array([experiment.t0, experiment.end])
         samples = (item.seen_times for item in experiment.measurements)
         times = np.concatenate([ends, *samples, *(signal.knots for signal in experiment.signals)])
-        return cls.from_times(times[(times >= ends[0]) & (times <= ends[1])])
+        mesh = cls.from_times(times[(times >= ends[0]) & (times <= ends[1])])
+        return replace(mesh, has_rest=experiment.has_free_tf)
 
     @property
     def times(self) -> FloatArray:
@@ -146,8 +150,11 @@ class Mesh:
     def refine(self, solutions: Sequence[FloatArray], stiffness: tuple[Stiffness, ...], finer: float = 1.0) -> Mesh:
         """Return the mesh with the nodes that the steps of some solutions need, or `finer` times as many."""
         nodes, (times, counts) = self.times, _count_steps(solutions)
+        needed = np.diff(np.interp(nodes, times, counts))
+        if self.has_rest:
+            needed *= _compare_densities(nodes, times, counts)
         # A twentieth of a step beyond a whole number does not cost a cell more.
-        pieces = np.maximum(np.ceil(finer * np.diff(np.interp(nodes, times, counts)) - 0.05).astype(int), 1)
+        pieces = np.maximum(np.ceil(finer * needed - 0.05).astype(int), 1)
         return Mesh.from_times(np.concatenate([nodes, _grade_nodes(nodes, times, counts, pieces)]), stiffness)
 
     def halve_rows(self, transition_times: FloatArray) -> Mesh:
@@ -169,6 +176,20 @@ def _count_steps(solutions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     middles = times[:-1] + 0.5 * np.diff(times)
     lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
     return times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))])
+
+
+PARTS = 4
+
+
+def _compare_densities(nodes: FloatArray, times: FloatArray, counts: FloatArray) -> FloatArray:
+    """Return how many times as dense as the nodes of `_grade_nodes` the steps of a solver are in each cell, where it is
+    not all rest: explicit steps are unstable if they are longer.
+    """
+    low, high, lengths = np.interp(nodes[:-1], times, counts), np.interp(nodes[1:], times, counts), np.diff(nodes)
+    # Of the quarters of the s steps in a cell of length T, the second shortest takes s h / 4 (the first steps of a solve
+    # may make one short). The density of s nodes is s (1 / (s h) + 1 / T) / 2 there, and that of the steps 1 / h.
+    quarters = np.interp(np.linspace(low, high, PARTS + 1, axis=1), counts, times)
+    return np.asarray(2.0 / (1.0 + PARTS * np.sort(np.diff(quarters), axis=1)[:, 1] / lengths))
 
 
 def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, pieces: NDArray[np.intp]) -> FloatArray:
