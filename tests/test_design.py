@@ -408,12 +408,7 @@ def test_problems_that_cannot_be_designed():
     corner = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + p["b"] * u}, [1.0])
     for problem, free, error, message in (
         (3, None, TypeError, r"problem must be an sf\.Problem"),
-        (
-            line(sigma=None),
-            None,
-            ValueError,
-            "design needs sigma, the standard deviation of the noise, for the data of r",
-        ),
+        (line(sigma=None), None, ValueError, "design needs sigma, the standard deviation of the noise, for the data"),
         (cost, None, ValueError, "design needs Measurements, for the data of run1"),
         (replace(one, system=corner), {"u": (0.0, 1.0)}, ValueError, "free cannot be used where"),
     ):

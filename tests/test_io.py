@@ -200,6 +200,7 @@ def last_unknown(p, run):
 
 NAMED = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = { left = "u", right = "sd" } }'
 UNKNOWN_STATE = 't0 = 0.0\ninitial_state = [{ value = 17.0, lower = 0.0, upper = 20.0, unit = "°C" }]'
+TF = sf.Parameter(7.0, 6.0, 9.0, prior=sf.Normal(7.5, 0.5))
 FREE_END = "tf = { value = 7.0, lower = 6.0, upper = 9.0, prior = { mean = 7.5, sd = 0.5 } }"
 MAPPED = 't0 = 0.0\nparameter_map = { heating = "cooling" }'
 MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
@@ -213,12 +214,7 @@ MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
         ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda p, run: run.data[0].weights.tolist(), [[2.0]]),
         ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda p, run: run.initial_state, [17.0]),
         ("t0 = 0.0", UNKNOWN_STATE, last_unknown, ("T(t0)", "°C", 17.0, 0.0, 20.0)),
-        (
-            "tf = 6.0",
-            FREE_END,
-            lambda p, run: repr(run.tf),
-            repr(sf.Parameter(7.0, 6.0, 9.0, prior=sf.Normal(7.5, 0.5))),
-        ),
+        ("tf = 6.0", FREE_END, lambda p, run: repr(run.tf), repr(TF)),
         ("t0 = 0.0", MAPPED, lambda p, run: run.parameter_map, {"heating": "cooling"}),
         ("t0 = 0.0", NAMED, lambda p, run: [run.inputs.values[name][2] for name in run.inputs.names], [1.0, 0.2]),
         ('"room.py:room"', MAKE, lambda p, run: p.system.initial_state, [18.0]),

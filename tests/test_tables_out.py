@@ -397,9 +397,8 @@ def xarray_dataset():
 
 
 def xarray_array():
-    data = xr.DataArray(
-        np.stack([X, Y], axis=1), coords={"t": CLOCK, "channel": ["x", "y"]}, dims=("t", "channel"), name="pose"
-    )
+    coordinates = {"t": CLOCK, "channel": ["x", "y"]}
+    data = xr.DataArray(np.stack([X, Y], axis=1), coords=coordinates, dims=tuple(coordinates), name="pose")
     data.attrs["units"] = UNITS
     return data["t"], data
 

@@ -54,10 +54,8 @@ def run(tau=30.0, data=None, modes=("on", "off"), **more):
     return sf.Experiment(log() if data is None else data, modes, taus, t0=0.0, tf=120.0, **more)
 
 
-RATES = {
-    "heating": sf.Parameter(0.3, 0.01, 2.0, unit="°C/min"),
-    "cooling": sf.Parameter(0.05, 0.001, 1.0, unit="1/min"),
-}
+HEATING, COOLING = sf.Parameter(0.3, 0.01, 2.0, unit="°C/min"), sf.Parameter(0.05, 0.001, 1.0, unit="1/min")
+RATES = {"heating": HEATING, "cooling": COOLING}
 
 
 def problem(unit, **more):
@@ -208,12 +206,8 @@ def test_each_experiment_has_its_own_unit(tmp_path):
     whole = sf.Problem(room(), runs, RATES | per_hour)
     assert whole.unknowns.units == ("min", "h", "°C/min", "1/min", "°C/h", "1/h")
     fit = sf.estimate(whole)
-    for pattern in (
-        r"first +on -> off, 0 to 120 min\n",
-        r"later +on -> off, 0 to 2 h\n",
-        r"later\.tau_1 +0\.7666\d+ +h",
-    ):
-        assert re.search(pattern, str(fit))
+    runs = r"first +on -> off, 0 to 120 min\n", r"later +on -> off, 0 to 2 h\n"
+    assert all(re.search(pattern, str(fit)) for pattern in (*runs, r"later\.tau_1 +0\.7666\d+ +h"))
     assert [ax.get_xlabel() for ax in fit.plot().axes[1::2]] == ["time (min)", "time (h)", "time (h)"]
     assert [ax.get_xlabel() for ax in fit.plot_residuals().axes[::3]] == ["time (min)", "time (h)", "time (h)"]
     assert all(text in write_problem(whole) for text in ("typically 4 min apart", "typically 0.06667 h apart"))

@@ -203,11 +203,7 @@ def filtered(hz):
         (lambda: as_choice(np.array(["a", "b"]), "kind", tuple("abcd")), TypeError, "must be one of a, b, c, d; got"),
         (lambda: as_callable(lambda: None, "f", "a function", arguments=1), TypeError, "cannot be called with 1"),
         (lambda: as_callable(int, "f", "a function"), TypeError, "f must be a function; got <class 'int'>"),
-        (
-            lambda: jax.jit(lambda x: as_array(x, "x"))(jnp.zeros(2)),
-            TypeError,
-            "NumPy cannot read .TracerArrayConversi",
-        ),
+        (lambda: jax.jit(lambda x: as_array(x, "x"))(jnp.zeros(2)), TypeError, "NumPy cannot read .TracerArrayConver"),
         (lambda: as_path(None, "path"), TypeError, "path must be a path"),
         (lambda: as_path("", "path"), ValueError, "path must be a path"),
         (lambda: sf.identifiability(3), TypeError, "identifiability needs an sf.Estimate or an sf.Problem; got int"),
