@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from models import temperature
-from test_cli import PROBLEM, ROOM
-from test_many_logs import log_of, run
+from test_cli import PROBLEM, ROOM, log_of, run
 
 import switchfit as sf
 from switchfit.estimation.estimator import Provenance

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from test_implicit import SQUARE, robertson, van_der_pol
+from test_implicit import one_mode as stiff_mode
 
 import switchfit as sf
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
@@ -27,9 +28,8 @@ def oscillate(t, x, p):
     return jnp.array([x[1], -(p["omega"] ** 2) * x[0]])
 
 
-def one_mode(mode, start, parameters, tf, data=SQUARE, **settings):
-    system = sf.HybridSystem({"m": mode}, start)
-    return sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, tf), parameters, **settings)
+one_mode = partial(stiff_mode, solver="auto")
+"""The step method of its mode is chosen, unless a solver is given."""
 
 
 def relaxing(rate=1e5, **settings):

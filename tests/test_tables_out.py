@@ -13,7 +13,8 @@ import polars as pl
 import pytest
 import xarray as xr
 from models import RAMP, heated_room, temperature
-from test_many_logs import folder, log_of, run  # noqa: F401  # a fixture
+from test_cli import log_of, run
+from test_many_logs import folder  # noqa: F401  # a fixture
 from test_report import made, several, trajectory_of
 from test_save import CERTIFICATE, assert_same
 
