@@ -22,10 +22,7 @@ gc.set_threshold(400_000, 20, 10)
 settings.register_profile("switchfit", derandomize=True, deadline=None)
 settings.load_profile("switchfit")
 
-PROMOTION = {
-    "jax_numpy_dtype_promotion": ("strict", "standard"),
-    "jax_numpy_rank_promotion": ("raise", "allow"),
-}
+PROMOTION = {"jax_numpy_dtype_promotion": ("strict", "standard"), "jax_numpy_rank_promotion": ("raise", "allow")}
 """JAX's settings in the tests, and its defaults.
 
 switchfit's own code must not rely on implicit conversions: an int32 that meets a float64, or a vector that is taken for

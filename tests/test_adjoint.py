@@ -12,16 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 from derivatives import differentiate
-from systems import (
-    KINDS,
-    NODES,
-    P0,
-    Parameter,
-    case,
-    closed_form,
-    closed_form_case,
-    padded_mesh,
-)
+from systems import KINDS, NODES, P0, Parameter, case, closed_form, closed_form_case, padded_mesh
 
 from switchfit.discretization.mesh import build_arguments
 

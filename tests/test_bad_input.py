@@ -77,7 +77,7 @@ def two(t, x, p):
 GOOD = problem()
 RUNNING = sf.RunningCost(lambda t, x, p: x[0])
 BROKEN = sf.RunningCost(lambda t, x, p: jnp.sqrt(0.3 - t))
-KNOWN = sf.Parameter(0.4, fixed=True)
+KNOWN, PAIR = sf.Parameter(0.4, fixed=True), ("grow", "shrink")
 NOISE = {"k": 1.0, "s": sf.Parameter(0.1, lower=0.01)}
 PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
 LATE = {"k": 1.0, "d": sf.Parameter(0.1, 0.0, 0.3)}
@@ -186,10 +186,7 @@ def test_wrong_types(build, said):
         (lambda: noisy(0.1, delay=0.1), ["Measurements times less the delay of 0.1 must lie inside"]),
         # Functions of other kinds than modes
         (lambda: problem(experiment(inputs=sf.Input([0.0], [1.0]))), ["is called as f(t, x, p, u), but takes the arg"]),
-        (
-            lambda: problem(of=system(reset_maps={("grow", "shrink"): two})),
-            ["reset map ('grow', 'shrink')", "R(t, x, p) must "],
-        ),
+        (lambda: problem(of=system(reset_maps={PAIR: two})), ["reset map ('grow', 'shrink')", "R(t, x, p) must "]),
         (lambda: starting_at(lambda p: p["k"]), ["initial_state(p) must return an array of shape (n,); got shape ()"]),
         (lambda: with_data(samples(observe=two)), ["observe: h(t, x, p)", "shape (1,); got shape (2,)"]),
         (lambda: with_data(sf.RunningCost(two)), ["RunningCost: ell(t, x, p)", "shape (); got shape (2,)"]),

@@ -58,10 +58,8 @@ def test_peers_agree_with_switchfit_on_a_small_model():
     model = replace(models.VEHICLE, times=(0.7, 1.3), horizon=(0.0, 2.0))
     case = replace(problems.case("vehicle"), model=model)
     ours = sf.evaluate(case.problem(rtol=1e-10, atol=1e-12))
-    rivals = {
-        "CasADi MX": casadi_shooting.build(model, 64, unrolled=False),
-        "SciPy": scipy_differences.build(model, 1e-10),
-    }
+    casadi, scipy = casadi_shooting.build(model, 64, unrolled=False), scipy_differences.build(model, 1e-10)
+    rivals = {"CasADi MX": casadi, "SciPy": scipy}
     if find_spec("heyoka"):
         from benchmarks.peers import heyoka_variational
 

@@ -51,16 +51,20 @@ room = sf.HybridSystem(modes={"on": on, "off": off}, initial_state=[0.0], state_
 """
 
 
+def log_of(switch, heating=0.5):
+    """A room that is heated until it is switched off."""
+    times = np.arange(0.25, 6.0, 0.5)
+    values = temperature(times, switch, heating, 0.05, start=0.0)
+    return "t;T\ns;K\n" + "".join(f"{t:g};{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A problem with an exact answer: heating 0.5 until t = 3.2."""
     folder = tmp_path_factory.mktemp("room")
     (folder / "problem.toml").write_text(PROBLEM)
     (folder / "room.py").write_text(ROOM)
-    times = np.arange(0.25, 6.0, 0.5)
-    values = temperature(times, 3.2, 0.5, 0.05, start=0.0)
-    rows = "".join(f"{t},{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
-    (folder / "log.csv").write_text("t,T\n" + rows)
+    (folder / "log.csv").write_text(log_of(3.2))
     return folder
 
 
@@ -241,7 +245,7 @@ def test_check_without_running_the_model(folder, tmp_path):
     path.write_text(PROBLEM)
     result = run("check", path, "--no-run")
     assert result.exit_code == 0, result.stderr
-    for said in ("on -> off on [0, 6] s, at 2 s", "12 samples of T, 0.25 to 5.75", "No Python file was run"):
+    for said in ("on -> off on [0, 6] s, at 2 s", "12 samples of T (K), 0.25 to 5.75", "No Python file was run"):
         assert said in result.stdout
     for old, new, message in (
         ("transition_times = [2.0]", "transition_times = [7.0]", "experiments[1]: transition_times must increase"),

@@ -9,7 +9,6 @@ from functools import cache
 
 import jax
 import jax.numpy as jnp
-import jax.scipy.linalg
 import numpy as np
 import pytest
 from derivatives import differentiate

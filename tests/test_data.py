@@ -1,13 +1,10 @@
 """Inputs, reference signals and measurements: what they add to the cost, in closed form."""
 
 from dataclasses import replace
-from functools import cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import differentiate
 from models import decay, rest
 from numpy.polynomial import Polynomial
 
@@ -142,82 +139,6 @@ def test_a_broken_reference_signal_is_integrated_up_to_the_break_and_from_it():
 
 
 # Measurements
-
-
-def seen(t, x, p):
-    return jnp.array([x[0] + x[1], p["k"] * x[1]])
-
-
-SECOND = lambda t, x, p: jnp.array([-p["k"] * x[0], p["k"] * x[0] - x[1]])  # noqa: E731
-DECAYS = sf.HybridSystem({"first": decay, "second": SECOND}, [1.5, 0.8])
-THETA = np.array([0.83, 1.4])
-SAMPLED = np.array([0.0, 0.011, 0.4, 0.41, 0.8, 1.25, 2.0])
-RNG = np.random.default_rng(5)
-VALUES = RNG.normal(size=(7, 2))
-
-
-def states(theta, t):
-    """x(t) in closed form: x' = -k x up to tau, then x1' = -k x1, x2' = k x1 - x2."""
-    tau, k = theta
-    early = jnp.array([1.5, 0.8]) * jnp.exp(-k * t)
-    a, b = jnp.array([1.5, 0.8]) * jnp.exp(-k * tau)
-    s = t - tau
-    forced = k * a * (jnp.exp(-k * s) - jnp.exp(-s)) / (1.0 - k)
-    return jnp.where(t <= tau, early, jnp.array([a * jnp.exp(-k * s), b * jnp.exp(-s) + forced]))
-
-
-@cache
-def observations():
-    """h at the samples with its first and second derivatives, (7, 2), (7, 2, 2) and (7, 2, 2, 2)."""
-
-    def observe(theta):
-        x = jax.vmap(states, in_axes=(None, 0))(theta, SAMPLED)
-        return jnp.stack([x[:, 0] + x[:, 1], theta[1] * x[:, 1]], axis=1)
-
-    return differentiate(observe, THETA)
-
-
-def closed_form(values, sigma):
-    """J, gradient and Hessian."""
-    h, slopes, curvatures = observations()
-    weight = np.where(np.isnan(values), 0.0, 1.0 / np.asarray(sigma, float) ** 2)
-    r = h - np.nan_to_num(values)
-    squares = np.einsum("kq,kqi,kqj->ij", weight, slopes, slopes)
-    return (
-        0.5 * np.sum(weight * r**2),
-        np.einsum("kq,kqi->i", weight * r, slopes),
-        squares + np.einsum("kq,kqij->ij", weight * r, curvatures),
-    )
-
-
-def with_gaps(*places):
-    values = VALUES.copy()
-    for place in places:
-        values[place] = np.nan
-    return values
-
-
-@pytest.mark.parametrize(
-    ("values", "sigma"),
-    [
-        (VALUES, 0.3),
-        (VALUES, [0.3, 0.7]),
-        (VALUES, RNG.uniform(0.1, 1.0, size=(7, 2))),
-        (with_gaps((0, 1), (3, 0), (6, 1)), [0.3, 0.7]),
-        (with_gaps((0,), (2,), (4,), (6,)), RNG.uniform(0.1, 1.0, size=(7, 2))),
-        (VALUES, None),
-    ],
-    ids=["sigma", "sigma a channel", "sigma a sample", "single gaps", "whole samples missing", "sigma unknown"],
-)
-def test_measurements_in_closed_form(values, sigma):
-    """Irregular times with one at t0 and one at tf; missing values leave no trace in any derivative."""
-    J, g, H = closed_form(values, 1.0 if sigma is None else sigma)
-    data = sf.Measurements(SAMPLED, values, observe=seen, sigma=sigma)
-    run = sf.Experiment(data, ("first", "second"), THETA[:1], 0.0, 2.0)
-    found = sf.evaluate(sf.Problem(DECAYS, run, {"k": THETA[1]}, rtol=1e-11, atol=1e-13))
-    assert found.cost == pytest.approx(J, rel=1e-9)
-    np.testing.assert_allclose(found.gradient, g, rtol=1e-8)
-    np.testing.assert_allclose(found.hessian, H, rtol=1e-8)
 
 
 def test_a_sample_at_a_transition_with_a_reset_map_is_of_the_state_before_the_jump():

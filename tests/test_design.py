@@ -234,10 +234,8 @@ def test_sensors_by_number_and_by_cost():
     slopes = np.diag([0.0, len(TIMES[::2]) / 0.1**2])
     each = {"value": line_information(TIMES), "slope": slopes, "fine": line_information(TIMES, 0.05)}
     costs = {"value": 1.0, "slope": 1.5, "fine": 2.5}
-    for settings, most, price in (
-        ({"sensors": 2}, 2, dict.fromkeys(each, 1)),
-        ({"sensors": costs, "budget": 3.5}, 3.5, costs),
-    ):
+    by_number, by_cost = ({"sensors": 2}, 2, dict.fromkeys(each, 1)), ({"sensors": costs, "budget": 3.5}, 3.5, costs)
+    for settings, most, price in (by_number, by_cost):
         plan = sf.design(problem, **settings)
         found = {}
         for taken in product((0, 1), repeat=3):
@@ -408,12 +406,7 @@ def test_problems_that_cannot_be_designed():
     corner = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + p["b"] * u}, [1.0])
     for problem, free, error, message in (
         (3, None, TypeError, r"problem must be an sf\.Problem"),
-        (
-            line(sigma=None),
-            None,
-            ValueError,
-            "design needs sigma, the standard deviation of the noise, for the data of r",
-        ),
+        (line(sigma=None), None, ValueError, "design needs sigma, the standard deviation of the noise, for the data"),
         (cost, None, ValueError, "design needs Measurements, for the data of run1"),
         (replace(one, system=corner), {"u": (0.0, 1.0)}, ValueError, "free cannot be used where"),
     ):

@@ -414,9 +414,8 @@ def test_the_error_that_is_reported_is_that_of_the_end():
 
 def test_the_error_does_not_depend_on_where_time_begins():
     theta = swing().theta
-    early, late = (
-        sf.estimate(fastest_swing(t0, rtol=1e-4), start=theta + t0, max_iterations=0) for t0 in (0.0, 1024.0)
-    )
+    begun = ((fastest_swing(begin, rtol=1e-4), theta + begin) for begin in (0.0, 1024.0))
+    early, late = (sf.estimate(problem, start=start, max_iterations=0) for problem, start in begun)
     assert early.integration_error_of.startswith("terminal constraint")
     assert late.integration_error_of == early.integration_error_of
     assert late.integration_error == pytest.approx(early.integration_error, rel=1e-6)

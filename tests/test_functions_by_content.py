@@ -126,9 +126,8 @@ def test_constants_are_copied_when_a_problem_is_built(shape):
     built = problem_of(lambda t, x, p: -np.ravel(g)[0] * jnp.sum(jnp.asarray(g)) * p["a"] * x)
     expected = sf.evaluate(problem_of(lambda t, x, p: -1.37 * (1.37 * g.size) * p["a"] * x)).cost
     g[...] = 5.0
-    assert [sf.evaluate(built, method=method).cost for method in ("forward", "auto")] == pytest.approx(
-        [expected] * 2, rel=1e-12
-    )
+    found = [sf.evaluate(built, method=method).cost for method in ("forward", "auto")]
+    assert found == pytest.approx([expected] * 2, rel=1e-12)
 
 
 def test_a_rule_for_derivatives_that_has_changed_is_another_function():

@@ -331,9 +331,7 @@ def test_many_runs_stay_small_and_the_worst_come_first():
 def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "switchfit.report.html.page")
     monkeypatch.setitem(sys.modules, "bokeh", None)
-    with pytest.raises(
-        ImportError, match=r"needs bokeh, which cannot be imported .*: pip install 'switchfit\[report\]'"
-    ):
+    with pytest.raises(ImportError, match=r"needs bokeh, which cannot be .*: pip install 'switchfit\[report\]'"):
         heater.save_report(tmp_path / "report.html")
     done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])
     assert done.exit_code == 0

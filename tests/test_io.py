@@ -112,10 +112,7 @@ def test_everything_in_the_file_arrives(folder):
     np.testing.assert_array_equal(data.values[:, 0], [15.0, 15.4, np.nan, 16.3, 16.2, 16.1, 16.0])
     assert (data.names, data.sigma) == (("T",), 0.1)
     np.testing.assert_array_equal(data.observe(0.0, np.array([21.0]), {}), [21.0])
-
-
-def test_check_describes_the_problem(folder):
-    text = write_problem(changed(folder).problem)
+    text = write_problem(problem)
     assert "on -> off on [0, 6] s, at 3 s" in text
     assert "7 samples of T, 0 to 6 s, typically 1 s apart, 1 values missing" in text
     assert re.search(r"heating\s+0\.3 K/min\s+in \[0, 2\]", text)
@@ -132,9 +129,6 @@ def test_short_forms_and_defaults(folder):
     assert "on -> off on [0, 6] s (t0 and tf from the data), at 3 s" in write_problem(loaded.problem)
     data = loaded.problem.experiments[0].data[0]
     assert (data.sigma, data.observe, loaded.options, loaded.problem.rtol) == (None, None, {}, sf.Problem.rtol)
-
-
-def test_a_horizon_of_which_one_end_is_left_out(folder):
     problem = changed(folder, ("t0 = 0.0\ntf = 6.0\n", "tf = 7.5\n"), ("sigma = 0.1\n", "delay = 0.25\n")).problem
     assert "on [-0.25, 7.5] s (t0 from the data)" in write_problem(problem)
 
@@ -206,6 +200,7 @@ def last_unknown(p, run):
 
 NAMED = 't0 = 0.0\ninputs = { file = "log.csv", time = "t", columns = { left = "u", right = "sd" } }'
 UNKNOWN_STATE = 't0 = 0.0\ninitial_state = [{ value = 17.0, lower = 0.0, upper = 20.0, unit = "°C" }]'
+TF = sf.Parameter(7.0, 6.0, 9.0, prior=sf.Normal(7.5, 0.5))
 FREE_END = "tf = { value = 7.0, lower = 6.0, upper = 9.0, prior = { mean = 7.5, sd = 0.5 } }"
 MAPPED = 't0 = 0.0\nparameter_map = { heating = "cooling" }'
 MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
@@ -219,12 +214,7 @@ MAKE = '{ name = "room.py:make", arguments = { start = 18.0 } }'
         ("sigma = 0.1", 'kind = "reference"\nweights = [2.0]', lambda p, run: run.data[0].weights.tolist(), [[2.0]]),
         ("t0 = 0.0", "t0 = 0.0\ninitial_state = [17.0]", lambda p, run: run.initial_state, [17.0]),
         ("t0 = 0.0", UNKNOWN_STATE, last_unknown, ("T(t0)", "°C", 17.0, 0.0, 20.0)),
-        (
-            "tf = 6.0",
-            FREE_END,
-            lambda p, run: repr(run.tf),
-            repr(sf.Parameter(7.0, 6.0, 9.0, prior=sf.Normal(7.5, 0.5))),
-        ),
+        ("tf = 6.0", FREE_END, lambda p, run: repr(run.tf), repr(TF)),
         ("t0 = 0.0", MAPPED, lambda p, run: run.parameter_map, {"heating": "cooling"}),
         ("t0 = 0.0", NAMED, lambda p, run: [run.inputs.values[name][2] for name in run.inputs.names], [1.0, 0.2]),
         ('"room.py:room"', MAKE, lambda p, run: p.system.initial_state, [18.0]),
@@ -239,8 +229,7 @@ def test_forms_of_keys(folder, old, new, find, expected):
 
 
 @pytest.mark.parametrize(
-    ("name", "tau"),
-    [('"built.py:problem"', 2.5), ('{ name = "built.py:make", arguments = { tau = 1.5 } }', 1.5)],
+    ("name", "tau"), [('"built.py:problem"', 2.5), ('{ name = "built.py:make", arguments = { tau = 1.5 } }', 1.5)]
 )
 def test_problem_built_in_python(folder, name, tau):
     (folder / "built.py").write_text(

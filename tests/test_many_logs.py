@@ -7,20 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from models import temperature
-from test_cli import PROBLEM, ROOM, run
+from test_cli import PROBLEM, ROOM, log_of, run
 
 import switchfit as sf
 from switchfit.io.logs import find_logs, name_files
 from switchfit.io.problem_file import load_problem
 from switchfit.runtime.errors import InputError
-
-
-def log_of(switch, heating=0.5):
-    """A room that is heated until it is switched off."""
-    times = np.arange(0.25, 6.0, 0.5)
-    values = temperature(times, switch, heating, 0.05, start=0.0)
-    return "t;T\ns;K\n" + "".join(f"{t:g};{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
 
 
 @pytest.fixture

@@ -245,10 +245,8 @@ def test_the_offsets_and_the_version_are_those_of_the_header():
     args, rets = (8 * fields_of(name).index(name.lower()) for name in ("Args", "Rets"))
     assert 8 * fields_of("CallFrame").index("extension_start") == program_module.EXTENSION
     assert (5 * 8 + args, 5 * 8 + 5 * 8 + rets) == (program_module.ARGUMENTS, program_module.RESULTS)
-    assert [8 * fields_of("Buffer").index(name) for name in ("data", "dims")] == [
-        program_module.DATA,
-        program_module.DIMENSIONS,
-    ]
+    data, dimensions = (8 * fields_of("Buffer").index(name) for name in ("data", "dims"))
+    assert (data, dimensions) == (program_module.DATA, program_module.DIMENSIONS)
     major, minor = (int(re.search(rf"#define XLA_FFI_API_{name} (\d+)", HEADER)[1]) for name in ("MAJOR", "MINOR"))
     assert major == program_module.MAJOR
     assert minor >= program_module.MINOR

@@ -14,9 +14,8 @@ def make_problem(**settings):
     times = np.arange(0.1, 5.0, 0.1)
     values = approach(times, [2.0], (0.7, 0.4), (3.0, 0.0), start=0.0)
     values += 0.02 * np.random.default_rng(0).normal(size=len(times))
-    system = sf.HybridSystem(
-        {"heat": lambda t, x, p: p["rate"][0] * (3.0 - x), "cool": lambda t, x, p: -p["rate"][1] * x}, [0.0]
-    )
+    modes = {"heat": lambda t, x, p: p["rate"][0] * (3.0 - x), "cool": lambda t, x, p: -p["rate"][1] * x}
+    system = sf.HybridSystem(modes, [0.0])
     run = sf.Experiment(sf.Measurements(times, values, sigma=0.02), ("heat",), t0=0.0, tf=5.0, **settings)
     return sf.Problem(system, run, {"rate": sf.Parameter([0.6, 0.5], lower=0.0, unit="1/s")})
 

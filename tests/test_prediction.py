@@ -10,11 +10,7 @@ from models import heated_room
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.uncertainty.prediction import (
-    build_gauss_newton,
-    collect_sample_derivatives,
-    compute_sensitivity,
-)
+from switchfit.uncertainty.prediction import build_gauss_newton, collect_sample_derivatives, compute_sensitivity
 
 SIGMA = 0.1
 TIMES = np.linspace(0.25, 6.0, 24)

@@ -262,10 +262,8 @@ def test_the_kinks_of_samples_with_a_delay_are_where_the_state_was_measured(dela
     """Intervals and profile are those of the same samples with earlier stamps."""
     times = np.arange(1, 41) / 10
     values = np.minimum(times, 2.0) + 0.3 * np.random.default_rng(1).standard_normal(40)
-    fits = [
-        ramp(values, 2.0, times=times + late, sigma=0.3, v=ONE, delay=given)
-        for late, given in ((0.0, 0.0), (0.05, delay))
-    ]
+    delays = (0.0, 0.0), (0.05, delay)
+    fits = [ramp(values, 2.0, times=times + late, sigma=0.3, v=ONE, delay=given) for late, given in delays]
     np.testing.assert_allclose(fits[1].confidence_intervals(), fits[0].confidence_intervals(), rtol=1e-7)
     np.testing.assert_allclose(fits[1].profile("tau_1").sample_times, times, rtol=1e-12)
 

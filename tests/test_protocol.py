@@ -105,9 +105,8 @@ def test_the_cost_of_transitions_in_closed_form():
         assert found.cost == pytest.approx((x - 0.4) ** 2 + 0.3 * tau, rel=1e-8)
         assert evaluator.cost(given.initial_theta) == pytest.approx(found.cost, rel=1e-12)
         np.testing.assert_allclose(found.gradient, [-k * x * slope + 0.3, 0.0, -tau * x * slope], rtol=1e-7)
-        second = bend * x**2 * np.outer([k, tau], [k, tau]) + slope * x * np.array(
-            [[k**2, k * tau - 1], [k * tau - 1, tau**2]]
-        )
+        x_dd = x * np.array([[k**2, k * tau - 1], [k * tau - 1, tau**2]])
+        second = bend * x**2 * np.outer([k, tau], [k, tau]) + slope * x_dd
         np.testing.assert_allclose(found.hessian[np.ix_([0, 2], [0, 2])], second, rtol=1e-6)
         np.testing.assert_allclose(found.hessian[1], 0.0, atol=1e-12)
 

@@ -630,15 +630,12 @@ def test_the_reference_knows_a_closed_form():
         return lambda t, x, p: [-p[name] * x[0]]
 
     samples = reference.Samples(np.array([0.4, 1.0]), np.array([[0.4], [0.3]]), lambda t, x, p: [x[0]], sigma=sigma)
-    run = reference.Run(
-        [decay("a"), decay("b")], 0.0, 1.0, [0], [x0], {"a": "a", "b": "b"}, [None], [None], samples=[samples]
-    )
+    modes, names = [decay("a"), decay("b")], {"a": "a", "b": "b"}
+    run = reference.Run(modes, 0.0, 1.0, [0], [x0], names, [None], [None], samples=[samples])
     found = reference.Reference([run], {"a": (slice(1, 2), ()), "b": b}).derivatives(np.array([tau, a]))
     early, late = x0 * np.exp(-0.4 * a), x0 * np.exp(-a * tau - b * (1 - tau))
-    r, slopes = (
-        np.array([early - 0.4, late - 0.3]) / sigma,
-        np.array([[0, -0.4 * early], [(b - a) * late, -tau * late]]),
-    )
+    r = np.array([early - 0.4, late - 0.3]) / sigma
+    slopes = np.array([[0, -0.4 * early], [(b - a) * late, -tau * late]])
     curvatures = np.array([[[0, 0], [0, 0.16 * early]], late * np.outer([b - a, -tau], [b - a, -tau])])
     curvatures[1] += late * np.array([[0, -1.0], [-1.0, 0]])
     assert found.cost == pytest.approx(0.5 * r @ r, rel=1e-13)

@@ -19,12 +19,7 @@ from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.report import sentences
 from switchfit.report.formats import format_rounded
-from switchfit.report.plot import (
-    plot_comparison,
-    plot_fit,
-    plot_modes,
-    plot_residuals,
-)  # fmt: skip
+from switchfit.report.plot import plot_comparison, plot_fit, plot_modes, plot_residuals
 from switchfit.runtime.errors import Issue
 from switchfit.uncertainty.verdict import find_issues
 
@@ -344,9 +339,6 @@ def test_sigma_is_wrong_only_where_it_is_given_and_the_fit_has_converged(cost):
     assert not warnings_of(made(cost=cost, sigma_known=False))
     assert not warnings_of(made(cost=cost, status=Status.MAX_ITERATIONS))
     assert not warnings_of(made(cost=28.0 * 1.3)), "chance explains it"
-
-
-# --- several experiments ----------------------------------------------------------------------------------------------
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------

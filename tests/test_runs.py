@@ -305,9 +305,8 @@ def arrays(take, engine="auto", sequences=(("fall", "rise"),) * 3):
         data = [seen, sf.TerminalCost(lambda x, p: x[0] * take(p["k"])[3])] if e == 1 else [seen]
         own = {"starts": "others"} if e == 2 else {}
         times = np.linspace(1.9, 2.3, len(sequence) - 1)
-        runs.append(
-            sf.Experiment(data, sequence, times, 0.0, 4.0, initial_state=partial(begin, e=e), parameter_map=own)
-        )
+        start = partial(begin, e=e)
+        runs.append(sf.Experiment(data, sequence, times, 0.0, 4.0, initial_state=start, parameter_map=own))
     parameters = {
         "k": [0.9, 0.3, 0.8, 0.2, 0.7],
         "c": sf.Parameter([0.1, 0.2], fixed=True),

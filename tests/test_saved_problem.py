@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from models import temperature
-from test_cli import PROBLEM, ROOM
-from test_many_logs import log_of, run
+from test_cli import PROBLEM, ROOM, log_of, run
 
 import switchfit as sf
 from switchfit.estimation.estimator import Provenance
@@ -205,13 +204,9 @@ def test_the_file_holds_the_problem_hashes_and_versions(project):
 
 
 def test_an_estimate_of_python_keeps_versions(project):
-    fit = sf.Estimate.load("heater.json")
-    found = fit.provenance
-    assert (found.problem_file, found.text, found.files) == ("", "", ())
-    assert found == Provenance()
-    assert "does not have its problem, which was built in Python: functions are not saved" in refuse_to_build(
-        "heater.json"
-    )
+    assert sf.Estimate.load("heater.json").provenance == Provenance(problem_file="", text="", files=())
+    said = "does not have its problem, which was built in Python: functions are not saved"
+    assert said in refuse_to_build("heater.json")
 
 
 def test_an_estimate_of_python_can_say_which_problem_file_it_is_of(project, tmp_path):

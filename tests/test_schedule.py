@@ -222,9 +222,7 @@ def test_pulses_are_those_that_are_spliced_in():
         times = np.unique(np.concatenate([grid, given.times]))
         pairs = [(begin, end) for k, begin in enumerate(times[:-1]) for end in times[k + 1 :]]
         spliced = [splice(drop_empty(given), mode, *pair) for pair in pairs for mode in library.modes]
-        wanted = [
-            schedule for schedule in spliced if library.admits(schedule.sequence) and not is_same(schedule, given)
-        ]
+        wanted = [each for each in spliced if library.admits(each.sequence) and not is_same(each, given)]
         found = list(list_insertions(given, library, 6))
         assert len(found) == len(wanted) > 0
         assert all(is_same(one, other) for one, other in zip(found, wanted, strict=True))

@@ -2,22 +2,20 @@
 
 import pickle
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from derivatives import differentiate
 from test_implicit import SQUARE, robertson, van_der_pol
+from test_implicit import one_mode as stiff_mode
 
 import switchfit as sf
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.engine.protocol import runs_of
 from switchfit.engine.stiffness import Choice, Look, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.problem.functions import use_float64
 from switchfit.report.text import write_steps
 
 
@@ -30,9 +28,8 @@ def oscillate(t, x, p):
     return jnp.array([x[1], -(p["omega"] ** 2) * x[0]])
 
 
-def one_mode(mode, start, parameters, tf, data=SQUARE, **settings):
-    system = sf.HybridSystem({"m": mode}, start)
-    return sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, tf), parameters, **settings)
+one_mode = partial(stiff_mode, solver="auto")
+"""The step method of its mode is chosen, unless a solver is given."""
 
 
 def relaxing(rate=1e5, **settings):
@@ -165,48 +162,12 @@ THREE = sf.HybridSystem(
 )
 """Three linear modes in x and its integral, of which the second is stiff."""
 
-SEEN = np.linspace(0.1, 9.9, 50)
-TRUTH = np.array([3.03, 6.08, 0.3])
-SIGMA = np.array([0.1, 0.02])
 
-
-def states_of_three(theta, rate, times):
-    """Return x and its integral at times (K,) of `THREE` from theta = (tau_1, tau_2, k), in closed form: (K, 2)."""
-    first, second, k = theta
-    A, B = rate**2 / (1 + rate**2), rate / (1 + rate**2)
-
-    def decay(x, y, k, s):
-        return x * jnp.exp(-k * s), y + x * (1 - jnp.exp(-k * s)) / k
-
-    def follow(x, y, t):
-        rest, gone = x - A * jnp.cos(first) - B * jnp.sin(first), jnp.exp(-rate * (t - first))
-        waves = A * (jnp.sin(t) - jnp.sin(first)) - B * (jnp.cos(t) - jnp.cos(first))
-        return A * jnp.cos(t) + B * jnp.sin(t) + rest * gone, y + waves + rest * (1 - gone) / rate
-
-    def at(t):
-        one = decay(1.5, 0.0, k, jnp.minimum(t, first))
-        two = follow(*one, jnp.clip(t, first, second))
-        return jnp.stack(decay(*two, 2 * k, jnp.maximum(t - second, 0.0)))
-
-    return jax.vmap(lambda t: jnp.where(t < first, jnp.stack(decay(1.5, 0.0, k, t)), at(t)))(jnp.asarray(times))
-
-
-compute_states = jax.jit(states_of_three)
-
-
-@cache
-def exact_samples(rate):
-    """The states at `SEEN` at the truth (K, 2)."""
-    with use_float64():
-        return np.asarray(compute_states(TRUTH, rate, SEEN))
-
-
-def three(theta=TRUTH, rate=1e5, *, values=None, **settings):
-    """The three modes with samples of both states, without noise unless values (K, 2) are given."""
-    data = sf.Measurements(SEEN, exact_samples(rate) if values is None else values, sigma=SIGMA)
-    run = sf.Experiment(data, ("cool", "follow", "fade"), tuple(theta[:2]), 0.0, 10.0)
-    parameters = {"k": sf.Parameter(theta[2], lower=0.01), "rate": sf.Parameter(rate, fixed=True)}
-    return sf.Problem(THREE, run, parameters, **settings)
+def three(rate=1e5):
+    """The three modes with samples of both states."""
+    data = sf.Measurements(np.linspace(0.1, 9.9, 50), np.ones((50, 2)), sigma=1.0)
+    run = sf.Experiment(data, ("cool", "follow", "fade"), (3.03, 6.08), 0.0, 10.0)
+    return sf.Problem(THREE, run, {"k": sf.Parameter(0.3, lower=0.01), "rate": sf.Parameter(rate, fixed=True)})
 
 
 def test_only_the_stiff_mode_takes_implicit_steps():
@@ -218,24 +179,6 @@ def test_only_the_stiff_mode_takes_implicit_steps():
     for ends in ((0.0, 2.9), (6.1, 10.0)):  # up to the samples beside the transitions
         cells, expected = (np.sum((m.times > ends[0]) & (m.times <= ends[1])) for m in (mesh, alone))
         assert cells == pytest.approx(expected, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    "method", ["auto", *(pytest.param(way, marks=pytest.mark.slow) for way in ("forward", "adjoint"))]
-)
-def test_three_modes_have_the_derivatives_of_their_closed_form(method):
-    theta = TRUTH + np.array([0.21, -0.13, 0.05])
-
-    exact = exact_samples(1e5)
-
-    def cost(theta):
-        return 0.5 * jnp.sum(((states_of_three(theta, 1e5, SEEN) - exact) / SIGMA[None]) ** 2)
-
-    J, g, H = differentiate(cost, theta)
-    found = sf.evaluate(three(theta), method=method)
-    assert found.cost == pytest.approx(J, rel=1e-7)
-    np.testing.assert_allclose(found.gradient, g, rtol=0, atol=1e-6 * np.abs(g).max())
-    np.testing.assert_allclose(found.hessian, H, rtol=0, atol=1e-5 * np.abs(H).max())
 
 
 def relaxations(rates, **settings):

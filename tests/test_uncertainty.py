@@ -163,11 +163,6 @@ def test_where_the_valley_bends_the_change_is_shortened():
     assert f"raises J by {max(direction.rises):.2g} ({max(direction.rises):.2g} %); 1 % of J is 1" in one_line(found)
 
 
-def test_identifiability_of_what_is_neither():
-    with pytest.raises(TypeError, match=r"identifiability needs an sf.Estimate or an sf.Problem; got int"):
-        sf.identifiability(3)
-
-
 def test_before_a_fit_without_sigma_and_without_measurements():
     samples = sf.Measurements(TIMES, 0.0 * TIMES, observe=decay)
     signal = sf.ReferenceSignal.from_samples(TIMES, np.exp(-0.4 * TIMES), observe=decay)

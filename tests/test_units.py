@@ -54,10 +54,8 @@ def run(tau=30.0, data=None, modes=("on", "off"), **more):
     return sf.Experiment(log() if data is None else data, modes, taus, t0=0.0, tf=120.0, **more)
 
 
-RATES = {
-    "heating": sf.Parameter(0.3, 0.01, 2.0, unit="°C/min"),
-    "cooling": sf.Parameter(0.05, 0.001, 1.0, unit="1/min"),
-}
+HEATING, COOLING = sf.Parameter(0.3, 0.01, 2.0, unit="°C/min"), sf.Parameter(0.05, 0.001, 1.0, unit="1/min")
+RATES = {"heating": HEATING, "cooling": COOLING}
 
 
 def problem(unit, **more):
@@ -208,12 +206,8 @@ def test_each_experiment_has_its_own_unit(tmp_path):
     whole = sf.Problem(room(), runs, RATES | per_hour)
     assert whole.unknowns.units == ("min", "h", "°C/min", "1/min", "°C/h", "1/h")
     fit = sf.estimate(whole)
-    for pattern in (
-        r"first +on -> off, 0 to 120 min\n",
-        r"later +on -> off, 0 to 2 h\n",
-        r"later\.tau_1 +0\.7666\d+ +h",
-    ):
-        assert re.search(pattern, str(fit))
+    runs = r"first +on -> off, 0 to 120 min\n", r"later +on -> off, 0 to 2 h\n"
+    assert all(re.search(pattern, str(fit)) for pattern in (*runs, r"later\.tau_1 +0\.7666\d+ +h"))
     assert [ax.get_xlabel() for ax in fit.plot().axes[1::2]] == ["time (min)", "time (h)", "time (h)"]
     assert [ax.get_xlabel() for ax in fit.plot_residuals().axes[::3]] == ["time (min)", "time (h)", "time (h)"]
     assert all(text in write_problem(whole) for text in ("typically 4 min apart", "typically 0.06667 h apart"))
@@ -226,56 +220,48 @@ def test_each_experiment_has_its_own_unit(tmp_path):
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
-def test_a_unit_is_not_blank():
-    with pytest.raises(ValueError, match="time_unit must not be empty; got"):
-        run(time_unit="\n\t")
+def twice(unit, **more):
+    """A second transition time that has a unit of its own, in a run that has seconds."""
+    return run((30.0, sf.Parameter(50.0, unit=unit, **more)), modes=("on", "off", "on"), time_unit="s")
 
 
-@pytest.mark.parametrize(("given", "unit", "fixed"), [("min", "s", False), ("1", "s", True)])
-def test_a_transition_time_in_another_unit_is_refused(given, unit, fixed):
-    with pytest.raises(ValueError, match=f"transition time 2 has the unit '{given}', but time_unit .* is '{unit}'"):
-        run((30.0, sf.Parameter(50.0, unit=given, fixed=fixed)), modes=("on", "off", "on"), time_unit=unit)
+def pose(*units, parameters=(), data=None, **more):
+    runs = [run(data=data, time_unit=unit, name=f"in {unit}") for unit in units]
+    return sf.Problem(room(), runs, RATES | dict(parameters), **more)
 
 
-@pytest.fixture
-def room_folder(tmp_path):
+SECOND = {"late": sf.Parameter(0.5, lower=0.0, upper=1.0, unit="s")}
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: run(time_unit="\n\t"), "time_unit must not be empty; got"),
+        (lambda: twice("min"), "transition time 2 has the unit 'min', but time_unit .* is 's'"),
+        (lambda: twice("1", fixed=True), "transition time 2 has the unit '1', but time_unit .* is 's'"),
+        (lambda: pose("min", data=log(delay="late"), parameters=SECOND), "delay 'late' has the unit 's', but .* 'min'"),
+        (lambda: pose("min", "h", min_duration=1e-3), r"min_duration must be 0 .* different units \(h, min\); got"),
+        (lambda: sf.estimate_many([pose("min"), pose("h")]), "problem 1 has its times in h, the first one in min"),
+    ],
+)
+def test_what_is_a_time_or_one_number_for_all_runs_has_one_unit(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_one_column_of_times_has_one_unit_and_so_has_one_run(tmp_path):
     (tmp_path / "room.py").write_text(SYSTEM)
     (tmp_path / "log.csv").write_text("t,T\n1,15\n100,16\n")
-    return tmp_path
-
-
-def test_a_problem_file_with_two_units_for_one_run(room_folder):
-    path = room_folder / "problem.toml"
+    path, out = tmp_path / "two.toml", tmp_path / "x.csv"
     path.write_text(FILE.replace('time_unit = "min"\n', ""))
     with pytest.raises(ValueError, match=r"experiments\[1\]: transition time 1 has the unit 'min', but"):
         load_problem(path)
-
-
-def test_one_column_of_times_has_one_unit(room_folder):
-    path, out = room_folder / "two.toml", room_folder / "x.csv"
-    one = FILE
-    other = one.partition("[[experiments]]")[2]
-    path.write_text(f"{one}\n[[experiments]]\n{other.replace('min', 'h')}")
+    other = FILE.partition("[[experiments]]")[2]
+    path.write_text(f"{FILE}\n[[experiments]]\n{other.replace('min', 'h')}")
     said = invoke("simulate", path, "--out", out)
     assert said.exit_code == 2
     assert "times in different units (h, min), and one column of the CSV file would mix them" in said.stderr
     assert not out.exists()
-    path.write_text(f"{one}\n[[experiments]]\n{other}")
+    path.write_text(f"{FILE}\n[[experiments]]\n{other}")
     assert invoke("simulate", path, "--out", out).exit_code == 0
     assert out.read_text().splitlines()[0] == "experiment,t (min),mode,x1"
-
-
-def test_what_is_one_number_has_one_unit():
-    """The shortest duration of all runs, transition times of many fits."""
-    minutes, hours = (sf.Problem(room(), run(time_unit=unit), RATES) for unit in ("min", "h"))
-    both = [run(time_unit="min"), run(time_unit="h", name="other")]
-    with pytest.raises(ValueError, match=r"min_duration must be 0 .* different units \(h, min\); got"):
-        sf.Problem(room(), both, RATES, min_duration=1e-3)
-    with pytest.raises(ValueError, match="problem 2 has its times in h, the first one in min"):
-        sf.estimate_many([minutes, minutes, hours])
-
-
-def test_a_delay_is_a_time():
-    given = RATES | {"late": sf.Parameter(0.5, lower=0.0, upper=1.0, unit="s")}
-    with pytest.raises(ValueError, match="the delay 'late' has the unit 's', but time_unit of its experiment is 'min'"):
-        sf.Problem(room(), run(30.0, log(delay="late"), time_unit="min"), given)

@@ -19,9 +19,7 @@ from switchfit.strategy.validation import correlate
 SIGMA = 0.3
 TRAIN, TEST = np.array([0.5, 1.0, 1.7, 2.2, 3.0, 3.9]), np.linspace(0.2, 4.5, 31)
 TIMES = np.linspace(0.3, 4.0, 12)
-POWERS = sf.HybridSystem(
-    {"m": lambda t, x, p: p["a"] + p["b"] * t + p["c"] * t**2 + 0.0 * x}, [0.0], state_names=("x",)
-)
+POWERS = sf.HybridSystem({"m": lambda t, x, p: p["a"] + p["b"] * t + p["c"] * t**2 + 0 * x}, [0.0], state_names=("x",))
 
 
 def design(times, count=2):

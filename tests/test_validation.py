@@ -147,11 +147,6 @@ def test_what_is_no_number_is_refused(given, error, said):
         as_array(given, "x")
 
 
-def test_a_traced_value_is_refused():
-    with pytest.raises(TypeError, match=r"theta must be .*which NumPy cannot read \(TracerArrayConversionError\)"):
-        jax.jit(lambda theta: as_array(theta, "theta"))(jnp.zeros(2))
-
-
 # Counts, flags, choices, functions, paths
 
 
@@ -208,8 +203,10 @@ def filtered(hz):
         (lambda: as_choice(np.array(["a", "b"]), "kind", tuple("abcd")), TypeError, "must be one of a, b, c, d; got"),
         (lambda: as_callable(lambda: None, "f", "a function", arguments=1), TypeError, "cannot be called with 1"),
         (lambda: as_callable(int, "f", "a function"), TypeError, "f must be a function; got <class 'int'>"),
+        (lambda: jax.jit(lambda x: as_array(x, "x"))(jnp.zeros(2)), TypeError, "NumPy cannot read .TracerArrayConver"),
         (lambda: as_path(None, "path"), TypeError, "path must be a path"),
         (lambda: as_path("", "path"), ValueError, "path must be a path"),
+        (lambda: sf.identifiability(3), TypeError, "identifiability needs an sf.Estimate or an sf.Problem; got int"),
         (lambda: sf.estimate(None), TypeError, "problem must be an sf.Problem; several .*estimate_many.*NoneType"),
         (lambda: sf.estimate(PROBLEM, start=[0.5, 9.0]), ValueError, "The start violates k at its upper bound 5"),
         (lambda: samples(values=TWO, names=("a", "a")), ValueError, "names must differ .*; got 'a' twice"),

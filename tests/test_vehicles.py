@@ -27,9 +27,8 @@ MASS, LENGTH, WIDTH, GRAVITY = 80.0, 0.25, 0.23, 9.81
 
 def evaluate(function, x, p, *u):
     with jax.enable_x64(True):
-        return np.asarray(
-            function(0.0, jnp.asarray(x), {k: jnp.asarray(v) for k, v in p.items()}, *map(jnp.asarray, u))
-        )
+        given = {k: jnp.asarray(v) for k, v in p.items()}
+        return np.asarray(function(0.0, jnp.asarray(x), given, *map(jnp.asarray, u)))
 
 
 def of_paper(mode, x, mu):

@@ -27,9 +27,8 @@ def line(t, x, p):
 def straight(values, *, sigma=None, times=TIMES, a=1.0, b=1.0, **settings) -> sf.Estimate:
     """Fit a straight line to values."""
     parameters = {"a": sf.Parameter(a), "b": sf.Parameter(b, **settings)}
-    return sf.estimate(
-        curve(line, times, np.asarray(values)[:, None], parameters, tf=float(times[-1]), sigma=sigma), strategy="local"
-    )
+    posed = curve(line, times, np.asarray(values)[:, None], parameters, tf=float(times[-1]), sigma=sigma)
+    return sf.estimate(posed, strategy="local")
 
 
 def noise(size=1.0, count=100, seed=0) -> np.ndarray:
