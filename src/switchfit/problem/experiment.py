@@ -389,6 +389,11 @@ class Experiment:
         """Length of the horizon at the guess."""
         return float(self.ends_of_modes(self.initial_times)[-1]) - self.t0
 
+    @cached_property
+    def clock(self) -> float:
+        """Size of its times, of which rounding is a part: the horizon, or the clock's reading if more."""
+        return max(self.initial_length, abs(self.t0), abs(self.t0 + self.initial_length))
+
     def _check_times(self) -> None:
         for i, tau in enumerate(self._own_times, start=1):
             what = "tf" if i > len(self.transition_times) else f"transition time {i}"
