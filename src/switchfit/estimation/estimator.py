@@ -883,11 +883,6 @@ def find_versions() -> dict[str, str]:
     return {"Python": platform.python_version(), **{package: find_version(package) for package in PACKAGES}}
 
 
-def describe_platform() -> str:
-    """Return operating system and processor."""
-    return f"{platform.platform()}, {platform.machine()}"
-
-
 @dataclass(frozen=True)
 class FileDigest:
     """A file that a fit was made from.
@@ -929,6 +924,7 @@ class Provenance:
     versions : mapping of str to str
         Of Python, switchfit and the libraries.
     platform : str
+        Operating system and processor.
     """
 
     problem_file: str = ""
@@ -938,7 +934,7 @@ class Provenance:
     options: Mapping[str, int | float | str] = field(default_factory=dict)
     files: tuple[FileDigest, ...] = ()
     versions: Mapping[str, str] = field(default_factory=find_versions)
-    platform: str = field(default_factory=describe_platform)
+    platform: str = field(default_factory=lambda: f"{platform.platform()}, {platform.machine()}")
 
 
 def make_relative(path: str | Path, folder: str | Path) -> str:

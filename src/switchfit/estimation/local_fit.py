@@ -179,11 +179,9 @@ def _compute_insignificance(problem: Problem, result: Result) -> float:
 
     J falls by s²/2 times the residual variance to its minimum from a distance of s standard errors.
     """
-    known = problem.is_sigma_known
-    if not (known or problem.is_least_squares):
-        return 0.0
     freedom = count_samples(problem) + count_priors(problem) - result.free_basis.shape[1]
-    return 0.5 * INSIGNIFICANT**2 * float(np.nan_to_num(measure_variance(result.cost, freedom, known)))
+    variance = measure_variance(result.cost, freedom, problem.is_sigma_known)  # NaN without a noise model
+    return 0.5 * INSIGNIFICANT**2 * float(np.nan_to_num(variance))
 
 
 def _drop_noise_of_times(problem: Problem, result: Result) -> Result:

@@ -22,9 +22,8 @@ from zoneinfo import ZoneInfo
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.validation import as_array, as_name, is_of_library, shorten
+from switchfit.problem.validation import FloatArray, as_array, as_name, is_of_library, shorten
 
-FloatArray = NDArray[np.float64]
 Instants = NDArray[np.datetime64]
 """In microseconds: in UTC, or on the wall clock of dates without a zone."""
 

@@ -435,7 +435,7 @@ class Experiment:
                     )
 
     def _require_inside(
-        self, what: str, times: FloatArray, outside: NDArray[np.bool_], last: float, bound: str = ""
+        self, what: str, times: FloatArray, outside: NDArray[np.bool_], last: float, bound: str
     ) -> None:
         if outside.any():
             raise ValueError(

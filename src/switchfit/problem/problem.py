@@ -191,11 +191,8 @@ class Problem:
     structures: tuple[Structure, ...] = field(init=False)
 
     def __repr__(self) -> str:
-        return format_line(
-            self,
-            format_count(len(self.experiments), "experiment"),
-            f"unknowns {join_first(self.theta_names) or 'none'}",
-        )
+        runs, unknowns = format_count(len(self.experiments), "experiment"), join_first(self.theta_names) or "none"
+        return format_line(self, runs, f"unknowns {unknowns}")
 
     def __post_init__(self) -> None:
         as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")
