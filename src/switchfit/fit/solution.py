@@ -455,8 +455,7 @@ def _list_visits(model: Model, p: Any, simulation: Simulation) -> Iterator[_Visi
     times = np.append(simulation.start[:1], simulation.end)
     states = np.vstack([simulation.before[:1], simulation.after])
     for sensor, samples in zip(structure.measurements, model.arguments.samples, strict=True):
-        seen = np.isin(times, samples.time) if sensor.delay is None else np.zeros(len(times), bool)
-        if seen.any():
+        if sensor.delay is None and (seen := np.isin(times, samples.time)).any():
             yield from visit(sensor.observe, times[seen], states[seen])
     for function in (*structure.terminal, *structure.terminal_constraints):
         yield from visit(function, states[-1:])

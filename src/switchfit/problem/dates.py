@@ -297,11 +297,6 @@ def list_dates(value: Any, what: str = "") -> Iterator[Given]:
             yield from list_dates(getattr(value, each.name), what or f"times of {type(value).__name__}")
 
 
-def has_dates(value: Any) -> bool:
-    """Return whether there are dates in a value, where `list_dates` looks."""
-    return next(list_dates(value), None) is not None
-
-
 def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     """Return numbers that count from the beginning of 1970 (UTC) as dates.
 

@@ -23,7 +23,7 @@ from switchfit.problem.data import (
     ReferenceSignal,
     count_from,
 )
-from switchfit.problem.dates import choose_origin, has_dates, list_dates, read_date, read_dates
+from switchfit.problem.dates import choose_origin, list_dates, read_date, read_dates
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, require_time_unit, unit_suffix
 from switchfit.problem.system import HybridSystem, as_state
@@ -253,7 +253,7 @@ class Experiment:
         if self.name is not None:
             set_fields(self, name=as_name(self.name, "name of an experiment"))
         if self.initial_state is not None:
-            set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
+            set_fields(self, initial_state=as_state(self.initial_state))
         set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
         set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_times()
@@ -280,7 +280,7 @@ class Experiment:
         given = [dates for name, part in parts.items() for dates in list_dates(part, names.get(name, ""))]
         if given or self.origin is not None or self.time_zone is not None:
             timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
-            of_data = given[: len(timed)] if all(map(has_dates, timed)) else []  # they stand first
+            of_data = given[: len(timed)] if all(any(list_dates(item)) for item in timed) else []  # they stand first
             origin = choose_origin(given, of_data, self.origin, self.time_zone, parts["t0"])
             for name, part in parts.items():
                 parts[name] = count_from(part, origin, self.time_unit, names.get(name, ""))
