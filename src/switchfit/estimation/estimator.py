@@ -822,8 +822,6 @@ class Estimate(Fit, Tabular, Displayed):
         >>> bool((loaded.theta == fit.theta).all())
         True
         """
-        if problem is not None:
-            as_instance(problem, "problem", Problem, "an sf.Problem")
         file = as_path(path, "path")
         content = read_document(file, "a saved estimate", FORMAT, VERSION)
         try:
@@ -841,6 +839,7 @@ class Estimate(Fit, Tabular, Displayed):
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
     """Raise ValueError unless a fit that was loaded from a file may be that of a problem."""
+    as_instance(problem, "problem", Problem, "an sf.Problem")
     if problem.theta_names != fit.theta_names:
         raise ValueError(
             f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
