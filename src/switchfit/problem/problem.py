@@ -296,8 +296,7 @@ class Problem:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the user's functions, and of their traces what identifies them."""
-        state = {name: getattr(self, name) for name in GIVEN}
-        return state | {"digests": self.digests}
+        return {name: getattr(self, name) for name in GIVEN} | {"digests": self.digests}
 
     @property
     def digests(self) -> list[dict[str, str]]:
