@@ -822,8 +822,6 @@ class Estimate(Fit, Tabular, Displayed):
         >>> bool((loaded.theta == fit.theta).all())
         True
         """
-        if problem is not None:
-            as_instance(problem, "problem", Problem, "an sf.Problem")
         file = as_path(path, "path")
         content = read_document(file, "a saved estimate", FORMAT, VERSION)
         try:
@@ -841,6 +839,7 @@ class Estimate(Fit, Tabular, Displayed):
 
 def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
     """Raise ValueError unless a fit that was loaded from a file may be that of a problem."""
+    as_instance(problem, "problem", Problem, "an sf.Problem")
     if problem.theta_names != fit.theta_names:
         raise ValueError(
             f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
@@ -881,11 +880,6 @@ def find_version(package: str) -> str:
 def find_versions() -> dict[str, str]:
     """Return the versions of Python and of `PACKAGES`."""
     return {"Python": platform.python_version(), **{package: find_version(package) for package in PACKAGES}}
-
-
-def describe_platform() -> str:
-    """Return operating system and processor."""
-    return f"{platform.platform()}, {platform.machine()}"
 
 
 @dataclass(frozen=True)
@@ -929,6 +923,7 @@ class Provenance:
     versions : mapping of str to str
         Of Python, switchfit and the libraries.
     platform : str
+        Operating system and processor.
     """
 
     problem_file: str = ""
@@ -938,7 +933,7 @@ class Provenance:
     options: Mapping[str, int | float | str] = field(default_factory=dict)
     files: tuple[FileDigest, ...] = ()
     versions: Mapping[str, str] = field(default_factory=find_versions)
-    platform: str = field(default_factory=describe_platform)
+    platform: str = field(default_factory=lambda: f"{platform.platform()}, {platform.machine()}")
 
 
 def make_relative(path: str | Path, folder: str | Path) -> str:

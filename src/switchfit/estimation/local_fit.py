@@ -27,7 +27,7 @@ from switchfit.optimize.sqp import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray
 from switchfit.problem.inspection import find_comparisons
 from switchfit.problem.problem import Problem, keep_with_problem, require_estimable
-from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
+from switchfit.problem.validation import as_choice, as_count, as_instance, as_positive
 from switchfit.runtime.errors import Issue, NotIntegrableError
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 
@@ -80,8 +80,6 @@ def fit_locally(
     require_estimable(problem)
     hessian = as_choice(hessian, "hessian", HESSIANS)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    if callback is not None:
-        as_callable(callback, "callback", "a function callback(record)", arguments=1)
     if problem.constraint_names and hessian not in ("auto", "exact"):
         raise ValueError(f"with guards or terminal constraints hessian must be 'auto' or 'exact'; got {hessian!r}.")
     began = time.perf_counter()
@@ -179,11 +177,9 @@ def _compute_insignificance(problem: Problem, result: Result) -> float:
 
     J falls by s²/2 times the residual variance to its minimum from a distance of s standard errors.
     """
-    known = problem.is_sigma_known
-    if not (known or problem.is_least_squares):
-        return 0.0
     freedom = count_samples(problem) + count_priors(problem) - result.free_basis.shape[1]
-    return 0.5 * INSIGNIFICANT**2 * float(np.nan_to_num(measure_variance(result.cost, freedom, known)))
+    variance = measure_variance(result.cost, freedom, problem.is_sigma_known)  # NaN without a noise model
+    return 0.5 * INSIGNIFICANT**2 * float(np.nan_to_num(variance))
 
 
 def _drop_noise_of_times(problem: Problem, result: Result) -> Result:

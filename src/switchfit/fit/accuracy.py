@@ -91,7 +91,7 @@ def constraint_errors(fine: Evaluator, theta: FloatArray, constraints: Sequence[
                 found = _evaluate_constraints(arguments.without_mesh(), tau, ends, p, structure=structure)
             compiled.add(e)
             values.append(np.asarray(found[0]))
-            scales.append(np.abs(found[1]) @ np.ptp(states, axis=0))
+            scales.append((np.abs(found[1]) @ np.ptp(states, axis=0)).sum(axis=1))
     scale = np.concatenate(scales)
     return np.abs(np.concatenate(values) - constraints) / np.where(scale > 0, scale, 1.0)
 
@@ -100,17 +100,15 @@ def constraint_errors(fine: Evaluator, theta: FloatArray, constraints: Sequence[
 def _evaluate_constraints(
     arguments: Arguments, tau: jax.Array, ends: jax.Array, p: jax.Array, *, structure: Structure
 ) -> tuple[jax.Array, jax.Array]:
-    """Return guards, then terminal constraints c (m,) at the ends (N + 1, n) of the segments; and D c, (m, n)."""
+    """Return guards, then terminal constraints c (m,) at the ends (N + 1, n) of segments; and D c, (m, N + 1, n)."""
     model = Model(structure, arguments)
-    values, slopes = [], []
-    for i, guard in list_transition_functions(model, "guards"):
-        value, slope = jax.value_and_grad(guard, argnums=1)(tau[i], ends[i], p)
-        values.append(value[None])
-        slopes.append(slope[None])
-    if structure.terminal_constraints:
-        values.append(model.terminal_constraint(ends[-1], p))
-        slopes.append(jax.jacfwd(model.terminal_constraint)(ends[-1], p))
-    return jnp.concatenate(values), jnp.concatenate(slopes)
+
+    def evaluate(ends: jax.Array) -> jax.Array:
+        values = [guard(tau[i], ends[i], p)[None] for i, guard in list_transition_functions(model, "guards")]
+        values += [model.terminal_constraint(ends[-1], p)] if structure.terminal_constraints else []
+        return jnp.concatenate(values)
+
+    return evaluate(ends), jax.jacfwd(evaluate)(ends)
 
 
 LARGEST_ROW_ERROR = 1e-3

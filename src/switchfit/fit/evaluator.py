@@ -327,8 +327,8 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
 
 
 ITERATIONS = 60
-#: Newton steps below this part of a transition time are rounding.
-NEGLIGIBLE = 4 * np.finfo(float).eps
+#: After a Newton step below this part of a transition time, its error is rounding.
+NEGLIGIBLE = 1e-10
 #: Part of the way to the next transition that one step may take.
 ROOM = 0.9
 
@@ -474,12 +474,9 @@ def _solve_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
             break
         step = np.zeros(len(theta))
         step[guarded] = -np.linalg.solve(C, c)
-        if np.all(np.abs(step[guarded]) <= NEGLIGIBLE * np.maximum(np.abs(theta[guarded]), 1.0)):
-            return theta
         # Shortened so that transitions stay in order: behind one another the guards are those of other states.
         theta = theta + _fraction(problem, theta, step) * step
-    else:
-        if np.all(np.abs(step[guarded]) <= 1e-10 * np.maximum(np.abs(theta[guarded]), 1.0)):
+        if np.all(np.abs(step[guarded]) <= NEGLIGIBLE * np.maximum(np.abs(theta[guarded]), 1.0)):
             return theta
     near, names = shorten(theta[guarded].round(6)), join_names(problem.theta_names[k] for k in guarded)
     raise ValueError(
@@ -492,8 +489,7 @@ def _solve_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:
     """Return the fraction of a step that keeps the transitions in order."""
     unknowns = problem.unknowns
-    slack, change = unknowns.A @ theta, unknowns.A @ step
-    room = slack - unknowns.b
+    room, change = unknowns.A @ theta - unknowns.b, unknowns.A @ step
     closing = change < -1e-300
     return float(min(1.0, ROOM * np.min(np.maximum(room[closing], 0.0) / -change[closing], initial=np.inf)))
 
@@ -544,24 +540,18 @@ def measure_variation(problem: Problem) -> FloatArray:
 
 
 def _vary(item: Any, run: Experiment) -> float:
+    """Return half the weighted squares of data about the means of their channels; about 0 where these do not vary."""
     if isinstance(item, Measurements):
-        return float(sum(_vary_channel(*pair) for pair in zip(item.values.T, item.weights.T, strict=True)))
+        y, w = np.nan_to_num(item.values), item.weights  # 0 where a value is missing
+        mean = (w * y).sum(axis=0) / np.maximum(w.sum(axis=0), np.finfo(float).tiny)
+        about_mean, about_zero = (w * (y - mean) ** 2).sum(axis=0), (w * y**2).sum(axis=0)
+        return 0.5 * float(np.where(about_mean > NO_VARIATION**2 * about_zero, about_mean, about_zero).sum())
     if isinstance(item, ReferenceSignal):
         times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
         followed = item.signal(times)
         deviation = followed - followed.mean(axis=0)
         return 0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * float(times[1] - times[0])
     return np.nan
-
-
-def _vary_channel(values: FloatArray, weights: FloatArray) -> float:
-    """Return half the weighted squares of a channel about its mean; about 0 where it does not vary."""
-    there = weights > 0
-    y, w = values[there], weights[there]
-    if not len(y):
-        return 0.0
-    about_mean, about_zero = float(w @ (y - w @ y / w.sum()) ** 2), float(w @ y**2)
-    return 0.5 * (about_mean if about_mean > NO_VARIATION**2 * about_zero else about_zero)
 
 
 @keep_with_problem

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -43,10 +44,11 @@ from switchfit.optimize.problem import Problem as Minimization
 from switchfit.optimize.state import Finding
 from switchfit.optimize.threads import with_own_threads
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import Experiment, drop_jumps
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.inspection import find_comparisons, find_undefined, find_unread
 from switchfit.problem.problem import Problem, keep_with_problem
+from switchfit.problem.system import HybridSystem
 from switchfit.problem.unknowns import Variables
 from switchfit.runtime.errors import HiddenSwitchError, Issue
 
@@ -55,6 +57,9 @@ CHANGES = (0.1, -0.1)
 
 NO_EFFECT = 1e-12
 """Relative change of the cost that may be rounding: a parameter that changes it by less has no effect."""
+
+ROUNDING = 32 * EPS
+"""Rounding error of the difference of two times, as a part of their size."""
 
 
 def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> NDArray[np.bool_]:
@@ -70,9 +75,16 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     """
     problem = evaluator.problem
     idle = np.zeros(len(theta), dtype=bool)
-    for group in _list_idle_groups(problem, theta):
-        idle[group[0]] = True
-    if parameters and any(_has_collapsed(problem, theta, e) for e in range(len(problem.experiments))):
+    ends = zip(problem.experiments, problem.ends_of_modes(theta), strict=True)
+    collapsed = [times[1:] - times[:-1] <= ROUNDING * run.clock for run, times in ends]
+    if not any(map(np.any, collapsed)):  # the usual case: tested at every step
+        return idle
+    for run, where, own in zip(problem.experiments, problem.unknowns.times, collapsed, strict=True):
+        for first, after in np.flatnonzero(np.diff(own, prepend=False, append=False)).reshape(-1, 2).tolist():
+            group = where[max(first - 1, 0) : after]
+            if first > 0 and after < len(own) and np.all(group >= 0) and _may_move(problem.system, run, first, after):
+                idle[group[0]] = True
+    if parameters:
         base = evaluator.cost(theta)
         for i in _list_parameters(problem):
             moved = map(evaluator.cost, list_changes(problem, theta, i, CHANGES))
@@ -80,55 +92,15 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     return idle
 
 
-def _list_idle_groups(problem: Problem, theta: FloatArray) -> Iterator[NDArray[np.intp]]:
-    """Yield the indices in theta of transitions that coincide and may move together without effect.
+def _may_move(system: HybridSystem, run: Experiment, first: int, after: int) -> bool:
+    """Return whether collapsed modes, from the first to the one before `after`, may move together without effect.
 
-    No transition among them is fixed or at an end of the horizon, the modes before and after them are the same, and no
-    reset map, guard or jump lies in between.
+    The modes before and after them are the same, and no reset map, guard or jump lies in between.
     """
-    system = problem.system
-    for e, experiment in enumerate(problem.experiments):
-        sequence, where = experiment.mode_sequence, problem.unknowns.times[e]
-        for first, last in _list_coincident(problem, theta, e):
-            passed = [*zip(sequence[first : last + 1], sequence[first + 1 : last + 2], strict=True)]
-            smooth = not any(pair in system.reset_maps or pair in system.guards for pair in passed)
-            smooth = smooth and not np.any((experiment.passed_by_jumps > first) & (experiment.passed_by_jumps <= last))
-            if smooth and sequence[first] == sequence[last + 1] and np.all(where[first : last + 1] >= 0):
-                yield where[first : last + 1]
-
-
-def _list_coincident(problem: Problem, theta: FloatArray, e: int) -> Iterator[tuple[int, int]]:
-    """Yield the first and last of two or more transitions that coincide strictly inside the horizon.
-
-    A free tf counts as a transition at the end.
-    """
-    experiment, times = problem.experiments[e], _get_times(problem, theta, e)
-    rounding = _estimate_rounding(experiment)
-    lasting = np.flatnonzero(times[1:] - times[:-1] > rounding).tolist()
-    if len(lasting) >= len(times) - 1:  # the usual case: tested at every step
-        return
-    end = experiment.ends_of_modes(times)[-1]
-    for first, last in zip([0, *(i + 1 for i in lasting)], [*lasting, len(times) - 1], strict=True):
-        if first < last and times[first] - experiment.t0 > rounding and end - times[last] > rounding:
-            yield first, last
-
-
-def _has_collapsed(problem: Problem, theta: FloatArray, e: int) -> bool:
-    """Return whether a mode of experiment e has no duration."""
-    experiment = problem.experiments[e]
-    lengths = np.diff(experiment.ends_of_modes(_get_times(problem, theta, e)))
-    return bool(np.any(lengths <= _estimate_rounding(experiment)))
-
-
-def _get_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:
-    """Return the transition times of experiment e, and a free tf behind them: (N,), without jumps."""
-    experiment, times = problem.experiments[e], problem.vectors(theta, e)[0]
-    return np.array(drop_jumps(experiment, times)) if len(experiment.jump_times) else times
-
-
-def _estimate_rounding(experiment: Experiment) -> float:
-    """Return the rounding error of the difference of two times of an experiment."""
-    return 32 * EPS * max(experiment.end - experiment.t0, abs(experiment.t0), abs(experiment.end))
+    modes = run.mode_sequence[first - 1 : after + 1]
+    acts = any(pair in system.reset_maps or pair in system.guards for pair in pairwise(modes))
+    jumps = np.isin(run.passed_by_jumps, range(first, after))
+    return modes[0] == modes[-1] and not acts and not jumps.any()
 
 
 def _list_parameters(problem: Problem) -> list[int]:
@@ -483,8 +455,7 @@ def _list_visits(model: Model, p: Any, simulation: Simulation) -> Iterator[_Visi
     times = np.append(simulation.start[:1], simulation.end)
     states = np.vstack([simulation.before[:1], simulation.after])
     for sensor, samples in zip(structure.measurements, model.arguments.samples, strict=True):
-        seen = np.isin(times, samples.time) if sensor.delay is None else np.zeros(len(times), bool)
-        if seen.any():
+        if sensor.delay is None and (seen := np.isin(times, samples.time)).any():
             yield from visit(sensor.observe, times[seen], states[seen])
     for function in (*structure.terminal, *structure.terminal_constraints):
         yield from visit(function, states[-1:])

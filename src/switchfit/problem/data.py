@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.dates import FIRST, LENGTHS, Dates, Origin, has_dates, read_dates
+from switchfit.problem.dates import FIRST, LENGTHS, Dates, Origin, list_dates, read_dates
 from switchfit.problem.validation import (
     as_array,
     as_callable,
@@ -717,7 +717,7 @@ def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any
         return tuple(count_from(entry, origin, time_unit, what) for entry in item)
     if isinstance(item, Dates):
         return origin.to_numbers(item, time_unit, what)
-    if not has_dates(item):
+    if not any(list_dates(item)):
         return item
     what = what or f"times of {type(item).__name__}"
     own = {each.name: count_from(getattr(item, each.name), origin, time_unit, what) for each in fields(item)}

@@ -22,9 +22,8 @@ from zoneinfo import ZoneInfo
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.validation import as_array, as_name, is_of_library, shorten
+from switchfit.problem.validation import FloatArray, as_array, as_name, is_of_library, shorten
 
-FloatArray = NDArray[np.float64]
 Instants = NDArray[np.datetime64]
 """In microseconds: in UTC, or on the wall clock of dates without a zone."""
 
@@ -296,11 +295,6 @@ def list_dates(value: Any, what: str = "") -> Iterator[Given]:
     elif is_dataclass(value):
         for each in fields(value):
             yield from list_dates(getattr(value, each.name), what or f"times of {type(value).__name__}")
-
-
-def has_dates(value: Any) -> bool:
-    """Return whether there are dates in a value, where `list_dates` looks."""
-    return next(list_dates(value), None) is not None
 
 
 def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:

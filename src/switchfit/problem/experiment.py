@@ -23,7 +23,7 @@ from switchfit.problem.data import (
     ReferenceSignal,
     count_from,
 )
-from switchfit.problem.dates import choose_origin, has_dates, list_dates, read_date, read_dates
+from switchfit.problem.dates import choose_origin, list_dates, read_date, read_dates
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, require_time_unit, unit_suffix
 from switchfit.problem.system import HybridSystem, as_state
@@ -253,7 +253,7 @@ class Experiment:
         if self.name is not None:
             set_fields(self, name=as_name(self.name, "name of an experiment"))
         if self.initial_state is not None:
-            set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
+            set_fields(self, initial_state=as_state(self.initial_state))
         set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
         set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_times()
@@ -280,7 +280,7 @@ class Experiment:
         given = [dates for name, part in parts.items() for dates in list_dates(part, names.get(name, ""))]
         if given or self.origin is not None or self.time_zone is not None:
             timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
-            of_data = given[: len(timed)] if all(map(has_dates, timed)) else []  # they stand first
+            of_data = given[: len(timed)] if all(any(list_dates(item)) for item in timed) else []  # they stand first
             origin = choose_origin(given, of_data, self.origin, self.time_zone, parts["t0"])
             for name, part in parts.items():
                 parts[name] = count_from(part, origin, self.time_unit, names.get(name, ""))
@@ -389,6 +389,11 @@ class Experiment:
         """Length of the horizon at the guess."""
         return float(self.ends_of_modes(self.initial_times)[-1]) - self.t0
 
+    @cached_property
+    def clock(self) -> float:
+        """Size of its times, of which rounding is a part: the horizon, or the clock's reading if more."""
+        return max(self.initial_length, abs(self.t0), abs(self.t0 + self.initial_length))
+
     def _check_times(self) -> None:
         for i, tau in enumerate(self._own_times, start=1):
             what = "tf" if i > len(self.transition_times) else f"transition time {i}"
@@ -430,7 +435,7 @@ class Experiment:
                     )
 
     def _require_inside(
-        self, what: str, times: FloatArray, outside: NDArray[np.bool_], last: float, bound: str = ""
+        self, what: str, times: FloatArray, outside: NDArray[np.bool_], last: float, bound: str
     ) -> None:
         if outside.any():
             raise ValueError(

@@ -305,8 +305,7 @@ def trace_function(call: Call, parameters: Mapping[str, Shape]) -> Function:
     content = read_contents(function)
     asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()))
     key = None if content is None else (content, asked)
-    found = None if key is None else _traces.get(key)
-    if found is not None:
+    if (found := _traces.get(key)) is not None:
         return found
     call = call._replace(function=function)
     with use_float64(), nullcontext() if key is not None else _retracing(next(_turn)):

@@ -65,8 +65,9 @@ def find_unread(problem: Problem) -> Unread:
     left = [name for name, span in free.items() if name not in here and not known[span].any()]
     if not left:
         return Unread()
-    try:
-        elsewhere = find_targets(problem, _trace_libraries(problem), library=True)
+    try:  # the modes, reset maps and guards that do not occur may have faults
+        libraries = [trace_structure(problem._sources, run, len(run.mode_sequence)) for run in problem.experiments]
+        elsewhere = find_targets(problem, libraries, library=True)
     except ValueError:
         return Unread()
     unread = tuple(entry for name in left if name not in elsewhere for entry in unknowns.names[free[name]])
@@ -101,20 +102,6 @@ def find_targets(problem: Problem, structures: Iterable[Structure], *, library: 
         for name, entries in chain(read, named):
             found.setdefault(run.parameter_map.get(name, name), set()).update(entries)
     return found
-
-
-def _trace_libraries(problem: Problem) -> list[Structure]:
-    """Return the structures with all modes of the system, traced if the problem's own have those of a sequence alone.
-
-    Raises
-    ------
-    ValueError
-        If a mode, a reset map or a guard that does not occur cannot be traced.
-    """
-    if problem.max_transitions is not None:
-        return list(problem.structures)
-    each = zip(problem.experiments, problem.structures, strict=True)
-    return [trace_structure(problem._sources, run, own.N) for run, own in each]
 
 
 VERBS = {

@@ -136,11 +136,8 @@ def find_line(equation: Any) -> str:
     ----------
     equation : operation of a jaxpr
     """
-    try:  # private API of JAX: if it changes, messages have no location
-        frame = source_info_util.user_frame(equation.source_info.traceback)
-        return "" if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
-    except (AttributeError, TypeError):
-        return ""
+    frame = source_info_util.user_frame(equation.source_info.traceback)
+    return "" if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
 
 
 def find_public_name(jaxpr: Any) -> str | None:

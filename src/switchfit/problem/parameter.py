@@ -13,12 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.problem.dates import Dates, list_dates, read_date
+from switchfit.problem.dates import Dates, FloatArray, list_dates, read_date
 from switchfit.problem.validation import as_array, as_choice, as_flag, as_name, require_deviation, set_fields, shorten
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -191,11 +191,8 @@ class Problem:
     structures: tuple[Structure, ...] = field(init=False)
 
     def __repr__(self) -> str:
-        return format_line(
-            self,
-            format_count(len(self.experiments), "experiment"),
-            f"unknowns {join_first(self.theta_names) or 'none'}",
-        )
+        runs, unknowns = format_count(len(self.experiments), "experiment"), join_first(self.theta_names) or "none"
+        return format_line(self, runs, f"unknowns {unknowns}")
 
     def __post_init__(self) -> None:
         as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")
@@ -299,8 +296,7 @@ class Problem:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the user's functions, and of their traces what identifies them."""
-        state = {name: getattr(self, name) for name in GIVEN}
-        return state | {"digests": self.digests}
+        return {name: getattr(self, name) for name in GIVEN} | {"digests": self.digests}
 
     @property
     def digests(self) -> list[dict[str, str]]:
@@ -440,7 +436,7 @@ class Problem:
         For a transition time it is the length of the horizon, or what the clock reads if that is more: a time that is
         1e-30 after t0 = 0 is t0.
         """
-        return self.unknowns.put_at_times(np.abs(self.unknowns.initial), [_clock(run) for run in self.experiments])
+        return self.unknowns.put_at_times(np.abs(self.unknowns.initial), [run.clock for run in self.experiments])
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
         """Return what the compiled programs of experiment e take: its times (N,), jumps among them and a free tf last,
@@ -560,7 +556,7 @@ class Problem:
             times = self._select_times(checked, e)
             knots = np.concatenate([[experiment.t0], times, [experiment.end]])
             shortest = (knots[1:] - knots[:-1]).min()
-            if shortest < -ROUNDING * _clock(experiment):
+            if shortest < -ROUNDING * experiment.clock:
                 last = ", with the upper bound of tf for its end" if experiment.has_free_tf else ""
                 raise ValueError(
                     f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
@@ -642,14 +638,6 @@ def place_parameters(problem: Problem, e: int, structure: Structure) -> NDArray[
         if read:
             parts.append(problem.unknowns.parameters[mapped.get(name, name)].start + np.array(read))
     return np.concatenate([*parts, states[states >= 0]]).astype(np.intp)
-
-
-def _clock(experiment: Experiment) -> float:
-    """Return the size of the times of an experiment, of which rounding is a part: the horizon, or the clock's reading
-    if more.
-    """
-    last = experiment.t0 + experiment.initial_length
-    return max(experiment.initial_length, abs(experiment.t0), abs(last))
 
 
 def keep_with_problem(build: Callable[[Problem], T]) -> Callable[[Problem], T]:

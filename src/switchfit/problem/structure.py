@@ -245,9 +245,8 @@ class _Tracer:
 
     def __init__(self, sources: Sources, experiment: Experiment) -> None:
         parameters, mapped = sources.parameters, experiment.parameter_map
-        order = {name: k for k, name in enumerate(parameters)}
         # The same order for every map, so that runs share a program.
-        names = sorted({*parameters, *mapped}, key=lambda name: (order.get(name, len(order)), name))
+        names = [*parameters, *sorted(mapped.keys() - parameters.keys())]
         self.named = {name: parameters[mapped.get(name, name)] for name in names}
         self.shapes = {name: q.shape for name, q in self.named.items()}
         self.read: dict[str, set[int]] = {}
@@ -265,11 +264,11 @@ class _Tracer:
         return traced
 
 
-def trace_structure(sources: Sources, experiment: Experiment, transitions: int | None = None) -> Structure:
+def trace_structure(sources: Sources, experiment: Experiment, transitions: int | None) -> Structure:
     """Trace and check the functions of one experiment, and return its structure.
 
     All modes take implicit steps if the solver is "stiff", else all take explicit ones.
-    With `transitions`, its library has all modes of the system and at most that many transitions; by default, it has
+    With `transitions`, its library has all modes of the system and at most that many transitions; with None, it has
     those of the experiment.
 
     Raises

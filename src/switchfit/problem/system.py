@@ -103,7 +103,7 @@ class HybridSystem:
         set_fields(self, modes=MappingProxyType(dict(self.modes)))
         for name in ("reset_maps", "guards"):
             set_fields(self, **{name: MappingProxyType(_check_pairs(getattr(self, name), name, self.modes))})
-        set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
+        set_fields(self, initial_state=as_state(self.initial_state))
         for label in ("state_names", "state_units"):
             set_fields(self, **{label: as_labels(getattr(self, label), label, "state")})
         if not callable(self.initial_state):
@@ -123,33 +123,26 @@ class HybridSystem:
         >>> system.check_labels_of(2)
         """
         for label in ("state_names", "state_units"):
-            labels = getattr(self, label)
-            if labels is not None and len(labels) != n:
-                raise ValueError(f"{label} must have one entry for each of the {n} states; got {shorten(labels)}.")
+            as_labels(getattr(self, label), label, "state", n)
 
 
-def as_state(value: Any, name: str) -> Callable[..., Any] | NDArray[np.float64] | tuple[Parameter, ...]:
+def as_state(value: Any) -> Callable[..., Any] | NDArray[np.float64] | tuple[Parameter, ...]:
     """Return `value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` if it contains any.
 
     A function is returned as it is.
-
-    Raises
-    ------
-    ValueError
-        With `name` in the message.
     """
     if callable(value):
         return value
     if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
         form = "a number or an sf.Parameter"
-        entries = tuple(as_parameter(entry, f"each entry of {name}", form, fixed=True) for entry in value)
+        entries = tuple(as_parameter(entry, "each entry of initial_state", form, fixed=True) for entry in value)
         if any(entry.shape != () for entry in entries):
-            shapes = [entry.shape for entry in entries]
-            raise ValueError(f"{name} must have {form} of one number for each state; got the shapes {shorten(shapes)}.")
+            shapes = shorten([entry.shape for entry in entries])
+            raise ValueError(f"initial_state must have {form} of one number for each state; got the shapes {shapes}.")
         return entries
-    state = as_array(value, name, form="an array of numbers, one for each state", finite=True)
+    state = as_array(value, "initial_state", form="an array of numbers, one for each state", finite=True)
     if state.ndim != 1 or state.size == 0:
-        raise ValueError(f"{name} must have shape (n,), one entry for each state; got shape {state.shape}.")
+        raise ValueError(f"initial_state must have shape (n,), one entry for each state; got shape {state.shape}.")
     state.flags.writeable = False
     return state
 

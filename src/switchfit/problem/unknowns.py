@@ -29,13 +29,13 @@ from switchfit.problem.experiment import Experiment, initial_state_of, name_runs
 from switchfit.problem.parameter import Parameter, PriorTerms, unit_suffix
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import join_names
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import Printed
 
 ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound"]
 
 
 @dataclass(frozen=True)
-class Constraint:
+class Constraint(Printed):
     """A linear constraint; print it for a sentence about it when it is active.
 
     Attributes
@@ -60,9 +60,6 @@ class Constraint:
     mode: str = ""
     position: int | None = None
     run: str = ""
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 @dataclass(frozen=True)

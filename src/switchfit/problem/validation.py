@@ -226,11 +226,11 @@ def require_deviation(sd: FloatArray, what: str) -> None:
             raise ValueError(f"{what} must be positive and finite, and so must its inverse square; got {sd.min()}.")
 
 
-def as_level(value: Any, what: str = "level") -> float:
+def as_level(value: Any) -> float:
     """Return a confidence level as a float between 0 and 1."""
-    number = as_number(value, what)
+    number = as_number(value, "level")
     if not 0 < number < 1:
-        raise ValueError(f"{what} must lie between 0 and 1; got {number}.")
+        raise ValueError(f"level must lie between 0 and 1; got {number}.")
     return number
 
 
@@ -250,9 +250,9 @@ def as_count(value: Any, what: str, *, at_least: int = 0, at_most: int = LARGEST
     return count
 
 
-def as_seed(value: Any, what: str = "seed") -> int:
+def as_seed(value: Any) -> int:
     """Return the seed of a random number generator."""
-    return as_count(value, what, at_most=LARGEST_SEED)
+    return as_count(value, "seed", at_most=LARGEST_SEED)
 
 
 def as_index(value: Any, what: str, size: int) -> int:
