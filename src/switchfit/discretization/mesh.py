@@ -186,8 +186,8 @@ def _compare_densities(nodes: FloatArray, times: FloatArray, counts: FloatArray)
     not all rest: explicit steps are unstable if they are longer.
     """
     low, high, lengths = np.interp(nodes[:-1], times, counts), np.interp(nodes[1:], times, counts), np.diff(nodes)
-    # Of the quarters of the s steps in a cell of length T, the second shortest takes s h / 4 (the first steps of a solve
-    # may make one short). The density of s nodes is s (1 / (s h) + 1 / T) / 2 there, and that of the steps 1 / h.
+    # The second shortest quarter of the s steps in a cell of length T takes s h / 4: the first steps of a solve may
+    # make one shorter. There the density of s nodes is s (1 / (s h) + 1 / T) / 2, and that of the steps 1 / h.
     quarters = np.interp(np.linspace(low, high, PARTS + 1, axis=1), counts, times)
     return np.asarray(2.0 / (1.0 + PARTS * np.sort(np.diff(quarters), axis=1)[:, 1] / lengths))
 
