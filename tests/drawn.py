@@ -40,7 +40,7 @@ NAMES = {
     "engine/native": "native protocol random_systems beam implicit operations functions",
     "estimation": "saved_problem estimate save mesh following bad_input",
     "experiment_design": "design",
-    "fit": "estimate jumps following finiteness starts strategy guards verdict",
+    "fit": "estimate jumps following finiteness starts strategy guards verdict log_times",
     "io": "io saved_problem init tables_out files many_logs",
     "io/logs": "logs log_formats units real_logs gps_drive dates",
     "io/problem_file": "io init files dates saved_problem bad_input cli_modes jumps",
