@@ -179,15 +179,18 @@ def test_a_transition_that_wants_past_a_jump_stops_there_and_says_so():
 
 
 def test_a_collapsed_mode_with_a_jump_inside_is_not_idle():
-    """Its two transition times cannot move together: one is before the jump, the other after it."""
+    """Its two transition times cannot move together: one is before the jump, the other after it; nor if the modes
+    before and behind it differ."""
 
-    def make(jumps, **more):
-        run = sf.Experiment(make_log(TIMES), ["slow", "fast", "slow"], [7.5, 8.5], t0=0.0, jumps=jumps)
+    def make(jumps, sequence=("slow", "fast", "slow"), **more):
+        run = sf.Experiment(make_log(TIMES), sequence, [7.5, 8.5], t0=0.0, jumps=jumps)
         return Evaluator(sf.Problem(replace(CHANGING, **more), run, GUESS))
 
     theta = np.array([8.0, 8.0, 0.2, 8.0])
     assert idle_unknowns(make([]), theta, False).any()
     assert not idle_unknowns(make(sf.Jump(8.0, dose)), theta, False).any()
+    three = CHANGING.modes | {"third": lambda t, x, p: -2.0 * p["k"] * x}
+    assert not idle_unknowns(make([], ("slow", "fast", "third"), modes=three), theta, False).any()
     assert not idle_unknowns(make([], reset_maps={("slow", "fast"): lambda t, x, p: 0.5 * x}), theta, False).any()
 
 

@@ -179,6 +179,7 @@ def _count_steps(solutions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
 
 
 PARTS = 4
+"""Into which the steps of a cell are divided, to see where they are shortest."""
 
 
 def _compare_densities(nodes: FloatArray, times: FloatArray, counts: FloatArray) -> FloatArray:
