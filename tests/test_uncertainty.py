@@ -305,15 +305,24 @@ def test_a_gap_of_unstable_adjoints_is_no_failure():
     assert check.passed, check
 
 
-def test_explicit_steps_that_blow_up_are_not_called_wrong_derivatives():
+def test_unstable_explicit_steps_are_not_called_wrong_derivatives():
     """LuGre friction with the published stiffness, which takes 20,000 explicit steps at the limit of stability."""
     case = vehicle_coverage.CASES["lugre, spring"]()
     system = lugre(k=2.0, sigma_0=1e5, sigma_1=np.sqrt(1e5), v_s=0.001)
     problem = sf.Problem(system, case.problem.experiments, case.problem.parameters, solver="explicit")
     check = sf.check_derivatives(problem, case.theta, paper=False)
+    assert [issue.kind for issue in check.failures] == ["cost not continuous"]
+    assert "J jumps at this theta or near it" in str(check)
+    assert "solver='stiff'" in str(check)
+
+
+def test_a_cost_that_is_not_finite_nearby_says_nothing_about_derivatives():
+    """x' = p x² ends at t = 1 / p."""
+    system = sf.HybridSystem({"m": lambda t, x, p: p["p"] * x**2}, [1.0])
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0] ** 2), ("m",), (), 0.0, 1.0)
+    check = sf.check_derivatives(sf.Problem(system, run, {"p": 0.999}), paper=False)
     assert [issue.kind for issue in check.failures] == ["cost not finite"]
     assert "not finite at this theta or near it" in str(check)
-    assert "solver='stiff'" in str(check)
 
 
 # Coverage

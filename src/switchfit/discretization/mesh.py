@@ -11,7 +11,7 @@ transition times.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -147,11 +147,20 @@ class Mesh:
         # Parts of a cell that is as short as rounding may coincide: such nodes are one.
         return Mesh.from_times(np.append(inside, nodes[-1]), self.stiffness)
 
-    def refine(self, solutions: Sequence[FloatArray], stiffness: tuple[Stiffness, ...], finer: float = 1.0) -> Mesh:
-        """Return the mesh with the nodes that the steps of some solutions need, or `finer` times as many."""
+    def refine(
+        self,
+        solutions: Sequence[FloatArray],
+        stiffness: tuple[Stiffness, ...],
+        has_limits: Callable[[], bool],
+        finer: float = 1.0,
+    ) -> Mesh:
+        """Return the mesh with the nodes that the steps of some solutions need, or `finer` times as many.
+
+        `has_limits` says whether stability limits explicit ones.
+        """
         nodes, (times, counts) = self.times, _count_steps(solutions)
         needed = np.diff(np.interp(nodes, times, counts))
-        if self.has_rest:
+        if self.has_rest or (needed.max() > MANY_STEPS and has_limits()):
             needed *= _compare_densities(nodes, times, counts)
         # A twentieth of a step beyond a whole number does not cost a cell more.
         pieces = np.maximum(np.ceil(finer * needed - 0.05).astype(int), 1)
@@ -177,6 +186,9 @@ def _count_steps(solutions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
     return times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))])
 
+
+MANY_STEPS = 32
+"""Steps inside a cell from which it matters whether stability limits them."""
 
 PARTS = 4
 """Into which the steps of a cell are divided, to see where they are shortest."""

@@ -19,6 +19,7 @@ from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from operator import sub
 from typing import Any, NamedTuple
 
 import jax
@@ -385,9 +386,9 @@ class _Solve:
             x = steps.y[:-1].copy()
             # From time to time the watch estimates whether stability limits the explicit steps, from the last one of
             # them.
-            if watch.add(len(times)) and len(times) and stretch.is_explicit:
+            if watch.add(len(times), not steps.is_running) and len(times) and stretch.is_explicit:
                 smallest = self._tolerances.atol / self._tolerances.rtol
-                step = accepted[-1] - accepted[-2]
+                step = max(map(sub, accepted[-1:-3:-1], accepted[-2:-4:-1]))  # the end may cut the last one
                 watch.look(Look(step, steps.slopes, accepted[-1], steps.y.copy(), smallest))
                 if len(accepted) > PACE and watch.is_clear():
                     watch.mode.projected = _project_steps(accepted, stretch.end)
@@ -513,8 +514,8 @@ def refine_mesh_of_run(
     ValueError
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
-    solutions, found = _solve_at(run, thetas, Choice(stiffness), most)
-    return run.coarse.refine(solutions, found, finer)
+    choice = Choice(stiffness)
+    return run.coarse.refine(_solve_at(run, thetas, choice, most), choice.stiffness, choice.has_limits, finer)
 
 
 def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
@@ -531,16 +532,17 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     runs = [runs_of(problem)[e] for problem in problems]
     solutions: list[FloatArray] = []
     stiffness: dict[str, Stiffness] = {}
+    choices = []
     for run in runs:
         with suppress(NotIntegrableError):
-            found, stiff = _solve_at(run, (run.problem.initial_theta,), Choice())
-            solutions += found
-            stiffness = {each.mode: each for each in stiff} | stiffness  # as it was found first
+            choices.append(Choice())
+            solutions += _solve_at(run, (run.problem.initial_theta,), choices[-1])
+            stiffness = choices[-1].found | stiffness  # as it was found first
     if not solutions:
         _solve_at(runs[0], (runs[0].problem.initial_theta,), Choice())  # it raises
     fewest = min(map(len, solutions))
     kept = [steps for steps in solutions if len(steps) <= MOST_TIMES * fewest + PACE]
-    return runs[0].coarse.refine(kept, tuple(stiffness.values()))
+    return runs[0].coarse.refine(kept, tuple(stiffness.values()), lambda: any(each.has_limits() for each in choices))
 
 
 def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
@@ -561,19 +563,22 @@ def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None
         found = _solve_at(run, thetas[::-1], choice)
     except NotIntegrableError:
         return None
-    return run.coarse.refine(*found) if choice.found.keys() - {each.mode for each in mesh.stiffness} else None
+    is_new = choice.found.keys() - {each.mode for each in mesh.stiffness}
+    return run.coarse.refine(found, choice.stiffness, choice.has_limits) if is_new else None
 
 
-def _solve_at(
-    run: Run, thetas: Sequence[FloatArray], choice: Choice, most: int = MAX_STEPS
-) -> tuple[list[FloatArray], tuple[Stiffness, ...]]:
+def _solve_at(run: Run, thetas: Sequence[FloatArray], choice: Choice, most: int = MAX_STEPS) -> list[FloatArray]:
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
     With ``solver="auto"``, a mode that is stiff at one of the thetas is solved by implicit steps at all of them, unless
-    these fail or take longer; the modes that are, and why, are returned too. `choice` has those known before.
+    these fail or take longer: the `choice` has the modes that are, and why, and those known before.
     """
     if run.problem.solver != "auto":
-        return [solve_adaptively(run, theta, Settings(most=most)) for theta in thetas], ()
+        choice.watches = [Watch() for _ in thetas]
+        return [
+            solve_adaptively(run, theta, Settings((), watch, most))
+            for theta, watch in zip(thetas, choice.watches, strict=True)
+        ]
     solutions: list[FloatArray] = []
     while len(solutions) < len(thetas):
         k = len(solutions)
@@ -588,4 +593,4 @@ def _solve_at(
             solutions = []  # again, with other steps in some mode
         elif failure is not None:
             raise failure
-    return solutions, choice.stiffness
+    return solutions

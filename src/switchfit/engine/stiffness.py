@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.discretization.mesh import Mesh, Stiffness
+from switchfit.discretization.mesh import MANY_STEPS, Mesh, Stiffness
 from switchfit.problem.data import FloatArray
 
 STEPS_BETWEEN = 250
@@ -174,8 +174,8 @@ class Watch:
         self.current, self.mode = name, self.modes.setdefault(name, _ModeSteps())
         self.mode.row_work = row_work
 
-    def add(self, accepted: int) -> bool:
-        """Count steps in the current mode, and return whether it is time to `look`.
+    def add(self, accepted: int, is_last: bool = False) -> bool:
+        """Count steps in the current mode, and return whether it is time to `look`: `is_last` says that they end it.
 
         Raises
         ------
@@ -186,7 +186,7 @@ class Watch:
         mode.count += accepted
         if mode.row_work * mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
-        return mode.count - mode.looked >= self.between
+        return mode.count - mode.looked >= (MANY_STEPS if is_last else self.between)
 
     def look(self, there: Look) -> None:
         """Keep a state of the current mode, for its eigenvalues."""
@@ -221,12 +221,15 @@ class Choice:
     ----------
     found : dict of str to Stiffness
         The modes that take implicit steps, and why.
+    watches : list of Watch
+        Of the last solve at each theta.
     """
 
     def __init__(self, stiffness: Iterable[Stiffness] = ()) -> None:
         self.found = {each.mode: each for each in stiffness}
         self._most: dict[str, tuple[int, float]] = {}  # where a mode was found, and the work it may have there
         self._refused: set[str] = set()
+        self.watches: list[Watch] = []
 
     @property
     def stiffness(self) -> tuple[Stiffness, ...]:
@@ -235,7 +238,13 @@ class Choice:
 
     def watch(self, k: int) -> Watch:
         """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its work is limited."""
-        return Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
+        watch = Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
+        self.watches = [*self.watches[:k], watch]
+        return watch
+
+    def has_limits(self) -> bool:
+        """Return whether stability limits explicit steps of a mode in one of the last solves."""
+        return any(mode.limited for watch in self.watches for mode in watch.modes.values())
 
     def add(self, stiff: Mapping[str, float], explicit: Watch, k: int) -> bool:
         """Let modes take implicit steps, and return whether there is one among them that did not.

@@ -341,6 +341,8 @@ _ISSUES: dict[str, Sentence] = {
     "cost not finite": "J or its derivatives are not finite at this theta or near it. The states of "
     "sf.simulate(problem, theta) are NaN from where the solution breaks down; for a stiff mode, give the Problem "
     "solver='stiff'",
+    "cost not continuous": "J jumps at this theta or near it, whatever its derivatives are. Steps of a stiff mode may "
+    "be unstable: give the Problem solver='stiff'",
     "derivatives of another cost": "the derivatives do not belong to the cost",
     # Why a line search failed, or a fit ended with an error
     "wrong slope": "The gradient does not belong to the cost: along that direction it says {before:.3g}, differences "

@@ -117,9 +117,11 @@ class DerivativeCheck(Printed):
 
     @property
     def failures(self) -> tuple[Issue, ...]:
-        """What failed; empty if nothing did. Where J is not finite, nothing can be said about its derivatives."""
+        """What failed; empty if nothing did. Where J is not finite or jumps, nothing can be said about derivatives."""
         if not np.isfinite(self.remainders).all():
             return (Issue("cost not finite"),)
+        if not are_orders_right(self.observed_orders[:1]):
+            return (Issue("cost not continuous"),)
         found = [] if are_orders_right(self.observed_orders) else [Issue("derivatives of another cost")]
         largest = max(self.gradient_gap, self.hessian_gap)
         if largest > LARGEST_GAP and not self.stiff:  # False if not checked: NaN
