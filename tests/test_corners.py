@@ -18,6 +18,7 @@ from switchfit.engine import jax as jax_programs
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.branches import MOST_CROSSINGS, trace_for_numpy
 from switchfit.engine.choice import SplitEngine
+from switchfit.engine.native.templates import Order, Sizes, Templates
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.corners import find_corners
 from switchfit.problem.functions import use_float64
@@ -621,6 +622,23 @@ def test_what_cannot_be_followed_at_a_trial_is_refused_with_its_corner(mode, sta
         refine_mesh(problem, 0, np.array(theta))
     assert "mode 'm'" in str(refused.value)
     assert f"(test_corners.py:{first + len(lines) - 1})" in str(refused.value)
+
+
+def test_branches_share_what_they_have_in_common():
+    """A corner is one function on all sides of another one, and a library that has grown traces its new modes alone."""
+    problem = problem_of(still, [1.0, 1.0, 1.0], {"c": 1.0})
+    corners, structure = find_corners(problem.structures[0].modes[0]), problem.structures[0]
+    assert corners.end((1, 1, 1), 0) == corners.end((1, -1, 1), 0) != corners.end((-1, 1, 1), 0)
+    modes = [corners.branch(sides) for sides in ((1, 1, 1), (1, -1, 1), (-1, 1, 1))]
+    stages = []
+    for count in (2, 3):
+        grown = {"modes": tuple(modes[:count]), "mode_names": ("m",) * count, "implicit": (False,) * count}
+        sizes = Sizes(structure.n, count, count, structure.M, 0, 0, ((3,),))
+        templates = Templates(replace(structure, **grown, transitions=count).library, sizes, Order.HESSIAN)
+        with use_float64():
+            stages.append([templates.stage(mode) for mode in range(count)])
+    assert stages[0][0] is stages[1][0] is not stages[1][1]
+    assert stages[0][1] is stages[1][1]
 
 
 def test_two_bodies_may_rest():

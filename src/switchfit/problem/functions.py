@@ -235,7 +235,10 @@ class Function:
         structs = list(self.structs)
         if self.takes_input:
             structs[2] = jax.ShapeDtypeStruct((2, *structs[2].shape), structs[2].dtype)
-        return Function(jax.make_jaxpr(evaluate)(*structs), self.parameters)
+        closed = jax.make_jaxpr(evaluate)(*structs)
+        # Without what has no use: a corner does not take all of its mode, and is one in branches on its other sides.
+        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=True)
+        return Function(closed.replace(jaxpr=jaxpr), self.parameters)
 
     def __hash__(self) -> int:
         return hash(self._key)

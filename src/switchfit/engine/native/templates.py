@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from enum import IntEnum
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -101,9 +102,14 @@ class Templates:
         """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `COST_TO_GO` are their positions.
 
         Without `running`, ell is zero. At order COST there are f and ell alone, with D_1 f and D_1 ell in a mode that
-        takes implicit steps.
+        takes implicit steps. Libraries with the same mode share the template.
         """
-        n, M = self.sizes.n, self.sizes.M
+        own = {name: (getattr(self.library, name)[mode],) for name in ("modes", "mode_names", "implicit")}
+        return self._share("trace_stage", running, has_free_tf=self.library.is_rest(mode), **own)
+
+    def trace_stage(self, running: bool) -> Template:
+        """Trace the only mode of the library, as `stage` does."""
+        n, M, mode = self.sizes.n, self.sizes.M, 0
 
         def stage(model: Model, t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any) -> Any:
             piece, zero = Piece(origin, coefficients), jnp.zeros(())
@@ -192,9 +198,13 @@ class Templates:
 
         The outputs of a constraint are its value and first derivatives, then those of the weighted one.
         """
+        return self._share("trace_transition", kind, **{kind: (getattr(self.library, kind)[which],)})
+
+    def trace_transition(self, kind: str) -> Template:
+        """Trace the only transition of the library, as `transition` does."""
 
         def at(model: Model, t: Any, x: Any, p: Any, weight: Any, origin: Any, coefficients: Any) -> Any:
-            function = get_transition_function(model, kind, which, Piece(origin, coefficients))
+            function = get_transition_function(model, kind, 0, Piece(origin, coefficients))
             if kind == "guards":
                 return self._map(lambda t, x, p: function(t, x, p)[None], (t, x, p), weight)
             return self._cost(function, (t, x, p))
@@ -237,6 +247,11 @@ class Templates:
 
         return self._trace(outputs, (), (self.sizes.n,), (self.sizes.M,), name="observe")
 
+    def _share(self, method: str, setting: Any, **own: Any) -> Template:
+        """Return what a method traces in a library with nothing but its `own` functions."""
+        alone = replace(self.library.functions, measurements=(), terminal=(), **own)
+        return _trace_alone(alone, self.sizes._replace(N=0, T=0, m=0), self.order, method, setting)
+
     def _trace(self, function: Callable[..., Any], *shapes: Shape, name: str) -> Template:
         """Trace a function of the model and of arrays of these shapes; the constants are further inputs."""
 
@@ -272,6 +287,12 @@ class Templates:
 
     def _no_second(self) -> Any:
         return jnp.zeros((1 + self.sizes.n + self.sizes.M,) * 2)
+
+
+@lru_cache(maxsize=256)
+def _trace_alone(library: Structure, sizes: Sizes, order: Order, method: str, setting: Any) -> Template:
+    """Return the template of a library of one function: libraries grow in a search, and derivatives take long."""
+    return getattr(Templates(library, sizes, order), method)(setting)
 
 
 def _differentiate_twice(value: Callable[..., Any], t: Any, x: Any, p: Any) -> Any:
