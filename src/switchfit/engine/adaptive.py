@@ -117,7 +117,8 @@ def find_path(
     # was followed with the final library, and its steps are those that machine code will take.
     while True:
         known = branches.get_structure(run.structure) if branches.count else run.structure
-        course, count = Course(branches, known, run.build_arguments(coarse), p), branches.count
+        smallest = run.problem.atol / run.problem.rtol
+        course, count = Course(branches, known, run.build_arguments(coarse), p, smallest), branches.count
         steps = None
         try:
             steps = _Solve(run, known, coarse, settings, course)(tau, p)

@@ -70,6 +70,18 @@ def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
     return evaluate
 
 
+@lru_cache(maxsize=1024)
+def are_equal(one: Function, other: Function) -> bool:
+    """Return whether two branches of a mode are one function: ``sign(d) * 0`` is 0 on both sides of d = 0."""
+    shapes = [struct.shape for struct in one.structs]
+    call = lambda *given: [each.evaluate(given) for each in (one, other)]  # noqa: E731
+    with use_float64():
+        try:
+            return one == other or trace_scalars(call, *shapes).has_equal_outputs
+        except Unsupported:
+            return False
+
+
 class Path(NamedTuple):
     """Branches of a trajectory.
 
@@ -258,9 +270,13 @@ class Course:
     structure : Structure
     arguments : Arguments
     p : (M,)
+    smallest : float
+        Size of a state below which its error is absolute.
     """
 
-    def __init__(self, branches: Branches, structure: Structure, arguments: Arguments, p: FloatArray) -> None:
+    def __init__(
+        self, branches: Branches, structure: Structure, arguments: Arguments, p: FloatArray, smallest: float = 0.0
+    ) -> None:
         self.branches, self._structure = branches, structure
         self._named = read_parameters(structure, arguments, p)
         self._nodes, self._signals = np.asarray(arguments.nodes), np.asarray(arguments.signals)
@@ -268,7 +284,7 @@ class Course:
         self._ends: list[list[int]] = []
         self._times: list[float] = []
         self._mode, self._scale = 0, np.zeros(0)
-        self._largest: FloatArray | float = 0.0
+        self._largest: FloatArray | float = smallest
         self._last: FloatArray | None = None
         self._beyond = np.zeros(0)
 

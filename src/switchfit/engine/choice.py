@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.adaptive import Settings, find_path
-from switchfit.engine.branches import Branches, Course, Path, find_dips
+from switchfit.engine.branches import Branches, Course, Path, are_equal, find_dips
 from switchfit.engine.jax import JaxEngine, derivatives
 from switchfit.engine.native.engine import NativeEngine, foreign_derivatives, reason_for_jax
 from switchfit.engine.native.hypotheses import NativeHypotheses, hypotheses_program
@@ -40,6 +40,9 @@ from switchfit.problem.structure import Structure
 from switchfit.runtime.errors import NotIntegrableError
 
 NEWTON_ITERATIONS = 8
+
+IDLE_ITERATIONS = 3
+"""The same for crossings that change nothing: they may be tangents, and are where they are as far as `_holds` sees."""
 
 CONVERGED, CLOSE = 1e-15, 1e-8
 """Newton steps of the times of crossings, relative to the horizon, at which they are found: before and after it."""
@@ -74,7 +77,8 @@ class _Split(NamedTuple):
     own : (N,), the transitions of the experiment
     crossings : (K,), those of the path
     guarded : (K',), those of the crossings that have a guard
-    own_constraints, guards : the rows of constraints of the experiment, and of the guarded crossings
+    idle : (I,), those that have one and change nothing, as in the middle of a play: J does not depend on their times
+    own_constraints, guards, idle_guards : the rows of constraints of the experiment, and of these crossings
     """
 
     path: Path
@@ -84,8 +88,10 @@ class _Split(NamedTuple):
     own: NDArray[np.intp]
     crossings: NDArray[np.intp]
     guarded: NDArray[np.intp]
+    idle: NDArray[np.intp]
     own_constraints: NDArray[np.intp]
     guards: NDArray[np.intp]
+    idle_guards: NDArray[np.intp]
 
     @property
     def has_gauss_newton(self) -> bool:
@@ -284,10 +290,14 @@ class SplitEngine:
             structure = self._branches.get_structure(self._structure, path)
             # Transitions in the order of time: the crossings of segment i, then its own transition i.
             kinds = np.concatenate([[*ends, OWN] for ends in path.ends])[:-1]
-            own, crossings, guarded = (np.flatnonzero(is_one) for is_one in (kinds == OWN, kinds != OWN, kinds >= 0))
-            guards = np.array([structure.guarded.index(i) for i in guarded], dtype=np.intp)
-            every = np.arange(len(structure.guarded) + structure.terminal_constraint_count)
-            places = own, crossings, guarded, np.delete(every, guards), guards
+            modes = [structure.modes[k] for k in structure.mode_of_segment]
+            is_idle = np.array([kind >= 0 and are_equal(*modes[i : i + 2]) for i, kind in enumerate(kinds)], dtype=bool)
+            every = kinds == OWN, kinds != OWN, (kinds >= 0) & ~is_idle, is_idle
+            own, crossings, guarded, idle = map(np.flatnonzero, every)
+            guards, idle_guards = (np.searchsorted(structure.guarded, which) for which in (guarded, idle))
+            rows = np.arange(len(structure.guarded) + structure.terminal_constraint_count)
+            others = np.delete(rows, np.append(guards, idle_guards))
+            places = own, crossings, guarded, idle, others, guards, idle_guards
             split = _Split(path, corners.copy(), structure, self._build_engine(structure), *places)
         self._split, self._times = split, np.zeros(len(split.own) + len(split.crossings))
         self._times[split.crossings] = path.times
@@ -306,8 +316,8 @@ class SplitEngine:
         none.
         """
         ends, times = self._mesh.times[[0, -1]], self._move_own(split, tau)
-        no_multipliers = np.zeros(len(split.guards) + len(split.own_constraints))
-        for _ in range(NEWTON_ITERATIONS):
+        no_multipliers = np.zeros(sum(map(len, (split.guards, split.idle_guards, split.own_constraints))))
+        for k in range(NEWTON_ITERATIONS):
             # A Newton step that changes the order of transitions leaves what the structure can say: the path is found
             # anew.
             if not (np.diff([ends[0], *times, ends[1]]) >= 0.0).all():
@@ -324,6 +334,12 @@ class SplitEngine:
             size = np.abs(step).max(initial=0.0) / (ends[1] - ends[0])
             if not np.isfinite(size):
                 break
+            if len(split.idle) and k < IDLE_ITERATIONS:
+                idle = times[split.idle] - self._step_idle(split, found, step)
+                bounds = np.array([ends[0], *times, ends[1]])
+                idle = np.clip(idle, bounds[split.idle], bounds[split.idle + 2])
+                size = max(size, np.abs(idle - times[split.idle]).max() / (ends[1] - ends[0]))
+                times[split.idle] = idle
             if size > CONVERGED:
                 times[split.guarded] -= step
             if size <= CLOSE:  # the next step is of the size of rounding
@@ -331,6 +347,13 @@ class SplitEngine:
                     found = split.engine.constrained(times, p, side, no_multipliers)
                 return (found if np.isfinite(found.cost) else None), times
         return None, times
+
+    def _step_idle(self, split: _Split, found: DenseEvaluation, step: FloatArray) -> FloatArray:
+        """Return the Newton steps of crossings that change nothing beside the `step` of the others."""
+        A, rows = found.jacobian, split.idle_guards
+        with np.errstate(all="ignore"):
+            own = found.constraints[rows] - A[np.ix_(rows, split.guarded)] @ step
+            return np.nan_to_num(own / A[rows, split.idle], posinf=0.0, neginf=0.0)  # it may be touched alone
 
     def _holds(self, split: _Split, times: FloatArray, p: FloatArray) -> bool:
         """Return whether the trajectory is inside its branches at the ends of all rows, and in dips between them."""

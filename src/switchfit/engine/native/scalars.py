@@ -525,6 +525,12 @@ class Template:
             results.append(rows.reshape((*rows.shape[:-1], *shape)))
         return results
 
+    @property
+    def has_equal_outputs(self) -> bool:
+        """Whether all outputs are the same operations of the same inputs."""
+        keys = [[v.index if isinstance(v, Node) else (v,) for v in values] for values in self._flat]
+        return all(each == keys[0] for each in keys)
+
     def list_long(self, only: Sequence[int]) -> list[Node]:
         """Return the operations that take long, functions of the C library, on which some outputs depend."""
         return [node for node in self._list_needed(tuple(only)) if node.op in LONG]
