@@ -465,16 +465,27 @@ class Course:
             found = self.evaluate(function, t0 + h * s, state_at(s), inside)
             return np.where(np.isfinite(found), found, np.inf)
 
+        def narrow(low: float, high: float, limits: FloatArray) -> tuple[float, float, NDArray[np.bool_]]:
+            """Return the first part of a grid at whose end a function is below its limit, and which of them are."""
+            s = np.linspace(low, high, GRID + 1)[1:]
+            passed = values_at(s) < limits
+            row = int(passed.any(axis=1).argmax())
+            return s[row - 1] if row else low, s[row], passed[row]
+
         # Three rounds of a grid narrow the first passage down to h / 16^3; one step of the secant method does the rest.
         low, high = 0.0, 1.0
         for _ in range(3):
-            s = np.linspace(low, high, GRID + 1)[1:]
-            passed = values_at(s) < limits
+            low, high, passed = narrow(low, high, limits)
             if not passed.any():
                 return None
-            row = int(passed.any(axis=1).argmax())
-            low, high = (s[row - 1] if row else low), s[row]
-        end = int(passed[row].argmax())
+        end = int(passed.argmax())
+        # The function has passed zero before its limit, where the trajectory is nearly a tangent far before it.
+        zero = np.where(np.arange(len(limits)) == end, 0.0, -np.inf)
+        if values_at(np.zeros(1))[0, end] > 0.0:
+            start = 0.0
+            for _ in range(3):
+                start, high, _ = narrow(start, high, zero)
+            low = start
         below, above = values_at(np.array([low, high]))[:, end]
         part = low + (high - low) * min(max(below / (below - above), 0.0), 1.0) if below > above else high
         return Crossing(t0 + h * float(part), state_at(np.array([part]))[0], end)

@@ -39,7 +39,12 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.runtime.errors import NotIntegrableError
 
-NEWTON_ITERATIONS = 8
+NEWTON_ITERATIONS, STEADY_ITERATIONS = 40, 8
+"""After the second number steps have to become shorter: they halve where a crossing is nearly a tangent."""
+
+GROWS, FALLEN = 4.0, 0.01
+"""Factor by which a Newton step grows although g is below this part of its largest value: g has no zero there, but a
+corner is touched, up to errors of the solver."""
 
 IDLE_ITERATIONS = 3
 """The same for crossings that change nothing: they may be tangents, and are where they are as far as `_holds` sees."""
@@ -92,6 +97,15 @@ class _Split(NamedTuple):
     own_constraints: NDArray[np.intp]
     guards: NDArray[np.intp]
     idle_guards: NDArray[np.intp]
+
+    def hold(self, touched: NDArray[np.bool_]) -> _Split:
+        """Return the same with some of the guarded crossings among the idle ones, at the times where they are."""
+        return self._replace(
+            guarded=self.guarded[~touched],
+            guards=self.guards[~touched],
+            idle=np.append(self.idle, self.guarded[touched]),
+            idle_guards=np.append(self.idle_guards, self.guards[touched]),
+        )
 
     @property
     def has_gauss_newton(self) -> bool:
@@ -249,13 +263,12 @@ class SplitEngine:
         # is needed.
         last = self._split or self._recall_path()
         if last is not None:
-            found, times = self._locate(last, tau, p, side)
-            if found is not None and self._holds(last, times, p):
+            split, found, times = self._locate(last, tau, p, side)
+            if found is not None and self._holds(split, times, p):
                 self._times = times
-                return last, found
+                return split, found
         with suppress(NotIntegrableError):
-            split = self._find_path(tau, p)
-            found, times = self._locate(split, tau, p, side)
+            split, found, times = self._locate(self._find_path(tau, p), tau, p, side)
             if found is not None:
                 self._times = times
                 return split, found
@@ -311,12 +324,13 @@ class SplitEngine:
 
     def _locate(
         self, split: _Split, tau: FloatArray, p: FloatArray, side: float
-    ) -> tuple[DenseEvaluation | None, FloatArray]:
+    ) -> tuple[_Split, DenseEvaluation | None, FloatArray]:
         """Find the times of the crossings by Newton's method from the last ones; the evaluation is None if there are
-        none.
+        none. Crossings that turn out to touch their corner alone are idle in the split that is returned.
         """
         ends, times = self._mesh.times[[0, -1]], self._move_own(split, tau)
         no_multipliers = np.zeros(sum(map(len, (split.guards, split.idle_guards, split.own_constraints))))
+        last, sizes, largest = np.inf, np.full(len(times), np.inf), np.zeros(len(times))
         for k in range(NEWTON_ITERATIONS):
             # A Newton step that changes the order of transitions leaves what the structure can say: the path is found
             # anew.
@@ -331,9 +345,20 @@ class SplitEngine:
                 step = np.linalg.solve(square, found.constraints[split.guards])
             except np.linalg.LinAlgError:
                 break
-            size = np.abs(step).max(initial=0.0) / (ends[1] - ends[0])
+            own, g = np.abs(step) / (ends[1] - ends[0]), np.abs(found.constraints[split.guards])
+            size = float(own.max(initial=0.0))
             if not np.isfinite(size):
                 break
+            largest[split.guarded] = np.maximum(largest[split.guarded], g)
+            grows = own > np.maximum(GROWS * sizes[split.guarded], CLOSE)
+            touched = grows & (g < FALLEN * largest[split.guarded])
+            if k >= IDLE_ITERATIONS and touched.any():
+                split = split.hold(touched)
+                continue
+            sizes[split.guarded] = own
+            if k >= STEADY_ITERATIONS and size > last:
+                break
+            last = size
             if len(split.idle) and k < IDLE_ITERATIONS:
                 idle = times[split.idle] - self._step_idle(split, found, step)
                 bounds = np.array([ends[0], *times, ends[1]])
@@ -345,10 +370,10 @@ class SplitEngine:
             if size <= CLOSE:  # the next step is of the size of rounding
                 if size > CONVERGED:
                     found = split.engine.constrained(times, p, side, no_multipliers)
-                return (found if np.isfinite(found.cost) else None), times
-        return None, times
+                return split, (found if np.isfinite(found.cost) else None), times
+        return split, None, times
 
-    def _step_idle(self, split: _Split, found: DenseEvaluation, step: FloatArray) -> FloatArray:
+    def _step_idle(self, split: _Split, found: DenseEvaluation, step: NDArray[Any]) -> NDArray[Any]:
         """Return the Newton steps of crossings that change nothing beside the `step` of the others."""
         A, rows = found.jacobian, split.idle_guards
         with np.errstate(all="ignore"):
