@@ -167,6 +167,7 @@ class SplitEngine:
         if split is None:
             return found
         at = self._times, p, side
+        found = split.engine.constrained(*at, np.zeros(len(found.constraints)))
         if split.has_gauss_newton and matrix == "exact":  # asked for all the same
             structure = replace(split.structure, has_rough_hessian=False)
             split = split._replace(structure=structure, engine=self._build_engine(structure))
@@ -188,6 +189,7 @@ class SplitEngine:
         split, found = self._solve(tau, p, side, len(multipliers))
         if split is None:
             return found
+        found = split.engine.constrained(self._times, p, side, np.zeros(len(found.constraints)))
         T, every_multiplier = self._eliminate(split, found, multipliers)
         second = split.engine.constrained(self._times, p, side, every_multiplier).hessian
         c, A = found.constraints[split.own_constraints], found.jacobian[split.own_constraints] @ T
@@ -198,6 +200,7 @@ class SplitEngine:
         split, found = self._solve(tau, p, 1.0)
         if split is None:
             raise NotIntegrableError(LOST)
+        found = split.engine.constrained(self._times, p, 1.0, np.zeros(len(found.constraints)))
         inner = split.engine.costates(self._times, p, self._eliminate(split, found, multipliers)[1])
         # psi of a branch that slides holds along its corners alone: the trajectory comes back to these.
         psi, course = inner.costates.copy(), Course(self._branches, self._structure, self._arguments, p)
@@ -255,7 +258,7 @@ class SplitEngine:
         return T, every
 
     def _solve(self, tau: FloatArray, p: FloatArray, side: float, m: int = 0) -> tuple[_Split | None, DenseEvaluation]:
-        """Return the path at a theta, and J and the constraints with their derivatives there, and keep its times.
+        """Return the path at a theta, J, and the constraints with their derivatives there, and keep its times.
 
         If the trajectory cannot be followed, J and m constraints are NaN and there is no path.
         """
@@ -329,14 +332,13 @@ class SplitEngine:
         none. Crossings that turn out to touch their corner alone are idle in the split that is returned.
         """
         ends, times = self._mesh.times[[0, -1]], self._move_own(split, tau)
-        no_multipliers = np.zeros(sum(map(len, (split.guards, split.idle_guards, split.own_constraints))))
         last, sizes, largest = np.inf, np.full(len(times), np.inf), np.zeros(len(times))
         for k in range(NEWTON_ITERATIONS):
             # A Newton step that changes the order of transitions leaves what the structure can say: the path is found
             # anew.
             if not (np.diff([ends[0], *times, ends[1]]) >= 0.0).all():
                 break
-            found = split.engine.constrained(times, p, side, no_multipliers)
+            found = split.engine.find_constraints(times, p, side)
             # J may be no number yet: sqrt(x) of the branch behind a crossing that is a little too early. What ends the
             # branch before it, and its derivatives, are numbers all the same.
             try:
@@ -369,7 +371,7 @@ class SplitEngine:
                 times[split.guarded] -= step
             if size <= CLOSE:  # the next step is of the size of rounding
                 if size > CONVERGED:
-                    found = split.engine.constrained(times, p, side, no_multipliers)
+                    found = split.engine.find_constraints(times, p, side)
                 return split, (found if np.isfinite(found.cost) else None), times
         return split, None, times
 

@@ -326,6 +326,11 @@ class JaxEngine:
         J, slope, H, c, A = map(np.array, found)
         return Evaluation(float(J), slope - multipliers @ A, H, c, A)
 
+    def find_constraints(self, tau: FloatArray, p: FloatArray, side: float) -> DenseEvaluation:
+        """Return J and the constraints with their derivatives, and those of J."""
+        count = len(self._structure.guarded) + self._structure.terminal_constraint_count
+        return self.constrained(tau, p, side, np.zeros(count))
+
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
         found = self._run(differentiate_in_states, tau, p, multipliers)

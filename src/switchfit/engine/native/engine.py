@@ -234,6 +234,14 @@ class NativeExperiment:
             c, A = self._named["constraints"][where], self._spread(self._jacobian[where])
             return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A, self._read_errors())
 
+    def find_constraints(self, tau: FloatArray, p: FloatArray, side: float) -> DenseEvaluation:
+        """Return J and the constraints with their derivatives; those of J are of no meaning."""
+        self._named["modes"][-1] = -2
+        try:
+            return self(tau, p, side, np.zeros(len(self._constraint_rows)))
+        finally:
+            self._named["modes"][-1] = self._judged
+
     def judge_rows(self, *, jumps: bool) -> None:
         """Estimate the errors of rows in all evaluations with second derivatives; look for `jumps` of f inside, too."""
         self._judged = self._named["modes"][-1] = 1 + jumps
@@ -531,6 +539,11 @@ class NativeEngine:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         given = tau, p, side, multipliers
         return self._try(self._second, NativeExperiment.__call__, self.fallback.constrained, *given)
+
+    def find_constraints(self, tau: FloatArray, p: FloatArray, side: float) -> DenseEvaluation:
+        """Return J and the constraints with their derivatives; those of J are of no meaning."""
+        given = tau, p, side
+        return self._try(self._second, NativeExperiment.find_constraints, self.fallback.find_constraints, *given)
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""

@@ -534,9 +534,11 @@ def write_evaluation(writer: Writer) -> str:
     for name in ["end"] * bool(library.terminal) + ["end_constraint"] * bool(library.terminal_constraints):
         writer.call(name, given)
     if writer.order > Order.COST:
-        with writer.loop(0, N + 1) as turn:
-            writer.invoke("backward", table, N - turn)
-        writer.call("start_back", found)
+        # Behind the modes: -2 where J, the constraints and their derivatives are all that is asked for.
+        with writer.when(writer.get("i64", found["modes"], N + 1) > -2):
+            with writer.loop(0, N + 1) as turn:
+                writer.invoke("backward", table, N - turn)
+            writer.call("start_back", found)
     return writer.end()
 
 
