@@ -97,11 +97,15 @@ def solve_adaptively(run: Run, theta: FloatArray, settings: Settings = Settings(
             if run.path is not None:  # a trial far from the guess
                 raise
             # Too many crossings at the guess: once more without following them, with short steps at each corner.
-            run.branches = None
+            known, run.branches = run.branches, None
             try:
                 return _Solve(run, run.structure, run.coarse, settings)(tau, p)
-            except NotIntegrableError as stuck:  # for it switches ever faster
-                raise error from stuck
+            except NotIntegrableError as stuck:  # for it rests, or switches ever faster
+                run.branches = known
+                if known.most == branches.MOST_AT_GUESS:
+                    raise error from stuck
+                known.most = branches.MOST_AT_GUESS
+                return solve_adaptively(run, theta, settings)
     return _Solve(run, run.structure, run.coarse, settings)(tau, p)
 
 
@@ -229,6 +233,7 @@ class _Solve:
         self, run: Run, structure: Structure, coarse: Mesh, settings: Settings, course: Course | None = None
     ) -> None:
         self._problem, self._structure, self._coarse, self._course = run.problem, run.structure, coarse, course
+        self._library = structure
         self._experiment, self._settings, self._watch = run.experiment, settings, settings.watch or Watch()
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
@@ -405,7 +410,7 @@ class _Solve:
 
     def _build_slope(self, stretch: _Stretch, mode: int) -> Slope:
         """Return the slope of a mode of the library by JAX; it raises where it is not finite."""
-        functions = self._structure.functions
+        functions = self._library.functions
         functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
         times, start, end = self._coarse.times, stretch.start, stretch.end
         first, last = np.nextafter(start, end), np.nextafter(end, start)
@@ -440,7 +445,7 @@ class _Solve:
         self, mode: int, t: float, x: FloatArray, value: FloatArray, piece: Piece
     ) -> NotIntegrableError:
         """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
-        name = self._structure.mode_names[mode]
+        name = self._library.mode_names[mode]
         if np.isfinite(value[:-1]).all():
             what, operation = f"a running cost in mode {name!r} returned {value[-1]}", ""
         else:
@@ -452,7 +457,7 @@ class _Solve:
 
     def _find_operation(self, mode: int, t: float, x: FloatArray, piece: Piece) -> str:
         """Return which operation of the mode is not finite at t and x (n,), " (log at tank.py:5)"; empty if all are."""
-        model, function = Model(self._structure, self._arguments), self._structure.modes[mode]
+        model, function = Model(self._library, self._arguments), self._library.modes[mode]
         points = t, x, *model.inputs(function, t, piece)  # type: ignore[arg-type]  # of NumPy
         parameters = model.parameters(self._p)  # type: ignore[arg-type]
         found = find_undefined(function, [np.asarray(a)[None] for a in points], parameters, derivatives=False)

@@ -32,8 +32,9 @@ from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.structure import Structure
 from switchfit.runtime.errors import NotIntegrableError
 
-MOST_CROSSINGS = 48
-"""Largest number of crossings that are unknowns of a structure: the time of an evaluation grows with their square."""
+MOST_CROSSINGS, MOST_AT_GUESS = 48, 128
+"""Largest number of crossings that are unknowns of a structure: the time of an evaluation grows with their square, and
+programs take ten seconds to compile above the first number, which holds unless the trajectory of a guess has more."""
 
 FEW_CORNERS = 2
 """Largest number of corners of a mode for which the ends of a branch are compiled with it, passed or not."""
@@ -90,11 +91,13 @@ class Path(NamedTuple):
     sides : for each segment the sides of its branches, one after the other
     ends : for each segment which end of a branch each crossing is; -1 at a known time, as where an input jumps
     times : (K,), of all crossings
+    scales : (K,), the largest size so far of the function that is zero at each
     """
 
     sides: tuple[tuple[Sides, ...], ...]
     ends: tuple[tuple[int, ...], ...]
     times: FloatArray
+    scales: FloatArray
 
 
 class Branches:
@@ -105,9 +108,12 @@ class Branches:
     Attributes
     ----------
     corners : list of Corners, of each mode
+    most : int
+        Largest number of crossings of a path.
     """
 
     def __init__(self, structure: Structure) -> None:
+        self.most = MOST_CROSSINGS
         self.corners = [find_corners(mode) for mode in structure.modes]
         self._modes: dict[tuple[int, Sides], None] = {}
         self._guards: dict[Function, None] = {}
@@ -133,8 +139,9 @@ class Branches:
                 every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
                 self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
-            # A power of two: programs are compiled for a number of transitions, and a few more crossings fit.
-            self._room = 1 << (len(path.times) + 1).bit_length()  # and some more at another theta
+            # Programs are compiled for a number of transitions: a few more crossings fit, as at another theta.
+            room = len(path.times) + 2
+            self._room = 1 << (room - 1).bit_length() if room <= 32 else -(-room // 16) * 16
 
     def make_steep(self, mode: int, margins: Mapping[tuple[int, int], float]) -> None:
         """Make corners of a mode steep on a side, with their margins; programs of its branches are of no use."""
@@ -170,7 +177,7 @@ class Branches:
         known = self._list(structure)
         # For the functions alone, any branch serves as the mode of all segments.
         if path is None:
-            path = Path((known[0][1:],) * (structure.N + 1), ((),) * (structure.N + 1), np.zeros(0))
+            path = Path((known[0][1:],) * (structure.N + 1), ((),) * (structure.N + 1), np.zeros(0), np.zeros(0))
             structure = replace(structure, mode_of_segment=(known[0][0],) * (structure.N + 1))
         modes: list[int] = []
         found: list[tuple[Any, Any, Any]] = []  # guard, reset map and cost of each transition
@@ -283,6 +290,7 @@ class Course:
         self._sides: list[list[Sides]] = []
         self._ends: list[list[int]] = []
         self._times: list[float] = []
+        self._scales: list[float] = []
         self._mode, self._scale = 0, np.zeros(0)
         self._largest: FloatArray | float = smallest
         self._last: FloatArray | None = None
@@ -291,7 +299,8 @@ class Course:
     @property
     def path(self) -> Path:
         """The path so far."""
-        return Path(tuple(map(tuple, self._sides)), tuple(map(tuple, self._ends)), np.array(self._times))
+        times, scales = np.array(self._times), np.array(self._scales)
+        return Path(tuple(map(tuple, self._sides)), tuple(map(tuple, self._ends)), times, scales)
 
     @property
     def sides(self) -> Sides:
@@ -358,15 +367,22 @@ class Course:
         behind = (*self.sides[:k], side, *self.sides[k + 1 :])
         drift = np.abs(self.evaluate(self.corners.surfaces(self.sides), t, x, inside))
         after = self._choose(behind, t, x, inside, np.where(np.array(self.sides) == 0, drift, drift[k]))
-        self._add(t, end, behind if after == self.sides else after)
+        if after == self.sides:
+            # Its rate is too small to lead anywhere: the trajectory slides if the field behind the end leads back.
+            leads_back = side * self.evaluate(self.corners.rates(behind), t, x, inside)[k] < 0
+            may_rest = self.sides[k] != 0 and self.sides.count(0) < MOST_SLIDING and not self._is_steep(k)
+            after = (*behind[:k], 0, *behind[k + 1 :]) if leads_back and may_rest else behind
+        self._add(t, end, after)
 
     def _add(self, t: float, end: int, after: Sides) -> None:
-        if len(self._times) == MOST_CROSSINGS:
+        if len(self._times) >= self.branches.most:
             raise TooManyCrossingsError(
                 f"mode {self._structure.mode_names[self._mode]!r} passes corners of the state ({self._list_lines()}) "
-                f"more than {MOST_CROSSINGS} times up to t = {t:.6g}: use a better guess, make them modes, or give "
+                f"more than {self.branches.most} times up to t = {t:.6g}: use a better guess, make them modes, or give "
                 "them a dead band if they switch ever faster."
             )
+        k, _ = self.corners.list_ends(self.sides)[end]
+        self._scales.append(1.0 if self.sides[k] == 0 else float(self._scale[k]))
         self._times.append(t)
         self._ends[-1].append(end)
         self._sides[-1].append(after)

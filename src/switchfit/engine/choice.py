@@ -42,9 +42,8 @@ from switchfit.runtime.errors import NotIntegrableError
 NEWTON_ITERATIONS, STEADY_ITERATIONS = 40, 8
 """After the second number steps have to become shorter: they halve where a crossing is nearly a tangent."""
 
-GROWS, FALLEN = 4.0, 0.01
-"""Factor by which a Newton step grows although g is below this part of its largest value: g has no zero there, but a
-corner is touched, up to errors of the solver."""
+TURNS = 0.25
+"""Part of the last dg/dsigma below which the next one is beside an extremum of g: it halves at a tangent."""
 
 IDLE_ITERATIONS = 3
 """The same for crossings that change nothing: they may be tangents, and are where they are as far as `_holds` sees."""
@@ -332,7 +331,9 @@ class SplitEngine:
         none. Crossings that turn out to touch their corner alone are idle in the split that is returned.
         """
         ends, times = self._mesh.times[[0, -1]], self._move_own(split, tau)
-        last, sizes, largest = np.inf, np.full(len(times), np.inf), np.zeros(len(times))
+        most, last, previous = np.zeros(len(times)), np.inf, times.copy()
+        most[split.crossings] = MAY_END * split.path.scales
+        slopes, values, idle = np.zeros(len(times)), np.full(len(times), np.inf), split.idle
         for k in range(NEWTON_ITERATIONS):
             # A Newton step that changes the order of transitions leaves what the structure can say: the path is found
             # anew.
@@ -351,22 +352,25 @@ class SplitEngine:
             size = float(own.max(initial=0.0))
             if not np.isfinite(size):
                 break
-            largest[split.guarded] = np.maximum(largest[split.guarded], g)
-            grows = own > np.maximum(GROWS * sizes[split.guarded], CLOSE)
-            touched = grows & (g < FALLEN * largest[split.guarded])
-            if k >= IDLE_ITERATIONS and touched.any():
+            # Where g is all but zero and has no zero, the corner is touched, up to errors of the solver.
+            slope, before, where = square.diagonal(), values[split.guarded], split.guarded
+            turned = slope * slopes[where] < TURNS * slopes[where] ** 2
+            touched = turned & (own > CLOSE) & (np.minimum(g, before) <= most[where])
+            if touched.any():
+                back = where[touched & (before < g)]
+                times[back] = previous[back]
                 split = split.hold(touched)
                 continue
-            sizes[split.guarded] = own
+            slopes[where], values[where], previous = slope, g, times.copy()
             if k >= STEADY_ITERATIONS and size > last:
                 break
             last = size
-            if len(split.idle) and k < IDLE_ITERATIONS:
-                idle = times[split.idle] - self._step_idle(split, found, step)
+            if len(idle) and k < IDLE_ITERATIONS:
                 bounds = np.array([ends[0], *times, ends[1]])
-                idle = np.clip(idle, bounds[split.idle], bounds[split.idle + 2])
-                size = max(size, np.abs(idle - times[split.idle]).max() / (ends[1] - ends[0]))
-                times[split.idle] = idle
+                moved = times[idle] - self._step_idle(split, found, step)[: len(idle)]
+                moved = np.clip(moved, bounds[idle], bounds[idle + 2])
+                size = max(size, np.abs(moved - times[idle]).max() / (ends[1] - ends[0]))
+                times[idle] = moved
             if size > CONVERGED:
                 times[split.guarded] -= step
             if size <= CLOSE:  # the next step is of the size of rounding
