@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.fit.trajectory import Comparison, Trajectory, find_delay
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
@@ -357,7 +357,8 @@ def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_
     about_zero : bool, optional
         Draw them about the zero of the residuals, since about the curve they are often too narrow to be seen.
     """
-    order, limits = np.argsort(prediction.times, kind="stable"), ax.get_ylim()
+    e, order, limits = prediction.experiment, np.argsort(prediction.times, kind="stable"), ax.get_ylim()
+    late = find_delay(list_outputs(prediction.fit, e)[k][0], prediction.fit.trajectories[e])
     bands = [
         ("prediction", prediction.prediction_band(level), 0.12),
         ("confidence", prediction.output_band(level), 0.3),
@@ -367,7 +368,7 @@ def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_
     for kind, ends, alpha in bands:
         band = (ends[:, k] - (prediction.outputs[:, [k]] if about_zero else 0.0))[order]
         widened = ", widened" if prediction.corrected and kind == "confidence" else ""
-        plot_band(prediction.times[order], band, ax, alpha=alpha, label=f"{100 * level:g} % {kind}{widened}")
+        plot_band(prediction.times[order] + late, band, ax, alpha=alpha, label=f"{100 * level:g} % {kind}{widened}")
         if about_zero and np.isfinite(band).any():
             reach = 1.1 * np.nanmax(np.abs(band))
             limits = min(limits[0], -reach), max(limits[1], reach)
