@@ -300,11 +300,12 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
             bar: dict[str, Any] = {"color": colours[mode], "edgecolor": TRANSITION, "linewidth": THIN / 2}
             ax.barh(row, end - begin, 0.7, begin, label="" if fits else mode, **bar)
             if fits:
-                ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
+                ax.text((begin + end) / 2, row - 0.15, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
         for low, high in find_transition_intervals(estimate, e, level).tolist():
             if np.isfinite(high - low):
-                look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
-                ax.plot([low, high], [row, row], "|-", label=f"transition time, {100 * level:g} % interval", **look)
+                look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 7, "zorder": 4}
+                look["label"] = f"transition time, {100 * level:g} % interval"
+                ax.plot([low, high], [row + 0.2] * 2, "|-", **look)
     style.label_axis(ax, trajectories[0])
     ax.set_xlim(first, last)
     ax.set_ylim(len(runs) - 0.5, -0.5)
