@@ -63,10 +63,10 @@ def curve(
     parameters: Mapping[str, Any],
     *,
     tf: float,
-    sigma: Any = None,
+    **settings: Any,
 ) -> sf.Problem:
-    """Fit ``observe(t, x, p)`` on [0, tf] to samples of it, with no dynamics behind it."""
-    data = sf.Measurements(times, values, observe=observe, sigma=sigma)
+    """Fit ``observe(t, x, p)`` on [0, tf] to samples of it, with no dynamics behind it; `settings` of Measurements."""
+    data = sf.Measurements(times, values, observe=observe, **settings)
     return sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, tf), parameters)
 
 

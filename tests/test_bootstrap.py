@@ -161,6 +161,23 @@ REFUSED = {
 }
 
 
+NO_LEAST_SQUARES = {
+    "prior": ({"m": sf.Parameter(1.0, prior=sf.Normal(1.0, 1.0))}, {"sigma": 1.0}),
+    "sigma": ({"m": 1.0, "s": sf.Parameter(1.0, lower=0.1)}, {"sigma": "s"}),
+    "delay": ({"m": 1.0, "d": sf.Parameter(0.01, lower=0.0, upper=0.05)}, {"sigma": 1.0, "delay": "d"}),
+    "loss": ({"m": 1.0}, {"sigma": 1.0, "loss": "huber"}),
+}
+
+
+@pytest.mark.parametrize("what", NO_LEAST_SQUARES)
+def test_only_least_squares_are_resampled(what):
+    """Draws of the residuals of anything else have another spread than the estimates: sf.monte_carlo is advised."""
+    parameters, settings = NO_LEAST_SQUARES[what]
+    fit = sf.estimate(curve(level, TIMES, skewed(), parameters, tf=4.0, **settings))
+    with pytest.raises(ValueError, match=rf"least squares alone.* {what}.*sf\.monte_carlo"):
+        sf.bootstrap(fit, 5)
+
+
 @pytest.mark.parametrize("message", REFUSED)
 def test_what_is_refused(message):
     with pytest.raises((TypeError, ValueError), match=message):

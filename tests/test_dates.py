@@ -397,6 +397,14 @@ def test_ticks_of_any_span(span):
     assert ax.format_coord(0.0, 0.0).count("2020-03-28 12:00:00") == 1
 
 
+@pytest.mark.parametrize("span", [90.0, 3600.0, 10_000.0])
+@pytest.mark.parametrize("day", ["2026-03-29", "2026-10-25"])
+def test_ticks_of_a_short_axis_pass_over_the_change_to_and_from_summer_time(day, span):
+    locators = (DateLocator(Origin(f"{own}T00:59:30", "Europe/Berlin"), "s") for own in (day, "2026-06-10"))
+    changing, usual = (locator.tick_values(0.0, span) for locator in locators)
+    np.testing.assert_allclose(changing, usual, atol=1e-3)
+
+
 def test_profiles_residuals_and_many_fits_show_dates(fits):
     dated, _ = fits
     profile, study = dated.profile("tau_1"), sf.bootstrap(dated, 40)

@@ -143,6 +143,14 @@ def test_which_column_has_the_times(write, header, times):
     np.testing.assert_array_equal(log.times, 10 * times + np.arange(3))
 
 
+@pytest.mark.parametrize("rows", ["2026-03-29T01:59:30Z 2026-03-29T01:59:32Z", "29.03.2026 30.03.2026", "23:59 24:00"])
+def test_a_first_column_of_dates_that_rise_has_the_times(write, rows):
+    first, last = rows.split()
+    assert sf.read_log(write(f"Zeitstempel;x\n{first};1\n{last};2\n")).time_name == "Zeitstempel"
+    with pytest.raises(InputError, match=r"no column is called time; .*or call it time in the file"):
+        sf.read_log(write(f"Zeitstempel;x\n{last};1\n{first};2\n"))
+
+
 def test_a_channel_that_is_asked_for_is_a_temperature(write):
     path = write("run,T,y\n0,20,5\n1,19,6\n2,21,7\n")
     log = sf.read_log(path, columns=["T"])

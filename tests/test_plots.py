@@ -186,6 +186,21 @@ def test_figures_of_several_panels(heater, starts):
         assert figure._repr_png_()[:4] == b"\x89PNG"
 
 
+def test_an_interval_that_is_far_longer_than_the_others_is_cut_off(heater):
+    fits = sf.estimate_many([heater.problem] * 3)
+    far = np.array([1.0, 1.0, 1e160])[:, None, None]
+    left, right = replace(fits, covariance=fits.covariance * far).plot().axes[1].get_xlim()
+    assert left < fits.confidence_intervals()[0, 1, 0] + 1e-9
+    assert right - left == pytest.approx(np.ptp(fits.confidence_intervals()[0, 1]), rel=0.2)
+
+
+def test_a_marker_covers_no_name_in_the_timeline(heater):
+    ax = heater.plot_timeline().axes[0]
+    ax.figure.draw_without_rendering()
+    (marker,) = ax.lines
+    assert all(marker.get_window_extent().y1 < text.get_window_extent().y0 for text in ax.texts)
+
+
 def test_names_with_dollars_are_no_formulas():
     figure = Figure()
     name, tick = figure.text(0.1, 0.1, "price $k$ of $m$"), figure.text(0.2, 0.2, r"$\mathdefault{10^{1}}$")

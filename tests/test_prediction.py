@@ -223,3 +223,18 @@ def test_bands_in_the_figure_with_each_transition_twice(fitted):
     assert top == pytest.approx(found.output_band().max(), rel=1e-9)
     for without in (fitted.plot(bands=False), replace(fitted, problem=None).plot()):
         assert not without.axes[0].collections
+
+
+@pytest.mark.parametrize("delay", [0.25, "late"])
+def test_bands_and_sigma_of_a_late_sensor_are_at_its_stamps(delay):
+    sigma, late = np.where(TIMES < 3.1, 0.1, 0.2)[:, None], {"late": sf.Parameter(0.2, lower=0.0, upper=0.25)}
+    data = sf.Measurements(TIMES, temperature(TIMES - 0.25, 2.1, 1.0, 0.4), sigma=sigma, names=("T",), delay=delay)
+    run = sf.Experiment(data, ("on", "off"), (2.1,), 0.0, 6.0)
+    fit = sf.estimate(sf.Problem(ROOM, run, {"power": 1.0, "k": 0.4} | (late if delay == "late" else {})))
+    assert fit.predict([2.9]).noise.tolist() == [[0.2]]  # the sample nearest to 3.15
+    for figure in (fit.plot(), fit.predict().plot()):
+        curve = next(line for line in figure.axes[0].lines if line.get_label() in {"fitted", "predicted"})
+        for band in figure.axes[0].collections:
+            assert (
+                band.get_datalim(figure.axes[0].transData).x0 == pytest.approx(0.25, rel=1e-3) == curve.get_xdata()[0]
+            )

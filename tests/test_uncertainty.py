@@ -161,6 +161,8 @@ def test_where_the_valley_bends_the_change_is_shortened():
     quadratic = 0.5 * direction.change @ H @ direction.change
     assert quadratic < 0.5
     assert f"raises J by {max(direction.rises):.2g} ({max(direction.rises):.2g} %); 1 % of J is 1" in one_line(found)
+    rounded = replace(found, directions=(replace(direction, rises=(-3e-13, -4e-13)),))
+    assert "raises J by 0 (0 %)" in one_line(rounded)
 
 
 def test_before_a_fit_without_sigma_and_without_measurements():

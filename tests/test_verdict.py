@@ -232,6 +232,17 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     assert (near.verdict.level != "good", "next: more starts" in steps(near)) == (True, True)
 
 
+def test_what_a_robust_loss_weighs_down_of_a_wrong_model_counts_as_unexplained():
+    """Nearly half of the samples are far from the line, and few of the others near it."""
+    values = 10 * LINE + noise(0.1) + np.where(TIMES > 6.0, 3 * np.sin(5 * TIMES), 0.2 * WAVE)
+    posed = curve(line, TIMES, values, {"a": 20.0, "b": 5.0}, tf=10.0, sigma=0.1, loss="cauchy", loss_scale=2.5)
+    fit = sf.estimate(posed, strategy="local")
+    assert 0.4 < np.mean(fit.comparisons[0][0].downweighted) < 0.5
+    assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["model suspected"])
+    assert "explains 99.11 %" in str(fit.verdict)
+    assert IS_WRONG in str(fit.verdict)
+
+
 # --- corrected standard errors ----------------------------------------------------------------------------------------
 
 

@@ -509,8 +509,9 @@ def bootstrap(
     TypeError
         If this is no estimate, or an argument is of the wrong type.
     ValueError
-        For an estimate that has no problem or did not converge, data that cannot be resampled, fewer than two
-        experiments for "runs", or a folder that holds something else.
+        For an estimate that has no problem or did not converge, data that cannot be resampled, a robust loss, a prior,
+        a sigma or a delay that is a parameter, fewer than two experiments for "runs", or a folder that holds something
+        else.
 
     See Also
     --------
@@ -564,7 +565,7 @@ def _check_data(problem: Problem) -> None:
     for item in (item for experiment in problem.experiments for item in experiment.data):
         if not isinstance(item, Measurements):
             raise ValueError(f"a bootstrap resamples Measurements; this problem has a {type(item).__name__} as well.")
-    if not problem.is_least_squares and problem.has_plain_samples:
+    if not (problem.is_least_squares and problem.has_plain_samples):
         raise ValueError(
             "a bootstrap takes least squares alone: no sigma and no delay that is a parameter, no robust loss and no "
             "prior. sf.monte_carlo draws from the noise that was fitted."

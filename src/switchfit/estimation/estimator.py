@@ -284,7 +284,7 @@ class Estimate(Fit, Tabular, Displayed):
             raise ValueError(
                 "The sandwich covariance needs the gradient of each sample: the problem, with a cost of Measurements "
                 "alone, without guards, terminal constraints, priors, and parameters that are a sigma or a delay, and "
-                "with more values than free unknowns. Use hessian='exact', or sf.bootstrap."
+                "with more values than free unknowns. Use hessian='exact', or sf.profile."
             )
         # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1, B = scores' scores
         scores = collect_sample_derivatives(self.problem, self.sensitivities).scores

@@ -172,6 +172,18 @@ class Comparison:
         return np.sqrt(squares.sum(0) / np.where(known.any(0), known.sum(0), np.nan))
 
 
+def find_delay(comparison: Comparison, trajectory: Trajectory) -> float:
+    """Return by how much the samples of a comparison are late: they see the state of an earlier time.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    trajectory : Trajectory
+        Of its experiment.
+    """
+    return float(comparison.curve_times[0] - trajectory.times[0])
+
+
 def simulate(
     problem: Problem,
     theta: ArrayLike | None = None,

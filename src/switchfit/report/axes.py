@@ -83,6 +83,9 @@ OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
 """Of years, months, days, hours, minutes and seconds, for ticks, for those where a larger unit begins, and for what
 all of them leave out."""
 
+SHORT = 0.25
+"""Days of an axis from which on its ticks may begin at another hour of the clock. On shorter ones the change to summer
+time is no hour that passes, which matplotlib takes it for."""
 LONGEST = 1000 * 365.25
 """Days from 1970 that an axis may reach."""
 
@@ -113,7 +116,10 @@ class DateLocator(Locator):
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the ticks between two times."""
         days = np.clip(self.to_days([vmin, vmax]), -LONGEST, LONGEST)
-        ticks = self.dates.tick_values(*num2date(np.sort(days), tz=self.zone))
+        zone = self.zone
+        if np.ptp(days) < SHORT:
+            zone = datetime.timezone(num2date(days[0], tz=zone).utcoffset() or datetime.timedelta())
+        ticks = self.dates.tick_values(*num2date(np.sort(days), tz=zone))
         return ((np.asarray(ticks) - self.start) / self.length).tolist()
 
 

@@ -33,6 +33,10 @@ LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
 """Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
 
+FARTHEST = 30.0
+"""Length of one side of an interval, in the median of all, beyond which a figure cuts it off: a parameter on a
+logarithmic scale that is not determined has an end of 1e166."""
+
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
@@ -213,6 +217,13 @@ def draw_rows(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> None:
         if here.any():
             ax.hlines(rows[here], *intervals[here].T, color=colour, linewidth=LINE, alpha=0.6)
             ax.scatter(fits.theta[order[here], k], rows[here], s=18, color=colour, label=level, zorder=2)
+    theta = fits.theta[order, k, None]
+    size = np.abs(intervals - theta)
+    known = size[(size > 0) & (size < np.inf)]
+    if len(known) and known.max() > (most := FARTHEST * np.median(known)):
+        near = np.where(size <= most, intervals, theta)
+        margin = 0.05 * (np.nanmax(near) - np.nanmin(near))
+        ax.set_xlim(np.nanmin(near) - margin, np.nanmax(near) + margin)
     ax.grid(axis="x", linewidth=THIN / 2, alpha=0.6)
     ax.set_yticks(rows, [str(run) for run in fits.runs[order]])
     ax.set_ylabel("run")

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.fit.trajectory import Comparison, Trajectory, find_delay
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
@@ -300,11 +300,12 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
             bar: dict[str, Any] = {"color": colours[mode], "edgecolor": TRANSITION, "linewidth": THIN / 2}
             ax.barh(row, end - begin, 0.7, begin, label="" if fits else mode, **bar)
             if fits:
-                ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
+                ax.text((begin + end) / 2, row - 0.15, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
         for low, high in find_transition_intervals(estimate, e, level).tolist():
             if np.isfinite(high - low):
-                look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
-                ax.plot([low, high], [row, row], "|-", label=f"transition time, {100 * level:g} % interval", **look)
+                look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 7, "zorder": 4}
+                look["label"] = f"transition time, {100 * level:g} % interval"
+                ax.plot([low, high], [row + 0.2] * 2, "|-", **look)
     style.label_axis(ax, trajectories[0])
     ax.set_xlim(first, last)
     ax.set_ylim(len(runs) - 0.5, -0.5)
@@ -357,7 +358,8 @@ def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_
     about_zero : bool, optional
         Draw them about the zero of the residuals, since about the curve they are often too narrow to be seen.
     """
-    order, limits = np.argsort(prediction.times, kind="stable"), ax.get_ylim()
+    e, order, limits = prediction.experiment, np.argsort(prediction.times, kind="stable"), ax.get_ylim()
+    late = find_delay(list_outputs(prediction.fit, e)[k][0], prediction.fit.trajectories[e])
     bands = [
         ("prediction", prediction.prediction_band(level), 0.12),
         ("confidence", prediction.output_band(level), 0.3),
@@ -367,7 +369,7 @@ def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_
     for kind, ends, alpha in bands:
         band = (ends[:, k] - (prediction.outputs[:, [k]] if about_zero else 0.0))[order]
         widened = ", widened" if prediction.corrected and kind == "confidence" else ""
-        plot_band(prediction.times[order], band, ax, alpha=alpha, label=f"{100 * level:g} % {kind}{widened}")
+        plot_band(prediction.times[order] + late, band, ax, alpha=alpha, label=f"{100 * level:g} % {kind}{widened}")
         if about_zero and np.isfinite(band).any():
             reach = 1.1 * np.nanmax(np.abs(band))
             limits = min(limits[0], -reach), max(limits[1], reach)

@@ -20,6 +20,8 @@ from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostic
 
 LEVELS = (0.683, 0.95, 0.99)
 """Levels whose thresholds the figure of a profile shows, up to the level of the profile."""
+ROUNDING = 1e-12
+"""Rise of J, relative to J, that is rounding."""
 LARGEST_FIGURE = 10
 """Largest number of channels in one figure."""
 
@@ -185,7 +187,7 @@ def _format_rises(direction: Direction, rise: str, cost: float) -> str:
     finite = [r for r in direction.rises if np.isfinite(r)]
     if not finite:
         return ": J could not be evaluated there."
-    worst = max(finite)
+    worst = 0.0 if abs(max(finite)) <= ROUNDING * abs(cost) else max(finite)
     related = np.isfinite(cost) and abs(worst) < 10 * abs(cost)  # a ratio to a J near 0 means nothing
     relative = f" ({100 * worst / abs(cost):.2g} %)" if related else ""
     both = ", or the opposite," if len(finite) == 2 else ""

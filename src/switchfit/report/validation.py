@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from switchfit.experiment_design import Design
+from switchfit.fit.trajectory import find_delay
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import formats, plot, style
@@ -38,7 +39,8 @@ def plot_prediction(prediction: Prediction, *, level: float = 0.95) -> Figure:
     axes = figure.subplots(len(outputs), 1, sharex=True, squeeze=False)[:, 0]
     for number, ((comparison, k), ax) in enumerate(zip(outputs, axes, strict=True)):
         plot.plot_bands(prediction, number, level, ax)
-        ax.plot(times, values[order, number], "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
+        late = find_delay(comparison, trajectory)
+        ax.plot(times + late, values[order, number], "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
         plot.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
         plot.plot_modes(trajectory, ax, labels=ax is axes[0])
         if times[-1] > end:

@@ -42,7 +42,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents, runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import read_times, select_visible
+from switchfit.fit.trajectory import find_delay, read_times, select_visible
 from switchfit.problem.data import FloatArray, influence
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import show_time
@@ -395,6 +395,9 @@ def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:
 def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
     """Return states and outputs at any times with their standard errors and bands.
 
+    Times are those of the states: a sensor with a delay shows the output of time t at t + delay, where figures draw it.
+    The bands leave out that an estimated delay is uncertain.
+
     Parameters
     ----------
     estimate : Estimate
@@ -520,7 +523,7 @@ def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatAr
     for item, comparison in zip(problem.experiments[e].measurements, fit.comparisons[e], strict=True):
         sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
         halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
-        columns.append(sigma[np.searchsorted(halfway, times)])
+        columns.append(sigma[np.searchsorted(halfway, times + find_delay(comparison, fit.trajectories[e]))])
     return np.concatenate(columns, axis=1)
 
 

@@ -15,8 +15,8 @@ How well a fit explains its data: share of the variance of each channel, and whe
   reference signal the sums are integrals over time, and channels of weight zero are left out. If measurements do not
   vary, the sum in the denominator is that of y² itself, so that ``1 - share`` is the square of the relative root mean
   square of the residuals (NRMSE); a constant reference has no variance to explain.
-- samples that a robust loss treats as outliers are left out, unless they are more than half of all: the fit is then
-  wrong, not the samples.
+- samples that a robust loss treats as outliers are left out, unless they are more than half of all or the typical
+  residual is `FAR` from sigma too: the fit is then wrong, not the samples.
 - noise is white, without outliers, and of the size of sigma. Each is tested, and the test that fails says what is
   suspected: the model, outliers, or sigma.
 
@@ -57,6 +57,10 @@ SERIOUS = 1.2
 """Factor by which standard errors may be too small, and a typical residual beside a robust loss too large: a 95 %
 interval that is too narrow by this factor covers 90 %, and a seventh of all values, if they are outliers, raise the
 median of the absolute residuals by it."""
+
+FAR = 2.0
+"""Factor by which the median of the absolute residuals beside a robust loss exceeds that of normal noise if 40 % of the
+values are outliers. Real outliers raise it to 1.2; a mode too few, which left 49 % weighed down, to 3.5."""
 
 HALF = 0.5
 """Share of the variance below which a model explains less than it leaves."""
@@ -593,7 +597,7 @@ def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals,
         if is_given:
             above = int(np.sum(z > SERIOUS * special.ndtri(0.75)))
             tests["sigma"] = float(special.bdtrc(above - 1, n, HALF))
-        elif np.mean(comparison.downweighted[np.isfinite(comparison.residuals[:, k]), k]) > HALF:
+        elif not _are_outliers(comparison.downweighted[np.isfinite(comparison.residuals[:, k]), k], z):
             tests["sigma"] = 0.0
         return tests
     if n >= FEWEST and residuals.rms > 0:
@@ -663,8 +667,9 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     there = np.isfinite(residual)
     if not there.any() or (comparison.weights is not None and comparison.weights[k] == 0):
         return np.nan, np.nan, 1.0
-    if comparison.downweighted is not None and np.mean(outliers := comparison.downweighted[there, k]) <= HALF:
-        there[there] = ~outliers
+    if comparison.downweighted is not None and comparison.sigma is not None:
+        outliers = comparison.downweighted[there, k]
+        there[there] = ~outliers | (not _are_outliers(outliers, residual[there] / comparison.sigma[there, k]))
     weight = _compute_weights(comparison)[there]
     y, residual = y[there], residual[there]
     size = 1.0
@@ -677,6 +682,11 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     if spread <= NO_VARIATION**2 * about_zero:
         spread = about_zero if comparison.kind == "measurements" else 0.0
     return float(weight @ residual**2), spread, size if size > 0 else 1.0
+
+
+def _are_outliers(weighed_down: NDArray[np.bool_], z: FloatArray) -> bool:
+    """Return whether samples (n,) that a robust loss weighs down are to blame, and not the fit; z in units of sigma."""
+    return bool(np.mean(weighed_down) <= HALF and np.median(np.abs(z)) <= FAR * special.ndtri(0.75))
 
 
 def _compute_weights(comparison: Comparison) -> FloatArray:

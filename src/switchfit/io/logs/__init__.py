@@ -92,7 +92,7 @@ def refuse_without_times(source: str, names: Iterable[str]) -> NoReturn:
 
     raise InputError(
         f"{source}: no column is called time; its columns are {join_names(names)}. Name the one with the times: "
-        "time = ..."
+        "time = ..., or call it time in the file."
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import contextlib
 import csv
 import gzip
 import re
@@ -257,7 +258,7 @@ def read_text(path: Path, options: Options) -> Log:
     drop_broken = "drop-broken-lines" in options.repair
     table = _read_table(path, drop_broken)
     names, wanted = table.names, None if options.columns is None else _find_columns(table, options.columns)
-    time = _find_time(table, wanted or ()) if options.time is None else _find_column(table, options.time)
+    time = _find_time(table, wanted or (), options) if options.time is None else _find_column(table, options.time)
     chosen = [k for k in range(len(names)) if k != time] if wanted is None else list(dict.fromkeys(wanted))
     if drop_broken:
         table = _drop_text(table, time, chosen)
@@ -430,14 +431,15 @@ def _find_columns(table: _Table, columns: Sequence[str]) -> list[int]:
     return [_find_column(table, name) for name in own]
 
 
-def _find_time(table: _Table, channels: Sequence[int]) -> int:
+def _find_time(table: _Table, channels: Sequence[int], options: Options) -> int:
     """Return the column with the times: the first one that is called so, or the first one if it never falls."""
     found = find_time_name(table.places, [table.names[k] for k in channels])
     if found is not None:
         return table.places[found]
-    numbers, bad = table.parse_column(0)
-    if len(table.names) > 1 and not bad.any() and np.all(np.diff(numbers) >= 0) and numbers[-1] > numbers[0]:
-        return 0
+    with contextlib.suppress(InputError):  # it has neither numbers nor dates
+        times = _read_times(table, 0, options).times
+        if len(table.names) > 1 and np.all(np.diff(times) >= 0) and times[-1] > times[0]:
+            return 0
     refuse_without_times(table.source, table.names)
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison
+from switchfit.fit.trajectory import Comparison, find_delay
 from switchfit.problem.data import FloatArray
 from switchfit.report.formats import describe_clock, format_estimate, format_unit, get_unit, list_dated
 from switchfit.report.plot import find_plane, has_bands, replace_infinities
@@ -144,7 +144,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     for comparison in estimate.comparisons[e]:
         names, units = comparison.names, [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
         columns = range(first, first := first + len(names))
-        late = float(comparison.curve_times[0] - trajectory.times[0])
+        late = find_delay(comparison, trajectory)
         count = len(comparison.times)
         drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
         curve = list_curve(columns, late)
