@@ -52,13 +52,7 @@ from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.residuals import measure_widening
-from switchfit.uncertainty.walks import (
-    Derivatives,
-    eliminate_others,
-    find_first_root,
-    list_sample_times,
-    list_transitions,
-)
+from switchfit.uncertainty.walks import eliminate_others, find_first_root, list_sample_times, list_transitions
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
 STEPS = 5
@@ -344,8 +338,8 @@ class Profile(Tabular, Displayed):
         others = (theta > c.lower) & (theta < c.upper) & found.hessian.any(axis=1)
         others[k] = False
         # The Schur complement of `walks`: curvature H_kk - H_ko H_oo^-1 H_ok, and the others follow by -H_oo^-1 H_ok.
-        at = Derivatives(np.array([found.cost]), found.gradient[None], found.hessian[None])
-        _, _, (curvature,), _, (follow,) = eliminate_others(at, np.array([k]), others[None])
+        at = found.gradient[None], found.hessian[None], np.array([k]), others[None]
+        (curvature,), _, (follow,) = eliminate_others(*at)
         follow = -follow
         follow[k] = 1.0
         return Point(float(theta[k]), found.cost, float(found.gradient[k]), float(curvature), theta, follow, converged)
