@@ -47,6 +47,7 @@ from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.problem.unknowns import SMALLEST
 from switchfit.problem.validation import as_callable, as_flag, as_instance, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
@@ -72,6 +73,8 @@ HALVINGS = 8
 """Largest number of times that a step is reduced because a fit fails or zeta rises too much."""
 ITERATIONS = 100
 """Largest number of iterations of one fit along the profile."""
+CREEPING = 1e-3
+"""Fall of J in the second half of them, as a part of that in one unit of zeta, below which the fit has ended too."""
 
 
 def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
@@ -82,7 +85,10 @@ def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
     problem : Problem
     """
     unknowns = problem.unknowns
-    low, high = unknowns.lower.copy(), unknowns.upper.copy()
+    # A logarithm never comes to its origin.
+    nearest = unknowns.origin + SMALLEST * unknowns.variables.size
+    low = np.where(unknowns.log, np.maximum(unknowns.lower, nearest), unknowns.lower)
+    high = unknowns.upper.copy()
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         free, times = where >= 0, experiment.initial_times
         gaps = np.array([problem.durations[mode] for mode in experiment.mode_sequence])  # before each time
@@ -357,7 +363,13 @@ class Profile(Tabular, Displayed):
             return None
         if result.status is Status.INTERRUPTED or self._should_stop():
             raise KeyboardInterrupt
-        return self._describe(result.theta, result, result.status.successful) if np.isfinite(result.cost) else None
+        if not np.isfinite(result.cost):
+            return None
+        # In a curved valley without an end, gradients may stay just above the tolerance while J no longer falls.
+        creeps = result.status is Status.MAX_ITERATIONS
+        fallen = result.history[len(result.history) // 2].cost - result.cost
+        settled = result.status.successful or (creeps and fallen < CREEPING * self._scale)
+        return self._describe(result.theta, result, settled)
 
     def _add(self, value: float, near: Point) -> Point | None:
         """Add a point, fitted from what a neighbor predicts; None if all fits fail.
