@@ -144,7 +144,7 @@ class Variables(NamedTuple):
         return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
 
     def inward(self, theta: Any, xp: Any = np) -> Any:
-        """Return z at theta (d,): for a logarithm, a bound or a start at the origin is `SMALLEST` first guesses away."""
+        """Return z at theta (d,): of a logarithm, a bound at the origin is `SMALLEST` first guesses away from it."""
         away = theta - self.origin
         positive = xp.where(self.log, xp.where(away > 0, away, SMALLEST * self.size), 1.0)
         return xp.where(self.log, xp.log(positive), theta / self.size)
