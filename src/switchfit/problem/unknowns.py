@@ -230,6 +230,11 @@ class Unknowns:
         return Variables.of(self.initial, bounds, self.log, keep=self.is_time, origin=self.origin)
 
     @cached_property
+    def lowest(self) -> FloatArray:
+        """Lower bounds, those of logarithms above their origins: (d,)."""
+        return np.where(self.log, np.maximum(self.lower, self.origin + SMALLEST * self.variables.size), self.lower)
+
+    @cached_property
     def log_times(self) -> NDArray[np.bool_]:
         """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
         return self.log & self.is_time

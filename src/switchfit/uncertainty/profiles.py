@@ -47,7 +47,6 @@ from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import SMALLEST
 from switchfit.problem.validation import as_callable, as_flag, as_instance, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
@@ -85,10 +84,7 @@ def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
     problem : Problem
     """
     unknowns = problem.unknowns
-    # A logarithm never comes to its origin.
-    nearest = unknowns.origin + SMALLEST * unknowns.variables.size
-    low = np.where(unknowns.log, np.maximum(unknowns.lower, nearest), unknowns.lower)
-    high = unknowns.upper.copy()
+    low, high = unknowns.lowest.copy(), unknowns.upper.copy()
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         free, times = where >= 0, experiment.initial_times
         gaps = np.array([problem.durations[mode] for mode in experiment.mode_sequence])  # before each time

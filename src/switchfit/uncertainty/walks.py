@@ -187,7 +187,9 @@ def list_walks(
     smallest = unknowns.origin + SMALLEST * (thetas - unknowns.origin)
     lower = np.where(unknowns.log, np.maximum(unknowns.lower, smallest), unknowns.lower)
     upper = np.broadcast_to(unknowns.upper, thetas.shape)
-    others = free | (((thetas <= unknowns.lower) | (thetas >= unknowns.upper)) & ~unknowns.is_time)
+    # Bounds hold unknowns for a part of a way.
+    at_bound = np.isclose(thetas, unknowns.lowest, rtol=AT_SAMPLE, atol=0.0) | (thetas >= unknowns.upper)
+    others = free | (at_bound & ~unknowns.is_time)
     others[:, place] = False
     knots, tau = problem.ends_of_modes(thetas)[e], thetas[:, place]
     beyond = np.full((len(thetas), 1), np.inf)  # a free tf has no neighbour behind it
