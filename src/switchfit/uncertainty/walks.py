@@ -323,10 +323,14 @@ def _eliminate_inside(
         size = np.sqrt(np.abs(np.diagonal(at.hessian, axis1=1, axis2=2)))
         size = np.where(free & (size > 0), size, 1.0)
         scale = size[:, :, None] * size[:, None, :]
-        values, vectors = np.linalg.eigh(np.where(both, at.hessian / scale, np.eye(g.shape[1])))
-        concave = values[:, 0] < -CONCAVE
-        turned = (np.abs(values)[:, None, :] * vectors) @ vectors.transpose(0, 2, 1) * scale
-        H = np.where(concave[:, None, None] & both, turned, at.hessian)
+        scaled, H, concave = np.where(both, at.hessian / scale, np.eye(g.shape[1])), at.hessian, np.zeros(len(g), bool)
+        try:
+            np.linalg.cholesky(scaled)  # in a tenth of the time, where all have a minimum
+        except np.linalg.LinAlgError:
+            values, vectors = np.linalg.eigh(scaled)
+            concave = values[:, 0] < -CONCAVE
+            turned = (np.abs(values)[:, None, :] * vectors) @ vectors.transpose(0, 2, 1) * scale
+            H = np.where(concave[:, None, None] & both, turned, H)
         curvature, newton, follow = eliminate_others(g + _multiply(H, step), H, own.place, free)
         there, leaves = theta + step - newton, newton + follow * length
         low = free & ((there < own.lower) | ((theta <= own.lower) & (leaves > 0)))
@@ -557,7 +561,9 @@ def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArr
         length, height, last = side * (stop - start), thresholds - rise, np.isnan(after)
         with np.errstate(invalid="ignore", divide="ignore"):
             parabola = find_first_root(height, slope, curvature)
-            cubic = np.where(after >= thresholds, _bisect(after - rise, slope, curvature, length, height), np.inf)
+            cubic, risen = np.full_like(found, np.inf), searched & (after >= thresholds)
+            if risen.any():
+                cubic = np.where(risen, _bisect(after - rise, slope, curvature, length, height), np.inf)
             said = rise + length * (slope + 0.5 * curvature * length)
             jumps = (after >= thresholds) & (after - said > JUMP * after)
             cubic = np.where(jumps, np.minimum(parabola, length), cubic)
