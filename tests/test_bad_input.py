@@ -149,7 +149,7 @@ def test_wrong_types(build, said):
         (lambda: sf.Parameter([1.0, 2.0], lower=[1, 2, 3]), ["lower must fit the value, of shape (2,)", "1.0, 2.0, 3"]),
         (lambda: sf.Parameter([]), ["Parameter value must have one entry or more"]),
         (lambda: sf.Parameter(math.nan), ["Parameter value must be finite; got nan"]),
-        (lambda: sf.Parameter(1.5, lower=2.0, upper=1.0), ["value 1.5 lies outside its bounds [2.0, 1.0]"]),
+        (lambda: sf.Parameter(1.5, lower=2.0, upper=1.0), ["Parameter lower must not be above upper; got [2.0, 1.0]"]),
         (lambda: sf.Parameter(0.0, scale="log"), ["with scale='log' must be positive; got 0.0"]),
         (lambda: sf.Parameter(1.0, -1.0, scale="log"), ["with scale='log' must be positive", "lower bound -1.0"]),
         (lambda: sf.Parameter(1.0, prior=sf.Normal([1, 2], 1)), ["prior must fit the value, of shape ()"]),

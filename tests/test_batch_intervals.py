@@ -67,6 +67,44 @@ def test_pieces_end_where_the_profile_likelihood_does(tau):
     assert np.median(gaps) < 1e-3
 
 
+def leaky(seed, scale):
+    """A tank is filled and drained, and leaks hardly: the leak ends near its bound, or at it."""
+    times, tau, q, r, k = np.arange(0.5, 10.0, 0.5), 4.3, 1.0, 0.5, 0.02
+    since = np.maximum(times - tau, 0.0)
+    filled = -q * np.expm1(-k * np.minimum(times, tau)) / k
+    level = filled * np.exp(-k * since) + r * np.expm1(-k * since) / k
+    values = level + 0.15 * np.random.default_rng(seed).standard_normal(len(times))
+    modes = {"fill": lambda t, x, p: p["q"] - p["leak"] * x, "drain": lambda t, x, p: -p["r"] - p["leak"] * x}
+    run = sf.Experiment(sf.Measurements(times, values, sigma=0.15), ("fill", "drain"), (4.0,), t0=0.0)
+    leak = sf.Parameter(0.1, lower=0.0, scale=scale)
+    return sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"q": 0.8, "r": 0.4, "leak": leak})
+
+
+def eaten(seed, scale):
+    """Michaelis-Menten: what is well known of V and K is V / K, so that they follow a curved valley."""
+    times, clock = np.arange(0.5, 14.0, 0.5), np.linspace(0.0, 14.0, 14001)
+    level = [8.0]
+    for t in clock[1:]:
+        level.append(level[-1] + 0.001 * (0.5 * (t > 6.2) - 0.6 * level[-1] / (1.5 + level[-1])))
+    values = np.interp(times, clock, level) + 0.2 * np.random.default_rng(seed).standard_normal(len(times))
+    eat = lambda x, p: -p["V"] * x / (p["K"] + x)  # noqa: E731
+    modes = {"eat": lambda t, x, p: eat(x, p), "fed": lambda t, x, p: p["feed"] + eat(x, p)}
+    run = sf.Experiment(sf.Measurements(times, values, sigma=0.2), ("eat", "fed"), (5.0,), t0=0.0)
+    parameters = {"V": 0.5, "feed": 0.4, "K": sf.Parameter(1.0, lower=0.0, scale=scale)}
+    return sf.Problem(sf.HybridSystem(modes, [8.0]), run, parameters)
+
+
+@pytest.mark.parametrize(
+    ("build", "scale", "seed"),
+    [(leaky, "log", 7), (leaky, "log", 8), (leaky, "linear", 2), (eaten, "linear", 34), (eaten, "linear", 39)],
+)
+def test_pieces_follow_other_unknowns_to_bounds_from_bounds_and_along_valleys(build, scale, seed):
+    """Held where they meet a bound, they were not eliminated again: widths were 0, or ends stuck at samples."""
+    fit = sf.estimate(build(seed, scale), strategy="local")
+    profile = np.array(fit.profile("tau_1").interval())
+    np.testing.assert_allclose(fit.confidence_intervals()[0], profile, atol=0.01 * np.ptp(profile), rtol=0)
+
+
 def test_a_way_ends_where_the_others_are_not_determined():
     """Beyond x = 1 J does not depend on y. The other way, to the left, is not affected."""
     count, stops = 2, np.array([[-1.0, -9.0, np.nan, np.nan], [1.0, 9.0, np.nan, np.nan]])

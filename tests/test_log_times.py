@@ -1,12 +1,17 @@
-"""Transition times on a logarithmic scale: the optimiser works in log(tau - t0), all numbers given are those of tau."""
+"""Transition times on a logarithmic scale: the optimiser works in log(tau - t0), all numbers given are those of tau.
+
+And other unknowns on it whose best value is 0, where a logarithm has none.
+"""
 
 from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
 from models import RAMP, first_state
+from test_batch_intervals import eaten, leaky
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
@@ -216,3 +221,28 @@ def test_what_does_not_go_together_is_said(build, said):
 def test_a_fixed_time_may_have_any_scale():
     problem = relaxation((0.03, sf.Parameter(4.0, fixed=True)))
     assert problem.unknowns.log_times.tolist() == [True, False, False, False]
+
+
+def test_an_unknown_whose_best_value_is_0_ends_at_its_bound():
+    log, linear = (sf.estimate(leaky(61, scale)) for scale in ("log", "linear"))
+    np.testing.assert_allclose(log.theta, linear.theta, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(log.confidence_intervals()[0], log.profile("tau_1").interval(), rtol=1e-3)
+    assert "at bounds" in {reason.kind for reason in log.verdict.reasons}
+
+
+def test_an_unknown_that_is_not_told_from_0_is_doubtful_and_no_fit_starts_there():
+    problem = leaky(7, "log")
+    fit = sf.estimate(problem)
+    assert fit.verdict.reasons[0].kind == "vanishing"
+    assert "leak tends to 0: use a linear scale with lower=0" in " ".join(str(fit.verdict).split())
+    assert fit.confidence_intervals()[-1].tolist() == [0.0, np.inf]
+    with pytest.raises(ValueError, match="start must be above 0 for leak, whose scale is 'log'; got"):
+        sf.estimate(problem, start=[4.3, 1.0, 0.5, 0.0], strategy="local")
+
+
+@pytest.mark.parametrize(("problem", "name"), [(partial(leaky, 0), "leak"), (partial(eaten, 1), "tau_1")])
+def test_profiles_do_not_depend_on_the_scale(problem, name):
+    """Neither where the unknown goes to 0 itself nor where others creep along a valley without an end."""
+    found = [sf.estimate(problem(scale), strategy="local").profile(name) for scale in ("log", "linear")]
+    assert found[0].ends == found[1].ends
+    np.testing.assert_allclose(found[0].interval(), found[1].interval(), rtol=1e-4, atol=1e-9)

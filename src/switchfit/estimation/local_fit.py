@@ -27,7 +27,7 @@ from switchfit.optimize.sqp import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray
 from switchfit.problem.inspection import find_comparisons
 from switchfit.problem.problem import Problem, keep_with_problem, require_estimable
-from switchfit.problem.validation import as_choice, as_count, as_instance, as_positive
+from switchfit.problem.validation import as_choice, as_count, as_instance, as_positive, join_names, shorten
 from switchfit.runtime.errors import Issue, NotIntegrableError
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 
@@ -84,6 +84,9 @@ def fit_locally(
         raise ValueError(f"with guards or terminal constraints hessian must be 'auto' or 'exact'; got {hessian!r}.")
     began = time.perf_counter()
     first = theta = problem.check_theta(start, "start")
+    unknowns = problem.unknowns
+    if names := [unknowns.names[i] for i in np.flatnonzero(unknowns.log & ~unknowns.is_time & (first <= 0))]:
+        raise ValueError(f"start must be above 0 for {join_names(names)}, whose scale is 'log'; got {shorten(first)}.")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
     history: list[IterationRecord] = []
     evaluations, multipliers, broken = 0, None, None

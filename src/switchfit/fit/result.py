@@ -646,7 +646,8 @@ def disagreement(fit: Fit) -> Disagreement | None:
 def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin: FloatArray) -> FloatArray:
     """Return ``theta -+ half``, or if `log` ``o + (theta - o) exp(-+ half / (theta - o))``, o the origin: (..., 2)."""
     away = theta - origin
-    factor = np.exp(np.where(log, half / np.where(log, away, 1.0), 0.0))
+    with np.errstate(over="ignore"):  # of an unknown that is not told from 0
+        factor = np.exp(np.where(log, half / np.where(log, away, 1.0), 0.0))
     low, high = (np.where(log, origin + end, theta) for end in (away / factor, away * factor))
     return np.stack([np.where(log, low, theta - half), np.where(log, high, theta + half)], axis=-1)
 

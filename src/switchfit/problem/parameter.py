@@ -246,6 +246,8 @@ class Parameter:
             raise ValueError("Parameter value must have one entry or more; got none.")
         if not ((lower <= value).all() and (value <= upper).all()):
             bounds = f"[{shorten(self.lower)}, {shorten(self.upper)}]"
+            if (lower > upper).any():
+                raise ValueError(f"Parameter lower must not be above upper; got {bounds}.")
             raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {bounds}.")
         if scale == "log":
             lower = np.where(np.isneginf(lower), 0.0, lower)

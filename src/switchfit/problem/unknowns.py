@@ -99,8 +99,15 @@ ORDINARY = (1e-3, 1e3)
 """Range of sizes in which an unknown is not scaled; the tolerance on the gradient is then that of theta itself."""
 
 
+SMALLEST = 1e-15
+"""Part of its first guess that an unknown on a logarithmic scale keeps without a lower bound of its own. At 0 the cost
+has no slope in the logarithm, and far below there is nothing left of its curvature but rounding."""
+
+
 class Variables(NamedTuple):
-    """The change of variables: ``size`` (d,), powers of 2, ``log`` (d,) of bool, and ``origin`` (d,) of logarithms."""
+    """The change of variables: ``size`` (d,), powers of 2, of a logarithm the first guess, ``log`` (d,) of bool, and
+    ``origin`` (d,) of logarithms.
+    """
 
     size: Any
     log: Any
@@ -124,7 +131,8 @@ class Variables(NamedTuple):
         typical = np.where(theta != 0.0, np.abs(theta), largest)
         outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
         # A power of 2, so that scaling causes no rounding.
-        return cls(2.0 ** np.round(np.log2(np.where(outside, typical, 1.0))), log, origin)
+        size = 2.0 ** np.round(np.log2(np.where(outside, typical, 1.0)))
+        return cls(np.where(log, np.abs(theta - origin), size), log, origin)
 
     @property
     def identity(self) -> bool:
@@ -136,10 +144,10 @@ class Variables(NamedTuple):
         return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
 
     def inward(self, theta: Any, xp: Any = np) -> Any:
-        """Return z at theta (d,): a bound at the origin becomes one of minus infinity for a logarithm."""
+        """Return z at theta (d,): of a logarithm, a bound at the origin is `SMALLEST` first guesses away from it."""
         away = theta - self.origin
-        positive = xp.where(self.log & (away > 0), away, 1.0)
-        return xp.where(self.log, xp.where(away > 0, xp.log(positive), -xp.inf), theta / self.size)
+        positive = xp.where(self.log, xp.where(away > 0, away, SMALLEST * self.size), 1.0)
+        return xp.where(self.log, xp.log(positive), theta / self.size)
 
     def sizes_inward(self, sizes: FloatArray) -> FloatArray:
         """Return sizes of z for sizes of theta (d,); the size of a logarithm is 1."""
@@ -220,6 +228,11 @@ class Unknowns:
         """What the optimiser works with: logarithms, transition times as they are, other unknowns scaled."""
         bounds = np.array([self.lower, self.upper])
         return Variables.of(self.initial, bounds, self.log, keep=self.is_time, origin=self.origin)
+
+    @cached_property
+    def lowest(self) -> FloatArray:
+        """Lower bounds, those of logarithms above their origins: (d,)."""
+        return np.where(self.log, np.maximum(self.lower, self.origin + SMALLEST * self.variables.size), self.lower)
 
     @cached_property
     def log_times(self) -> NDArray[np.bool_]:

@@ -52,13 +52,7 @@ from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.residuals import measure_widening
-from switchfit.uncertainty.walks import (
-    Derivatives,
-    eliminate_others,
-    find_first_root,
-    list_sample_times,
-    list_transitions,
-)
+from switchfit.uncertainty.walks import eliminate_others, find_first_root, list_sample_times, list_transitions
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
 STEPS = 5
@@ -78,6 +72,8 @@ HALVINGS = 8
 """Largest number of times that a step is reduced because a fit fails or zeta rises too much."""
 ITERATIONS = 100
 """Largest number of iterations of one fit along the profile."""
+CREEPING = 1e-3
+"""Fall of J in the second half of them, as a part of that in one unit of zeta, below which the fit has ended too."""
 
 
 def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
@@ -88,7 +84,7 @@ def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
     problem : Problem
     """
     unknowns = problem.unknowns
-    low, high = unknowns.lower.copy(), unknowns.upper.copy()
+    low, high = unknowns.lowest.copy(), unknowns.upper.copy()
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         free, times = where >= 0, experiment.initial_times
         gaps = np.array([problem.durations[mode] for mode in experiment.mode_sequence])  # before each time
@@ -344,8 +340,8 @@ class Profile(Tabular, Displayed):
         others = (theta > c.lower) & (theta < c.upper) & found.hessian.any(axis=1)
         others[k] = False
         # The Schur complement of `walks`: curvature H_kk - H_ko H_oo^-1 H_ok, and the others follow by -H_oo^-1 H_ok.
-        at = Derivatives(np.array([found.cost]), found.gradient[None], found.hessian[None])
-        _, _, (curvature,), _, (follow,) = eliminate_others(at, np.array([k]), others[None])
+        at = found.gradient[None], found.hessian[None], np.array([k]), others[None]
+        (curvature,), _, (follow,) = eliminate_others(*at)
         follow = -follow
         follow[k] = 1.0
         return Point(float(theta[k]), found.cost, float(found.gradient[k]), float(curvature), theta, follow, converged)
@@ -363,7 +359,13 @@ class Profile(Tabular, Displayed):
             return None
         if result.status is Status.INTERRUPTED or self._should_stop():
             raise KeyboardInterrupt
-        return self._describe(result.theta, result, result.status.successful) if np.isfinite(result.cost) else None
+        if not np.isfinite(result.cost):
+            return None
+        # In a curved valley without an end, gradients may stay just above the tolerance while J no longer falls.
+        creeps = result.status is Status.MAX_ITERATIONS
+        fallen = result.history[len(result.history) // 2].cost - result.cost
+        settled = result.status.successful or (creeps and fallen < CREEPING * self._scale)
+        return self._describe(result.theta, result, settled)
 
     def _add(self, value: float, near: Point) -> Point | None:
         """Add a point, fitted from what a neighbor predicts; None if all fits fail.

@@ -58,6 +58,10 @@ BARELY_DETERMINED = 1e-6
 of 0.999999 have it."""
 
 
+VANISHING = 10.0
+"""Standard errors of an unknown on a logarithmic scale, in parts of it, above which the data do not tell it from 0."""
+
+
 @dataclass(frozen=True)
 class Numbers:
     """Numbers about R fits from which they are judged: arrays (R,), or one number where it is that of all of them.
@@ -512,6 +516,10 @@ def _find_others(fit: Fit, certificate: Certificate) -> Iterator[Finding]:
         return
     for issue in find_without_effect(fit):
         yield Finding("doubtful", issue, (NO_EFFECT[issue.kind],))
+    vanishing = np.isin(fit.theta_names, fit.log_scaled) & ~fit.is_time & (fit.standard_errors > VANISHING * fit.theta)
+    if vanishing.any():
+        names = tuple(np.array(fit.theta_names, dtype=object)[vanishing].tolist())
+        yield Finding("doubtful", Issue("vanishing", names), ("linear scale",))
     for failure in certificate.failures:
         if failure.kind != "integration error":
             yield Finding("doubtful", failure, ("check derivatives",))

@@ -11,7 +11,8 @@ It costs an evaluation for each piece but the first. The other unknowns follow a
 trusted as far as the end of the interval misses that end by a tenth of the interval: 95 % intervals then hold 92 to
 93 % of the truths (`benchmarks/coverage.py`). Therefore the last stretch is covered in up to `MOST_HALVINGS` + 1
 pieces, each of which begins halfway to where the one before it would end; the other unknowns are fitted by Newton's
-method where each begins, and each piece meets the next.
+method where each begins, and each piece meets the next. One that meets a bound is held there until J falls inwards; a
+piece ends at either place, as the curvature of the profile jumps there.
 
 All ways go on together, a piece at a time, so that those of many fits take few calls. A piece is an array of five
 numbers: the transition times where it starts and stops, by how much the profile exceeds J of the estimate at the start,
@@ -48,8 +49,14 @@ NEAR_END = 0.75
 RIGHT = 0.01
 """... parabolas are right up to this part of the threshold."""
 
-MOST_REPEATS = 2
+MOST_REPEATS = 20
 """Further Newton steps of the other unknowns at one place, while one lowers J by more than `RIGHT` thresholds."""
+
+PART, SMALLEST_PART = 0.25, 1e-2
+"""Part of a Newton step that is tried where it has not lowered J; and the smallest one, as where J has a kink."""
+
+CONCAVE = 1e-9
+"""Curvature, scaled by those of the unknowns alone, below minus which J has no minimum in the others."""
 
 AT_SAMPLE = 1e-9
 """A transition time nearer to a sample time than this part of the horizon is at it."""
@@ -180,7 +187,9 @@ def list_walks(
     smallest = unknowns.origin + SMALLEST * (thetas - unknowns.origin)
     lower = np.where(unknowns.log, np.maximum(unknowns.lower, smallest), unknowns.lower)
     upper = np.broadcast_to(unknowns.upper, thetas.shape)
-    others = free.copy()
+    # Bounds hold unknowns for a part of a way.
+    at_bound = np.isclose(thetas, unknowns.lowest, rtol=AT_SAMPLE, atol=0.0) | (thetas >= unknowns.upper)
+    others = free | (at_bound & ~unknowns.is_time)
     others[:, place] = False
     knots, tau = problem.ends_of_modes(thetas)[e], thetas[:, place]
     beyond = np.full((len(thetas), 1), np.inf)  # a free tf has no neighbour behind it
@@ -223,34 +232,45 @@ def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -
     most : int
         Pieces that are kept.
     """
-    count = len(walks.place)
+    count, d = walks.theta.shape
     pieces, kept = np.full((count, most, PIECE), np.nan), np.zeros(count, dtype=int)
     passed, halvings, repeats = np.zeros((3, count), dtype=int)
-    theta = walks.theta.copy()
+    theta, part = walks.theta.copy(), np.ones(count)
+    # The lowest J where each way is, and the other unknowns there.
+    lowest, best = Derivatives(np.zeros(count), np.zeros((count, d)), np.zeros((count, d, d))), theta.copy()
     going = np.arange(count)
     # One piece a turn for all ways that go on.
     while going.size:
         at = evaluate(going, theta[going])
         # Ways whose derivatives are not finite end here; what they have so far is kept.
         sound = np.all(np.abs(at.gradient) < LARGEST, axis=1) & np.isfinite(at.hessian).all(axis=(1, 2))
-        going, at = going[sound], Derivatives(*(each[sound] for each in at))
+        # A Newton step that has not lowered J is taken back, and a part of it tried.
+        worse = (repeats[going] > 0) & ~(sound & (at.cost < lowest.cost[going]))
+        part[going] = np.where(worse, PART * part[going], 1.0)
+        for all_kept, new in zip((*lowest, best), (*at, theta[going]), strict=True):
+            all_kept[going[~worse]] = new[~worse]
+        going = going[sound | worse]
         if not going.size:
             break
+        at, theta[going] = Derivatives(*(each[going] for each in lowest)), best[going]
         own = Walks(*(each[going] for each in walks))
         each, value = np.arange(going.size), theta[going, own.place]
-        (height, decrement), slope, curvature, newton, follow = eliminate_others(at, own.place, own.free)
-        lost = np.isnan(curvature)
+        stop = own.stops[each, passed[going]]
+        found = _eliminate_inside(at, own, theta[going], part[going], stop)
+        curvature, lost = found.curvature, np.isnan(found.curvature)
         # Another Newton step of the others first, where the one just found would lower J by more than the piece may be
-        # wrong.
-        repeat = ~lost & (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
-        rise, steepness = height - cost[going], own.side * slope
+        # wrong, or where their minimum is farther away than one step tells.
+        far = (found.decrement > part[going] * RIGHT * own.threshold) | found.concave
+        repeat = ~lost & (repeats[going] < MOST_REPEATS) & (part[going] > SMALLEST_PART) & far
+        rise, steepness = at.cost - found.decrement - cost[going], own.side * found.slope
         ahead = find_first_root(own.threshold - rise, steepness, curvature)
         reach = np.where(rise >= own.threshold, 0.0, ahead)  # how far it is to the threshold
-        piece = np.column_stack([value, own.stops[each, passed[going]], rise, steepness, curvature])
-        # A piece ends at the next stop, or halfway to the threshold where it is not to be trusted as far as that.
-        halfway = _find_halfway(piece, pieces[going, kept[going] - 1], reach, own.threshold, own.side)
-        cut = ~repeat & (halvings[going] < MOST_HALVINGS) & ~np.isnan(halfway)
-        piece[cut, 1] = halfway[cut]
+        piece = np.column_stack([value, stop, rise, steepness, curvature])
+        # A piece ends at the next stop, where another unknown meets or leaves its bound, or halfway to the threshold
+        # where it is not to be trusted as far as that.
+        earlier = _find_cut(piece, pieces[going, kept[going] - 1], reach, found.meets, own.threshold, own.side)
+        cut = ~repeat & (halvings[going] < MOST_HALVINGS) & np.isfinite(earlier)
+        piece[cut, 1] = earlier[cut]
         passed[going] += ~repeat & ~cut
         halvings[going] += cut
         repeats[going] = np.where(repeat, repeats[going] + 1, 0)
@@ -260,33 +280,103 @@ def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -
         done = ~repeat & ~lost
         pieces[going[done], kept[going[done]]] = piece[done]
         kept[going] += done
-        # On to where the piece ends, the others along their tangent: -H_oo^-1 g_o at once, -H_oo^-1 H_ok by length.
+        # On to where the piece ends, the others along their tangent.
         there = np.where(repeat, value, piece[:, 1])
-        moved = np.clip(theta[going] - newton - follow * (there - value)[:, None], own.lower, own.upper)
+        moved = theta[going] + found.step + found.follow * np.abs(there - value)[:, None]
+        near = 1e-9 * np.abs(moved - theta[going])  # what should meet its bound is put there
+        moved = np.where(moved <= own.lower + near, own.lower, np.where(moved >= own.upper - near, own.upper, moved))
         moved[each, own.place] = there
         theta[going] = moved
         going = going[~last]
     return pieces
 
 
-def eliminate_others(
-    at: Derivatives, place: NDArray[np.intp], free: NDArray[np.bool_]
-) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the cost of each profile, by how much a Newton step of the others has lowered it, its slope and curvature,
-    (n,) each; and how the others follow: at once, and by length, (n, d) each. NaN where H_oo is singular.
+class _Eliminated(NamedTuple):
+    """The profiles of n ways where they are: slope and curvature in the transition time (n,); the step of the others at
+    once and how they follow by length, outwards, (n, d); by how much the step lowers J; how far it is until another
+    unknown meets a bound or leaves it; and whether J has no minimum in the others: (n,).
     """
-    J, g, H = at
-    each = np.arange(len(J))
+
+    slope: FloatArray
+    curvature: FloatArray
+    step: FloatArray
+    follow: FloatArray
+    decrement: FloatArray
+    meets: FloatArray
+    concave: NDArray[np.bool_]
+
+
+def _eliminate_inside(
+    at: Derivatives, own: Walks, theta: FloatArray, part: FloatArray, stop: FloatArray
+) -> _Eliminated:
+    """Eliminate the other unknowns (n, d) inside their bounds, by a part (n,) of a Newton step.
+
+    One that the step leads out of its bounds, or that would leave one before its way is at its stop (n,), is put at the
+    bound, in the quadratic model of J, and held. Where J has no minimum, negative curvatures change their signs.
+    """
+    g = at.gradient
+    each, inside = np.arange(len(g)), (theta > own.lower) & (theta < own.upper)
+    free, step = own.free & (inside | at.hessian.any(axis=2)), np.zeros_like(g)
+    length = (stop - theta[each, own.place])[:, None]
+    while True:
+        both = free[:, :, None] & free[:, None, :]
+        size = np.sqrt(np.abs(np.diagonal(at.hessian, axis1=1, axis2=2)))
+        size = np.where(free & (size > 0), size, 1.0)
+        scale = size[:, :, None] * size[:, None, :]
+        scaled, H, concave = np.where(both, at.hessian / scale, np.eye(g.shape[1])), at.hessian, np.zeros(len(g), bool)
+        try:
+            np.linalg.cholesky(scaled)  # in a tenth of the time, where all have a minimum
+        except np.linalg.LinAlgError:
+            values, vectors = np.linalg.eigh(scaled)
+            concave = values[:, 0] < -CONCAVE
+            turned = (np.abs(values)[:, None, :] * vectors) @ vectors.transpose(0, 2, 1) * scale
+            H = np.where(concave[:, None, None] & both, turned, H)
+        curvature, newton, follow = eliminate_others(g + _multiply(H, step), H, own.place, free)
+        there, leaves = theta + step - newton, newton + follow * length
+        low = free & ((there < own.lower) | ((theta <= own.lower) & (leaves > 0)))
+        high = free & ((there > own.upper) | ((theta >= own.upper) & (leaves < 0)))
+        to_bound = np.where(low, own.lower, own.upper) - theta
+        # That which meets its bound first, as the others may turn round then.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reached = np.where(low | high, np.nan_to_num(np.abs(to_bound / (there - theta))), np.inf)
+        first = np.argmin(reached, axis=1)
+        out = np.flatnonzero((low | high).any(axis=1))
+        if not out.size:
+            break
+        step[out, first[out]] = to_bound[out, first[out]]
+        free[out, first[out]] = False
+    step, follow = part[:, None] * (step - newton), -follow * own.side[:, None]
+    # The slope of J in an unknown that is held, and how it changes: it leaves its bound where that is 0.
+    slope, column = g + _multiply(H, step), H[each, own.place]
+    change = column * own.side[:, None] + _multiply(H, follow)
+    after = theta + step
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(follow > 0, own.upper - after, after - own.lower) / np.abs(follow)
+        room = np.where(free, room, -slope / change)
+    meets = np.fmin.reduce(room, axis=1, where=own.free & (room > 0), initial=np.inf)
+    decrement = -0.5 * np.sum(step * (g + slope), axis=1)
+    return _Eliminated(slope[each, own.place], curvature, step, follow, decrement, meets, concave)
+
+
+def _multiply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return the products of matrices (n, d, d) and vectors (n, d)."""
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
+
+
+def eliminate_others(
+    g: FloatArray, H: FloatArray, place: NDArray[np.intp], free: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the curvatures H_kk - H_ko H_oo^-1 H_ok of profiles (n,), the Newton steps H_oo^-1 g_o, and how the others
+    follow, H_oo^-1 H_ok, (n, d), from gradients (n, d) and Hessians (n, d, d). NaN where H_oo is singular.
+    """
+    each = np.arange(len(g))
     column = H[each, :, place]
     rest = np.stack([np.where(free, g, 0.0), np.where(free, column, 0.0)], axis=2)
     # Rows and columns of the identity for what is held: its solution is zero.
     both = free[:, :, None] & free[:, None, :]
     solved = _solve_each(np.where(both, H, np.eye(g.shape[1])), rest)
     newton, follow = solved[:, :, 0], solved[:, :, 1]
-    decrement = 0.5 * np.sum(rest[:, :, 0] * newton, axis=1)
-    slope = g[each, place] - np.sum(column * newton, axis=1)
-    curvature = H[each, place, place] - np.sum(column * follow, axis=1)
-    return (J - decrement, decrement), slope, curvature, newton, follow
+    return H[each, place, place] - np.sum(column * follow, axis=1), newton, follow
 
 
 def _solve_each(matrices: FloatArray, right: FloatArray) -> FloatArray:
@@ -299,22 +389,29 @@ def _solve_each(matrices: FloatArray, right: FloatArray) -> FloatArray:
         return np.concatenate([_solve_each(matrices[k : k + 1], right[k : k + 1]) for k in range(len(matrices))])
 
 
-def _find_halfway(
-    pieces: FloatArray, before: FloatArray, reach: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]
+def _find_cut(
+    pieces: FloatArray,
+    before: FloatArray,
+    reach: FloatArray,
+    meets: FloatArray,
+    thresholds: FloatArray,
+    sides: NDArray[np.intp],
 ) -> FloatArray:
-    """Return where pieces (n, 5) are cut off, halfway to where they reach the threshold; NaN if they hold to the end.
+    """Return where pieces (n, 5) are cut off, halfway to where they reach the threshold or where another unknown meets
+    or leaves its bound; infinite if they hold to the end.
 
     A piece holds if it begins near the threshold, if it ends before it is halfway there, or if the piece before it, of
     NaN for the first one, was right about the rise here: errors of parabolas grow with the third power of their length.
     """
     start, stop, rise, _, _ = pieces.T
-    begun, met, height, steepness, bend = before.T
-    length = sides * (met - begun)
+    begun, ended, height, steepness, bend = before.T
+    length = sides * (ended - begun)
     error = rise - (height + steepness * length + 0.5 * bend * length**2)
     with np.errstate(invalid="ignore"):  # a piece that never reaches it
         right = np.abs(error) * reach**3 <= RIGHT * thresholds * length**3
         holds = (rise >= NEAR_END**2 * thresholds) | (0.5 * reach >= sides * (stop - start)) | right
-        return np.where(holds, np.nan, start + 0.5 * sides * reach)
+        met = np.where(meets < np.minimum(reach, sides * (stop - start)), meets, np.inf)
+        return start + sides * np.minimum(met, np.where(holds, np.inf, 0.5 * reach))
 
 
 def find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
@@ -464,7 +561,9 @@ def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArr
         length, height, last = side * (stop - start), thresholds - rise, np.isnan(after)
         with np.errstate(invalid="ignore", divide="ignore"):
             parabola = find_first_root(height, slope, curvature)
-            cubic = np.where(after >= thresholds, _bisect(after - rise, slope, curvature, length, height), np.inf)
+            cubic, risen = np.full_like(found, np.inf), searched & (after >= thresholds)
+            if risen.any():
+                cubic = np.where(risen, _bisect(after - rise, slope, curvature, length, height), np.inf)
             said = rise + length * (slope + 0.5 * curvature * length)
             jumps = (after >= thresholds) & (after - said > JUMP * after)
             cubic = np.where(jumps, np.minimum(parabola, length), cubic)
