@@ -48,7 +48,8 @@ TESTS = {
             "tests/test_corners.py",
             "-k",
             "once or stays_on or what_slides or infinite_slope or leaves_out or closed_forms or differences or order "
-            "or rest or predicts or level or filled or cascade or nearly_shuts or saturate or rounded or cases",
+            "or rest or play or sticks or predicts or level or filled or cascade or nearly_shuts or saturate "
+            "or rounded or cases",
         ]
     ],
     "online": [["tests/test_online.py"]],
@@ -271,9 +272,14 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "times of crossings at another theta": swap(SPLIT, "times[split.guarded] -= step", "pass"),
         "a path that does not hold any more": swap(
-            SPLIT, "if found is not None and self._holds(last, times, p):", "if found is not None:"
+            SPLIT, "if found is not None and self._holds(split, times, p):", "if found is not None:"
         ),
-        "the side behind a crossing": swap(COURSE, "behind if after == self.sides else after", "self.sides"),
+        "the side behind a crossing": swap(
+            COURSE, "if leads_back and may_rest else behind", "if not may_rest else behind"
+        ),
+        "what changes nothing": swap(SPLIT, "(kinds >= 0) & ~is_idle, is_idle", "kinds >= 0, kinds > 1e9"),
+        "what is touched": swap(SPLIT, "if touched.any():", "if False:"),
+        "rounding at rest": swap("engine/adaptive.py", "coarse), p, smallest)", "coarse), p)"),
         "sliding": swap(COURSE, "\n            )\n        return 0", "\n            )\n        return 1"),
         "a jump of the input": swap(COURSE, "if after != self.sides:", "if False:"),
         "the end of sliding": swap(CORNERS, "[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]"),

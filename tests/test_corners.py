@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
+from scipy.integrate import solve_ivp
 
 import switchfit as sf
 from benchmarks.sharp import problems as sharp
@@ -691,6 +692,78 @@ def test_a_solver_that_is_stuck_makes_no_corner_steep_beyond_which_the_field_is_
         refine_mesh(problem, 0, np.array([5.5, 5.1, 0.16, 1e-15]))
     assert not evaluator.engines[0].has_steep_corners
     assert Evaluator(problem).cost(problem.initial_theta) == pytest.approx(before, rel=1e-9)
+
+
+# --- rest, play and ringing -------------------------------------------------------------------------------------------
+
+
+def belt_axis(t, x, p, u):
+    """A motor with dry friction that drives a carriage through a play."""
+    d = x[0] - x[2]
+    force = 4000.0 * jnp.sign(d) * jnp.maximum(jnp.abs(d) - p["w"], 0.0)
+    return jnp.stack([x[1], (u - p["fc"] * jnp.sign(x[1]) - 2.0 * x[1] - force) / 0.5, x[3], force / 1.2])
+
+
+def jaw(t, x, p, u):
+    """A gripper with a coil, dry friction, and a spring that it meets."""
+    spring = jnp.where(x[0] > p["xc"], p["k"] * (x[0] - p["xc"]) + p["d"] * x[1], 0.0)
+    pull = p["kt"] * x[2] - spring - p["fc"] * jnp.sign(x[1])
+    return jnp.stack([x[1], 1000.0 * pull / 0.35, (u - p["R"] * x[2] - 0.012 * x[1]) / 0.05])
+
+
+def build_belt_axis(torque, **settings):
+    times = np.linspace(0.0, 0.3, 61)
+    motor = sf.Input(times, torque + 60.0 * times, kind="linear")
+    return problem_of(belt_axis, [0.0] * 4, {"fc": 1.5, "w": 8e-4}, 0.3, inputs=motor, **settings)
+
+
+@pytest.mark.parametrize(("torque", "idle"), [(0.42, 1), (1.2, 0), (-20.0, 9)])
+def test_a_body_that_rests_in_the_middle_of_a_play_starts_to_move(torque, idle):
+    """There both corners of the play and that of the friction are met at once, and nothing changes at the middle."""
+    problem = build_belt_axis(torque)
+    evaluator, data = Evaluator(problem), problem.experiments[0].data[0].values[:, 0]
+    seen = sf.simulate(build_belt_axis(torque, rtol=1e-11, atol=1e-14), times="samples").states[:, 0]
+    assert evaluator.cost(problem.initial_theta) == pytest.approx(0.5 * np.sum((seen - data) ** 2), rel=1e-7)
+    assert len(evaluator.engines[0]._split.idle) == idle
+
+
+def test_a_body_that_comes_to_rest_at_the_limit_of_friction_stays_there():
+    """On its side nothing moves it any more, up to 1e-7 of what leads back from the other side."""
+    problem = problem_of(lambda t, x, p: p["pull"] - jnp.sign(x), [5e-8], {"pull": 1.0 - 1e-7}, 1.0)
+    assert sf.simulate(problem, times=[0.25, 1.0]).states[:, 0] == pytest.approx([2.5e-8, 0.0], abs=1e-8)
+
+
+JAWS = {
+    "touched before a jump of the input": [11.991072, 8.988309, 0.036014, 1.070291, 6.367288, 4.755193],
+    "nearly a tangent": [20.084229, 9.905172, 0.040986, 2.584081, 7.757184, 5.213984],
+    "touched after rest": [14.743367, 13.110893, 0.029047, 2.62197, 10.044949, 2.828601],
+    "at the limit of friction": [38.808322, 19.428271, 0.01597, 3.137182, 6.318142, 1.985941],
+    "rings": [35.855828, 6.586639, 0.018435, 2.537466, 14.851757, 3.58999],
+}
+
+
+@pytest.mark.parametrize("name", [*list(JAWS)[:2], *(pytest.param(n, marks=pytest.mark.slow) for n in list(JAWS)[2:])])
+def test_a_body_that_sticks_and_slips_and_rings(name):
+    """Dozens of crossings, some of which touch a corner alone. The slow cases have more than `MOST_CROSSINGS`."""
+    p = dict(zip(("xc", "k", "d", "fc", "kt", "R"), JAWS[name], strict=True))
+    times, knots = np.arange(1, 350) * 0.008, np.array([0.0, 0.05, 0.9, 1.3, 1.7, 1.95, 2.2, 2.8])
+    volts = np.array([0.0, 4.0, 6.0, 9.0, -1.5, 0.0, 2.5])
+    problem = problem_of(jaw, [0.0] * 3, p, 2.8, samples(2.8, 350, np.zeros(350)), inputs=sf.Input(knots[:-1], volts))
+
+    def slope(t, x, u):
+        spring = p["k"] * (x[0] - p["xc"]) + p["d"] * x[1] if x[0] > p["xc"] else 0.0
+        pull = p["kt"] * x[2] - spring - p["fc"] * np.tanh(x[1] / 1e-5)
+        return [x[1], 1000.0 * pull / 0.35, (u - p["R"] * x[2] - 0.012 * x[1]) / 0.05]
+
+    x, expected, times = np.zeros(3), 0.0, problem.experiments[0].data[0].times
+    for begin, end, u in zip(knots[:-1], knots[1:], volts, strict=True):
+        there = times[(times > begin) & (times <= end)]
+        settings = {"method": "LSODA", "rtol": 1e-8, "atol": 1e-10, "max_step": 0.004, "args": (u,)}
+        found = solve_ivp(slope, (begin, end), x, t_eval=np.union1d(there, end), **settings)
+        x, expected = found.y[:, -1], expected + 0.5 * np.sum(found.y[0, : len(there)] ** 2)
+    found = sf.evaluate(problem)
+    assert found.cost == pytest.approx(expected, rel=1e-5)
+    assert np.isfinite(found.gradient).all()
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------

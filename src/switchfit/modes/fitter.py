@@ -238,7 +238,7 @@ class Fitter:
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Bounds of the parameters and initial states: (M,), (M,)."""
         unknowns = self.problem.unknowns
-        return unknowns.lower[self.first :], unknowns.upper[self.first :]
+        return unknowns.lowest[self.first :], unknowns.upper[self.first :]
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -325,7 +325,7 @@ class Beam:
         self.own = in_theta - int(unknowns.is_time.sum())
         self.into = np.zeros((S + len(same), S + len(in_theta)))
         self.into[:S, :S], self.into[S:, S:] = np.eye(S), self.places[:, None] == np.arange(len(in_theta))
-        self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
+        self.lower, self.upper = unknowns.lowest[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
         self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
         is_unknown = any(item.sigma is None for item in run.measurements)

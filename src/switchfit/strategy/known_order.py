@@ -122,7 +122,7 @@ class Beams:
         unknowns, places, moved, near = self.problem.unknowns, self.first + self.shared, q.copy(), q[self.shared]
         _, g, h = PriorTerms(*(values[places] for values in unknowns.priors)).evaluate(near, gauss_newton=True)
         solved = _solve(self.matrices.sum(0) + np.diag(h), self.slopes.sum(0) + h * near - g, near)
-        moved[self.shared] = np.clip(solved, unknowns.lower[places], unknowns.upper[places])
+        moved[self.shared] = np.clip(solved, unknowns.lowest[places], unknowns.upper[places])
         return moved
 
 

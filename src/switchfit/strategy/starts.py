@@ -142,7 +142,7 @@ def fit_briefly(
 
 def make_feasible(problem: Problem, theta: FloatArray) -> FloatArray:
     """Return theta (d,) inside its bounds, the times of each run inside its horizon and in order."""
-    theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
+    theta = np.clip(theta, problem.unknowns.lowest, problem.unknowns.upper)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         free = where[where >= 0]
         theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.end))
