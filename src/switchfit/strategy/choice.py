@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, get_args
 
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
-from switchfit.fit.evaluator import measure_variation
+from switchfit.fit.evaluator import evaluator_of, measure_variation
 from switchfit.fit.result import Step
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
@@ -260,6 +261,9 @@ def estimate(
             report = _write_to(line, name, callback)
             return fit_locally(problem, start=start, callback=report, first_cost=first_cost, **settings)
 
+        with suppress(NotIntegrableError):  # the fit says why
+            evaluator_of(problem)
+        compiled = time.perf_counter() - began
         best, failure = None, None
         try:
             best = fit(start, "fit")
@@ -277,7 +281,7 @@ def estimate(
         if best is not None and is_over:
             return best
         search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, other)
-        search.run(callback, budget)
+        search.run(callback, budget, compiled)
         if failure is not None and search.best is None:
             raise failure
         return search.finish()
@@ -342,12 +346,15 @@ class Search:
         self.steps = [Step(name, self.lowest, self.evaluations, time.perf_counter() - self.began)]
         self.first_cost = np.nan if self.best is None else self.best.initial_cost
 
-    def run(self, callback: Callable[[IterationRecord], object] | None, budget: float | None) -> None:
-        """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
+    def run(self, callback: Callable[[IterationRecord], object] | None, budget: float | None, compiled: float) -> None:
+        """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far. Of what the
+        first fit has taken, the seconds in which programs were compiled do not count.
+        """
         Search.running += 1
         try:
             strategies = self._list_strategies()  # compiles
-            most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * self.steps[0].seconds)
+            took = self.steps[0].seconds - compiled
+            most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * took)
             with limit_time(most if budget is None else budget - (time.perf_counter() - self.began), callback):
                 for name, find in strategies:
                     if is_late() or not self._try(name, find):
