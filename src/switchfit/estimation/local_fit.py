@@ -26,8 +26,8 @@ from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.sqp import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray
 from switchfit.problem.inspection import find_comparisons
-from switchfit.problem.problem import Problem, keep_with_problem, require_estimable
-from switchfit.problem.validation import as_choice, as_count, as_instance, as_positive, join_names, shorten
+from switchfit.problem.problem import Problem, keep_with_problem
+from switchfit.problem.validation import as_choice, as_count, as_positive, join_names, shorten
 from switchfit.runtime.errors import Issue, NotIntegrableError
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 
@@ -76,8 +76,6 @@ def fit_locally(
     ValueError
         For a bad setting.
     """
-    as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
-    require_estimable(problem)
     hessian = as_choice(hessian, "hessian", HESSIANS)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     if problem.constraint_names and hessian not in ("auto", "exact"):

@@ -22,8 +22,8 @@ from switchfit.fit.result import Step
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, ReferenceSignal
-from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_choice, as_positive
+from switchfit.problem.problem import Problem, require_estimable
+from switchfit.problem.validation import as_callable, as_choice, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
 from switchfit.strategy.hops import can_reinsert, choose_hops, reinsert_modes
@@ -247,6 +247,8 @@ def estimate(
     >>> fit.transition_times[0].round(2), round(float(fit.parameters["k"]), 2)
     (array([2.46]), 0.39)
     """
+    as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
+    require_estimable(problem)
     strategy = as_choice(strategy, "strategy", STRATEGIES)
     budget = None if time_budget is None else as_positive(time_budget, "time_budget")
     if callback is not None:
