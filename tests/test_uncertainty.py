@@ -1,5 +1,6 @@
 """Both covariances, identifiability in words, tests of the residuals, the certificate; and slowly, coverage."""
 
+import re
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -316,6 +317,23 @@ def test_unstable_explicit_steps_are_not_called_wrong_derivatives():
     assert [issue.kind for issue in check.failures] == ["cost not continuous"]
     assert "J jumps at this theta or near it" in str(check)
     assert "solver='stiff'" in str(check)
+
+
+def test_a_comparison_of_an_input_with_an_unknown_is_named_where_derivatives_fail():
+    """A dead band: how the time at which the input leaves it moves is left out."""
+
+    def flow(t, x, p, u):
+        return p["k"] * jnp.sign(u) * jnp.maximum(jnp.abs(u) - p["w"], 0.0) - 0.3 * x
+
+    knots = [0.0, 0.6, 1.2, 0.3, -0.5, -1.1, -0.4, 0.5, 1.3, 0.9, 0.2, -0.6, -0.2]
+    command, times = sf.Input(np.arange(13.0), knots, kind="linear"), np.arange(0.25, 12.0, 0.25)
+    data = sf.Measurements(times, 0.7 * np.sin(times), sigma=0.03)
+    run = sf.Experiment(data, ("m",), (), 0.0, 12.0, inputs=command)
+    problem = sf.Problem(sf.HybridSystem({"m": flow}, [0.0]), run, {"w": 0.3, "k": 0.7})
+    check = sf.check_derivatives(problem, paper=False)
+    assert [issue.kind for issue in check.failures] == ["hidden switch"]
+    assert re.search(r"mode 'm' bends with w at test_uncertainty.py:\d+, and derivatives leave out", str(check))
+    assert "hidden switch" in [issue.kind for issue in sf.estimate(problem, strategy="local").certificate.failures]
 
 
 def test_a_cost_that_is_not_finite_nearby_says_nothing_about_derivatives():

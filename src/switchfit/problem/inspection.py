@@ -117,6 +117,9 @@ SMOOTH = ("jnp.interp",)
 Names = frozenset[str]
 NONE: Names = frozenset()
 
+BENDS = frozenset({"max", "min", "clamp", "abs"})
+"""Operations that are continuous, and have a corner."""
+
 STATE = ""
 """Stands for the state among the names of parameters."""
 
@@ -132,18 +135,32 @@ def find_comparisons(problem: Problem) -> dict[int, str]:
     ----------
     problem : Problem
     """
+    return _find_places(problem)
+
+
+def find_bends(problem: Problem) -> dict[int, str]:
+    """Return what `find_comparisons` does, with the operations that bend alone, such as ``maximum``.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    return _find_places(problem, bends=True)
+
+
+def _find_places(problem: Problem, bends: bool = False) -> dict[int, str]:
     found: dict[str, str] = {}
     for run, structure in zip(problem.experiments, problem.structures, strict=True):
         for role, function in structure.acting.items():
             # Where a mode compares with its state, rows end, and derivatives have all of it: see `corners`.
-            for parameter, what in list_comparisons(function, with_state=not role.startswith("mode ")):
+            for parameter, what in list_comparisons(function, with_state=not role.startswith("mode "), bends=bends):
                 found.setdefault(run.parameter_map.get(parameter, parameter), f"{role} {what}")
     spans = problem.unknowns.parameters.items()
     return {i: found[name] for name, span in spans if name in found for i in range(span.start, span.stop)}
 
 
 @lru_cache(maxsize=1024)
-def list_comparisons(function: Function, with_state: bool = True) -> tuple[tuple[str, str], ...]:
+def list_comparisons(function: Function, with_state: bool = True, bends: bool = False) -> tuple[tuple[str, str], ...]:
     """Return the parameters with which a function compares, in the order of its operations, and what it does, such as
     "compares with k at model.py:12".
 
@@ -152,11 +169,13 @@ def list_comparisons(function: Function, with_state: bool = True) -> tuple[tuple
     function : Function
     with_state : bool
         Whether a comparison of the state, the second argument, with a parameter counts.
+    bends : bool
+        Whether operations that only bend count too.
     """
     others = [NONE] * (len(function.jaxpr.invars) - len(function.parameters))
     if not with_state:
         others[1] = frozenset({STATE})
-    walk = _Comparing()
+    walk = _Comparing(bends)
     walk.run(function.jaxpr, function.consts, [*others, *(frozenset({name}) for name in function.parameters)])
     return tuple(dict.fromkeys(walk.found))
 
@@ -164,7 +183,8 @@ def list_comparisons(function: Function, with_state: bool = True) -> tuple[tuple
 class _Comparing(Walk):
     """Finds the comparisons of a function; what it follows are the parameters on which values depend."""
 
-    def __init__(self) -> None:
+    def __init__(self, bends: bool) -> None:
+        self._bends = bends
         self.found: list[tuple[str, str]] = []
 
     def constant(self, value: Any) -> Names:
@@ -172,8 +192,9 @@ class _Comparing(Walk):
 
     def apply(self, equation: Any, given: list[Names], origin: Any) -> list[Names]:
         names = NONE.union(*given)
-        if _jumps(equation) and STATE not in names:
-            verb, line = VERBS[equation.primitive.name], find_line(origin)
+        is_bend = self._bends and equation.primitive.name in BENDS
+        if (is_bend or _jumps(equation)) and STATE not in names:
+            verb, line = VERBS.get(equation.primitive.name, "bends with"), find_line(origin)
             self.found += [(name, f"{verb} {name}{line and f' at {line}'}") for name in sorted(names)]
         results = [names] * len(equation.outvars)
         for inner, own in _list_calls(equation, given):

@@ -343,6 +343,9 @@ _ISSUES: dict[str, Sentence] = {
     "solver='stiff'",
     "cost not continuous": "J jumps at this theta or near it, whatever its derivatives are. Steps of a stiff mode may "
     "be unstable: give the Problem solver='stiff'",
+    "hidden switch": "{0}, and derivatives leave out how that place moves: they are right up to the error of the mesh "
+    "where the model only bends there, for which a smaller rtol helps, and wrong where it jumps. Make it a transition, "
+    "or use a smooth function",
     "derivatives of another cost": "the derivatives do not belong to the cost",
     # Why a line search failed, or a fit ended with an error
     "wrong slope": "The gradient does not belong to the cost: along that direction it says {before:.3g}, differences "

@@ -33,7 +33,7 @@ from switchfit.fit.trajectory import compare, replace_values
 from switchfit.optimize import Status
 from switchfit.optimize.matrix import null_space
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.inspection import find_unread
+from switchfit.problem.inspection import find_bends, find_unread
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.problem.validation import as_flag, as_instance
@@ -71,6 +71,8 @@ class DerivativeCheck(Printed):
         Relative gap between the paper's equations (6)-(17) and the discretized cost's exact derivatives; with half the
         steps if it is above 1e-4 without: integration error of the paper's adjoints closes then, a wrong derivative
         does not. Infinite if the paper's equations overflow, NaN if not checked.
+    switch : str
+        Which function compares an unknown with an input or the time, and where; empty if none does.
 
     See Also
     --------
@@ -96,6 +98,7 @@ class DerivativeCheck(Printed):
     stiff: bool
     gradient_gap: float = np.nan
     hessian_gap: float = np.nan
+    switch: str = ""
 
     def __repr__(self) -> str:
         orders = ", ".join(f"{order:.2f}" for order in self.observed_orders)
@@ -122,7 +125,8 @@ class DerivativeCheck(Printed):
             return (Issue("cost not finite"),)
         if not are_orders_right(self.observed_orders[:1]):
             return (Issue("cost not continuous"),)
-        found = [] if are_orders_right(self.observed_orders) else [Issue("derivatives of another cost")]
+        wrong = Issue("hidden switch", (self.switch,)) if self.switch else Issue("derivatives of another cost")
+        found = [] if are_orders_right(self.observed_orders) else [wrong]
         largest = max(self.gradient_gap, self.hessian_gap)
         if largest > LARGEST_GAP and not self.stiff:  # False if not checked: NaN
             found.append(Issue("derivative gap", figures={"gap": largest}))
@@ -196,7 +200,8 @@ def compare_derivatives(evaluator: Evaluator, theta: FloatArray, *, paper: bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
     gaps = measure_closing_gap(evaluator, at) if paper else (np.nan, np.nan)
-    return DerivativeCheck(steps, remainders, orders, at, evaluator.takes_implicit_steps, *gaps)
+    switch = next(iter(find_bends(evaluator.problem).values()), "")
+    return DerivativeCheck(steps, remainders, orders, at, evaluator.takes_implicit_steps, *gaps, switch)
 
 
 def are_orders_right(observed: tuple[float, ...]) -> bool:
@@ -717,4 +722,5 @@ def _find_failures(fit: Fit, smallest: float, check: DerivativeCheck) -> Iterato
     yield from (issue for issue in check.failures if issue.kind == "derivative gap")
     # The first order is not tested: at a minimum, the gradient vanishes.
     if not are_orders_right((np.nan, *check.observed_orders[1:])):
-        yield Issue("Taylor orders", figures={"orders": check.observed_orders})
+        orders = Issue("Taylor orders", figures={"orders": check.observed_orders})
+        yield Issue("hidden switch", (check.switch,)) if check.switch else orders
