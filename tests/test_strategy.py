@@ -612,6 +612,32 @@ def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found(friction)
     assert not again.steps, "of two minima that are known the lower one is left as it is"
 
 
+def test_a_minimum_behind_a_kink_where_a_pendulum_turns_once_more_is_found():
+    """It is driven until 5.3 s, and rests by dry friction. Its J has two minima, 4 standard errors of mu apart."""
+    times = np.arange(0.1, 14.0, 0.1)
+
+    def swing(t, x, p, drive=0.0):
+        return jnp.stack([x[1], drive - 9.81 * jnp.sin(x[0]) - p["mu"] * jnp.sign(x[1]) - p["c"] * x[1]])
+
+    def driven(t, x, p):
+        return swing(t, x, p, p["torque"] * jnp.cos(2.5 * t))
+
+    def build(values, switch, guesses):
+        log = sf.Measurements(times, values, sigma=0.01, observe=lambda t, x, p: x[:1])
+        run = sf.Experiment(log, ("driven", "free"), (switch,), 0.0, 14.0)
+        system = sf.HybridSystem({"driven": driven, "free": swing}, [0.3, 0.0])
+        return sf.Problem(system, run, dict(zip(("mu", "c", "torque"), guesses, strict=True)))
+
+    truth = np.array([5.3, 0.4, 0.15, 2.0])
+    exact = sf.simulate(build(0.0 * times, truth[0], truth[1:]), times=times).states[:, 0]
+    problem = build(exact + 0.01 * np.random.default_rng(1).normal(size=139), 5.28, (0.38, 0.17, 2.0))
+    near, fit = sf.estimate(problem, strategy="local"), sf.estimate(problem)
+    assert near.verdict.level == "good"
+    assert fit.cost < near.cost - 1.0
+    assert fit.cost == pytest.approx(sf.estimate(problem, start=truth, strategy="local").cost, rel=1e-6)
+    assert fit.steps[-1].strategy == choice.OTHER
+
+
 @pytest.mark.parametrize(("seed", "status"), [(0, Status.CONVERGED_AT_KINK), (1, Status.CONVERGED)])
 def test_a_narrow_minimum_far_away_is_found_from_a_kink_too(seed, status):
     """A lag is driven in steps and leaks faster from 5.2 s on. It is at rest from 5.6 to 7.2 s: a switch there or a

@@ -143,6 +143,11 @@ class SplitEngine:
         at_guess = self._run.vectors(self._run.problem.initial_theta)
         return (self._split or self._recall_path() or self._find_path(*at_guess)).engine.engine
 
+    @property
+    def path(self) -> tuple[Any, ...]:
+        """The branches that the last trajectory has run in, and their ends; empty where it could not be followed."""
+        return () if self._split is None else self._split.path[:2]
+
     def judge_rows(self) -> None:
         """Estimate the errors of rows in all evaluations from now on."""
         self._judges_rows = True

@@ -205,6 +205,11 @@ class Evaluator:
         """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
         return summarize(self.engines, self.problem.run_names)
 
+    @property
+    def paths(self) -> list[tuple[Any, ...]]:
+        """The path of the last trajectory of each experiment through the corners of its modes; empty without any."""
+        return [engine.path if isinstance(engine, SplitEngine) else () for engine in self.engines]
+
     def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
         """Simulate all experiments row by row, with the derivatives of rows if `tangents`."""
         each = zip(self.engines, self._vectors(theta), strict=True)

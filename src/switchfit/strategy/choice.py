@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -26,7 +27,7 @@ from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_callable, as_choice, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
-from switchfit.strategy.hops import can_reinsert, choose_hops, reinsert_modes
+from switchfit.strategy.hops import can_reinsert, choose_hops, look_beyond_corners, reinsert_modes
 from switchfit.strategy.known_order import explain_no_beam, find_times
 from switchfit.strategy.starts import (
     End,
@@ -147,10 +148,13 @@ logger = logging.getLogger("switchfit")
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
 
-OTHER = "another minimum in a time"
+OTHER = "another minimum near by"
 BEAM, REINSERT, STARTS = "beam along the log", "removal and re-insertion", "many starts"
 """Names of strategies. The re-insertion is for costs without data: of the fishing of the benchmark a fit takes 40 ms
 with it, and 690 ms by many starts."""
+
+MOST_LEFT = 4
+"""Times that a search goes on to another minimum near by."""
 
 MORE = "more iterations"
 """Name of what is no search: a fit that has not converged goes on."""
@@ -187,8 +191,8 @@ def estimate(
     strategy : {"auto", "local", "thorough"}
         "local": one fit from the first guess. "auto": more where the verdict on it is not good, and for costs without
         data, whose verdict knows no quality of fit: a beam that follows hypotheses about the times through the log,
-        where it applies, then many starts, until the verdict is good. Where it is good, another minimum in a transition
-        time is tried if J may be lower there. "thorough": all of them, whatever the verdict.
+        where it applies, then many starts, until the verdict is good. Where it is good, another minimum near by is
+        tried if J may be lower there. "thorough": all of them, whatever the verdict.
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
         not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
@@ -289,13 +293,18 @@ def estimate(
         return search.finish()
 
 
-def find_other_minimum(fit: Estimate) -> FloatArray | None:
-    """Return a start at another minimum in a transition time that may be lower than the end of a good fit, if any."""
+def find_other_minimum(fit: Estimate, *, in_times: bool = True) -> FloatArray | None:
+    """Return a start at another minimum that may be lower than the end of a good fit, if any: in a transition time, or
+    where the state meets corners in another way.
+    """
     evaluator = fit.evaluator_at_solution()
     if not evaluator.problem.is_sigma_known or not fit.status.is_strict_minimum:
         return None
     try:
-        return next(iter(choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors)), None)
+        hops = choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors) if in_times else []
+        if hops or evaluator.problem.constraint_names:
+            return next(iter(hops), None)
+        return look_beyond_corners(evaluator, fit.theta, fit.cost, fit.covariance)
     except (KeyboardInterrupt, NotIntegrableError):  # the fit stays
         return None
 
@@ -354,13 +363,14 @@ class Search:
         """
         Search.running += 1
         try:
-            strategies = self._list_strategies()  # compiles
+            strategies = self._list_strategies() if self.other is None else []  # compiles
             took = self.steps[0].seconds - compiled
             most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * took)
             with limit_time(most if budget is None else budget - (time.perf_counter() - self.began), callback):
                 for name, find in strategies:
                     if is_late() or not self._try(name, find):
                         break
+                self._leave_minimum()
         except KeyboardInterrupt:
             if self.best is None:
                 raise
@@ -400,8 +410,6 @@ class Search:
     def _list_strategies(self) -> list[tuple[str, Callable[[FloatArray], End]]]:
         """Return the strategies that apply to the problem, the cheapest first."""
         problem, best = self.problem, self.best
-        if self.other is not None:  # what the first fit has found is enough
-            return [(OTHER, lambda theta: fit_briefly(problem, make_feasible(problem, self.other)))]
         reason = explain_no_beam(problem)
         if not reason:
             return [(BEAM, lambda theta: find_times(problem, self.theta, self._is_good)), (STARTS, self._try_starts)]
@@ -412,6 +420,20 @@ class Search:
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
         return [*found, (STARTS, self._try_starts)]
+
+    def _leave_minimum(self) -> None:
+        """Go on to lower minima near the best, if any."""
+        start = self.other
+        for _ in range(MOST_LEFT):
+            if start is None and self.best is not None and is_enough(self.problem, self.best, self.steps):
+                start = find_other_minimum(self.best, in_times=False)
+            if start is None or is_late():
+                break
+            before = self.lowest
+            self._try(OTHER, partial(fit_briefly, self.problem), make_feasible(self.problem, start))
+            if self.lowest == before:
+                break
+            start = None
 
     def _try_starts(self, theta: FloatArray) -> End:
         if self.best is not None and is_minimum_time(self.problem, self.best):
@@ -435,15 +457,17 @@ class Search:
         size = self.problem.smallest_cost
         return max(LOWER * abs(cost), size if self.problem.is_least_squares else LOWER * size)
 
-    def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
-        """Run one strategy; a full fit follows where its end is lower than the best so far. Return whether to go on."""
+    def _try(self, name: str, find: Callable[[FloatArray], End], start: FloatArray | None = None) -> bool:
+        """Run one strategy, from the best so far unless it has a start of its own; a full fit follows where its end is
+        lower. Return whether to go on.
+        """
         began = time.perf_counter()
         logger.info("strategy: %s (lowest J so far: %.6g)", name, self.lowest)
         self.line.write(name, self.lowest)
-        theta, before, ended = self.theta if self.best is None else self.best.theta, self.lowest, ""
-        evaluations = 0
+        known = self.theta if self.best is None else self.best.theta
+        before, evaluations, ended = self.lowest, 0, ""
         try:
-            end = find(theta)
+            end = find(known if start is None else start)
             evaluations = end.evaluations
             if self._is_lower(end.cost):
                 fit = self.fit(end.theta, f"{name}, fit of its end", np.nan_to_num(self.first_cost))

@@ -6,7 +6,8 @@ minimum.
 
 Farther away J may have another minimum, too: where the difference of two vector fields changes its sign, as it does of
 a mass on a spring, a switch on the other side of that has nearly the same effect. What is left may be noise by its size
-at both.
+at both. So it may where the state meets corners: J has a kink where a trajectory takes another path through them, as
+where a pendulum with dry friction turns once more before it rests, and may have a minimum on either side.
 
 Removal and re-insertion of modes: what local minima in switching times are made of is undone.
 
@@ -30,6 +31,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.branches import has_corners
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize import lapack
@@ -58,6 +60,13 @@ Between two equal minima J is like (s (s - D))² at the distance s from one: at 
 
 SCAN_STEP = 1 / 40
 """Largest distance of two places, as a part of the horizon: others may be narrow. A scan from a kink begins with it."""
+
+BEYOND = (2.0, 4.0)
+"""Standard errors from a minimum, along each unknown with the others following, at which other paths are looked for. Of
+48 fits of a pendulum with dry friction 10 ended 0.6 to 2.8 above another minimum, which these found in all cases."""
+
+WORTH = 0.1
+"""By how much J has to be lower on another path for a fit: the data cannot tell less, and the model errs as much."""
 
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
@@ -221,6 +230,41 @@ def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -
             for j in np.flatnonzero(falls[:-1] & ~falls[1:]).tolist():
                 low, high = sorted((times[j], times[j + 2] if j + 2 < count else end))
                 yield place, float(low), float(high)
+
+
+def look_beyond_corners(
+    evaluator: Evaluator, theta: FloatArray, cost: float, covariance: FloatArray
+) -> FloatArray | None:
+    """Return where the quadratic model of J about a point near by is lowest, if that is below the cost at theta and the
+    trajectory of the point takes another path through the corners of its modes; None if there is no such point.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+        A minimum.
+    cost : float
+    covariance : (d, d)
+    """
+    errors = np.sqrt(covariance.diagonal())
+    if not any(map(has_corners, evaluator.structures)):
+        return None
+    evaluator.cost(theta)
+    lowest, best, path = cost - WORTH, None, evaluator.paths
+    for place in np.flatnonzero(errors > 0.0):
+        for side in (-1.0, 1.0):
+            for distance in BEYOND:
+                point = theta + side * distance / errors[place] * covariance[:, place]
+                point = make_feasible(evaluator.problem, point)
+                if not np.isfinite(evaluator.cost(point)):
+                    break
+                if evaluator.paths != path:
+                    there = evaluator(point)
+                    found = _minimize(there.gradient, there.hessian, errors > 0.0, int(place), -np.inf, np.inf)
+                    if found is not None and there.cost + found[0] < lowest:
+                        lowest, best = there.cost + found[0], point + found[1]
+                    break
+    return best
 
 
 PLACES = 60
