@@ -27,7 +27,7 @@ from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_callable, as_choice, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
-from switchfit.strategy.hops import can_reinsert, choose_hops, look_beyond_corners, reinsert_modes
+from switchfit.strategy.hops import can_reinsert, find_far_minima, look_beyond_corners, reinsert_modes
 from switchfit.strategy.known_order import explain_no_beam, find_times
 from switchfit.strategy.starts import (
     End,
@@ -277,36 +277,37 @@ def estimate(
             if strategy == "local":
                 raise
             failure = error
-        other, is_over = None, strategy == "local"
+        others: list[FloatArray] = []
+        is_over = strategy == "local"
         if best is not None and strategy == "auto":
             only_few = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # were asked for
             is_over = hessian != "auto" or only_few
             if not is_over and is_enough(problem, best):
-                other = find_other_minimum(best)
-                is_over = other is None
+                others = find_other_minima(best)
+                is_over = not others
         if best is not None and is_over:
             return best
-        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, other)
+        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, others)
         search.run(callback, budget, compiled)
         if failure is not None and search.best is None:
             raise failure
         return search.finish()
 
 
-def find_other_minimum(fit: Estimate, *, in_times: bool = True) -> FloatArray | None:
-    """Return a start at another minimum that may be lower than the end of a good fit, if any: in a transition time, or
-    where the state meets corners in another way.
+def find_other_minima(fit: Estimate, *, in_times: bool = True) -> list[FloatArray]:
+    """Return starts at other minima that may be lower than the end of a good fit, the best first: in a transition time,
+    or where the state meets corners in another way.
     """
     evaluator = fit.evaluator_at_solution()
     if not evaluator.problem.is_sigma_known or not fit.status.is_strict_minimum:
-        return None
+        return []
     try:
-        hops = choose_hops(evaluator, fit.theta, fit.cost, errors=fit.standard_errors) if in_times else []
+        hops = find_far_minima(evaluator, fit.theta, fit.cost, fit.standard_errors) if in_times else []
         if hops or evaluator.problem.constraint_names:
-            return next(iter(hops), None)
+            return hops
         return look_beyond_corners(evaluator, fit.theta, fit.cost, fit.covariance)
     except (KeyboardInterrupt, NotIntegrableError):  # the fit stays
-        return None
+        return []
 
 
 def _write_to(
@@ -346,7 +347,7 @@ class Search:
     fit: Callable[..., Estimate]
     began: float
     line: Line
-    other: FloatArray | None = None
+    others: Sequence[FloatArray] = ()
     starts: Starts | None = None
     running: ClassVar[int] = 0
 
@@ -363,7 +364,7 @@ class Search:
         """
         Search.running += 1
         try:
-            strategies = self._list_strategies() if self.other is None else []  # compiles
+            strategies = [] if self.others else self._list_strategies()  # compiles
             took = self.steps[0].seconds - compiled
             most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * took)
             with limit_time(most if budget is None else budget - (time.perf_counter() - self.began), callback):
@@ -423,17 +424,17 @@ class Search:
 
     def _leave_minimum(self) -> None:
         """Go on to lower minima near the best, if any."""
-        start = self.other
+        starts = self.others
         for _ in range(MOST_LEFT):
-            if start is None and self.best is not None and is_enough(self.problem, self.best, self.steps):
-                start = find_other_minimum(self.best, in_times=False)
-            if start is None or is_late():
-                break
+            if not starts and self.best is not None and is_enough(self.problem, self.best, self.steps):
+                starts = find_other_minima(self.best, in_times=False)
             before = self.lowest
-            self._try(OTHER, partial(fit_briefly, self.problem), make_feasible(self.problem, start))
+            for start in starts:
+                if not is_late() and self.lowest == before:
+                    self._try(OTHER, partial(fit_briefly, self.problem), make_feasible(self.problem, start))
             if self.lowest == before:
                 break
-            start = None
+            starts = ()
 
     def _try_starts(self, theta: FloatArray) -> End:
         if self.best is not None and is_minimum_time(self.problem, self.best):

@@ -24,7 +24,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 
@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.engine.branches import has_corners
-from switchfit.engine.protocol import Evaluation
+from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize import lapack
 from switchfit.problem.data import FloatArray
@@ -57,6 +57,10 @@ ROUNDS = 12
 SCAN_FIRST, SCAN_RATIO = 3.0, 1.6
 """Distance of the first place of a scan of J over a time, in standard errors, and of each place to that before it.
 Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other."""
+
+MODELS, RIGHT = 4, 0.2
+"""Models of which each is about the minimum of the last, and the part of what a minimum is above the cost below which
+the error of J there makes no difference."""
 
 SCAN_STEP = 1 / 40
 """Largest distance of two places, as a part of the horizon: others may be narrow. A scan from a kink begins with it."""
@@ -96,11 +100,7 @@ def is_lower(cost: float, than: float) -> bool:
 
 
 def choose_hops(
-    evaluator: Evaluator,
-    theta: FloatArray,
-    cost: float,
-    free: NDArray[np.bool_] | None = None,
-    errors: FloatArray | None = None,
+    evaluator: Evaluator, theta: FloatArray, cost: float, free: NDArray[np.bool_] | None = None
 ) -> list[FloatArray]:
     """Return starts in sample intervals near by where J may be lower than the cost at theta, the best first.
 
@@ -111,66 +111,110 @@ def choose_hops(
     cost : float
     free : (d,) bool, optional
         Unknowns that may move; those at a bound do not.
-    errors : (d,), optional
-        Standard errors: J is scanned for minima farther away instead.
     """
     unknowns = evaluator.problem.unknowns
-    inside = (unknowns.lower < theta) & (theta < unknowns.upper)
-    free, intervals = inside if free is None else inside & free, []
-    for e, run in enumerate(evaluator.problem.experiments):
-        if errors is None:
-            intervals.append(list(_list_intervals(run, unknowns.times[e], list_sample_times(run), theta)))
-        else:
-            intervals.append(list(_scan(evaluator, e, theta, errors)))
-    if not any(intervals):
-        return []
-    whole = evaluator(theta)
-    hops = [hop for e, own in enumerate(intervals) if own for hop in _list_hops(evaluator, e, whole, theta, free, own)]
+    intervals = [
+        list(_list_intervals(run, unknowns.times[e], list_sample_times(run), theta))
+        for e, run in enumerate(evaluator.problem.experiments)
+    ]
+    hops = _list_hops(evaluator, theta, intervals, np.ones(len(theta), bool) if free is None else free)
     near = sorted(hops, key=lambda hop: hop[0])[:MOST]
     again = [find_lowest(start) for lowest, start, find_lowest in near if np.isfinite(lowest)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
 
 
+def find_far_minima(evaluator: Evaluator, theta: FloatArray, cost: float, errors: FloatArray) -> list[FloatArray]:
+    """Return points beside other minima in a transition time at which J is lower than the cost at theta, the best
+    first.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+        A minimum.
+    cost : float
+    errors : (d,)
+        Standard errors.
+    """
+    problem = evaluator.problem
+    intervals = [list(_scan(evaluator, e, theta, errors)) for e in range(len(problem.experiments))]
+    found = []
+    # Far away residuals are large at first, and so is their part of the exact Hessian.
+    for lowest, start, find_lowest in _list_hops(evaluator, theta, intervals, errors > 0.0, "gauss-newton"):
+        for _ in range(MODELS):
+            point = make_feasible(problem, start)
+            there = evaluator.cost(point)
+            if is_lower(there, cost):
+                found.append((there, point))
+            # A model that is right and not lower than the cost has nothing to tell.
+            if not there > cost or abs(there - lowest) < RIGHT * (lowest - cost):
+                break
+            lowest, start = find_lowest(point)
+    return [point for _, point in sorted(found, key=lambda each: each[0])]
+
+
 def _list_hops(
+    evaluator: Evaluator,
+    theta: FloatArray,
+    intervals: Sequence[list[tuple[int, float, float]]],
+    free: NDArray[np.bool_],
+    otherwise: Matrix = "exact",
+) -> Iterator[tuple[float, FloatArray, FindLowest]]:
+    """Yield for each of some intervals of each run the lowest J of the quadratic model about its middle, theta there,
+    and a function that returns both of the model about another point.
+
+    The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
+    point; with the matrix `otherwise` where its exact Hessian leads to no minimum.
+    """
+    if not any(intervals):
+        return
+    unknowns, whole = evaluator.problem.unknowns, evaluator(theta)
+    free = free & (unknowns.lower < theta) & (theta < unknowns.upper)
+    for e, listed in enumerate(intervals):
+        here = _evaluate_run(evaluator, e, theta) if listed else whole
+        for place, low, high in listed:
+            model = partial(_find_lowest, evaluator, e, whole, here, theta, free, otherwise, place, low, high)
+            middle = theta.copy()
+            middle[place] = 0.5 * (low + high)
+            yield *model(middle), model
+
+
+def _find_lowest(
     evaluator: Evaluator,
     e: int,
     whole: Evaluation[FloatArray],
+    here: Evaluation[FloatArray],
     theta: FloatArray,
     free: NDArray[np.bool_],
-    intervals: list[tuple[int, float, float]],
-) -> Iterator[tuple[float, FloatArray, FindLowest]]:
-    """Yield for each of some intervals of a run the lowest J of the quadratic model about its middle, theta
-    there, and a function that returns both of the model about another point.
-
-    The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
-    point.
+    otherwise: Matrix,
+    place: int,
+    low: float,
+    high: float,
+    point: FloatArray,
+) -> tuple[float, FloatArray]:
+    """Return the lowest J with the unknown at `place` between two values, and theta there (d,); infinite where the
+    model about the point has no minimum.
     """
-    problem, here = evaluator.problem, _evaluate_run(evaluator, e, theta)
-    own, mine = problem.own_places[e]
-
-    def find_lowest(place: int, low: float, high: float, point: FloatArray) -> tuple[float, FloatArray]:
-        """Return the lowest J with the unknown at `place` between two values, and theta there (d,); infinite where the
-        model about the point has no minimum.
-        """
-        check_time()
-        there = _evaluate_run(evaluator, e, point, side=1 if point[place] < high else -1)
-        away = (theta - point)[mine]
+    check_time()
+    own, mine = evaluator.problem.own_places[e]
+    side, away = 1 if point[place] < high else -1, (theta - point)[mine]
+    for matrix in dict.fromkeys(("exact", otherwise)):
+        there = _evaluate_run(evaluator, e, point, side, matrix)
         curvature = there.hessian[own[:, None], own]
         cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away
         gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
         np.add.at(gradient, mine, (there.gradient - here.gradient)[own] + curvature @ away)
         np.add.at(hessian, (mine[:, None], mine), curvature - here.hessian[own[:, None], own])
         found = _minimize(gradient, hessian, free, place, low - theta[place], high - theta[place])
-        return (np.inf, theta) if found is None else (float(cost + found[0]), theta + found[1])
-
-    for place, low, high in intervals:
-        middle = theta.copy()
-        middle[place] = 0.5 * (low + high)
-        yield *find_lowest(place, low, high, middle), partial(find_lowest, place, low, high)
+        if found is not None:
+            return float(cost + found[0]), theta + found[1]
+    return np.inf, theta
 
 
-def _evaluate_run(evaluator: Evaluator, e: int, theta: FloatArray, side: int = 1) -> Evaluation[FloatArray]:
-    return evaluator.engines[e].derivatives(*evaluator.problem.vectors(theta, e), side, "exact")
+def _evaluate_run(
+    evaluator: Evaluator, e: int, theta: FloatArray, side: int = 1, matrix: Matrix = "exact"
+) -> Evaluation[FloatArray]:
+    return evaluator.engines[e].derivatives(*evaluator.problem.vectors(theta, e), side, matrix)
 
 
 def _minimize(
@@ -234,9 +278,9 @@ def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -
 
 def look_beyond_corners(
     evaluator: Evaluator, theta: FloatArray, cost: float, covariance: FloatArray
-) -> FloatArray | None:
-    """Return where the quadratic model of J about a point near by is lowest, if that is below the cost at theta and the
-    trajectory of the point takes another path through the corners of its modes; None if there is no such point.
+) -> list[FloatArray]:
+    """Return where quadratic models of J about points near by are lowest, the best first, if that is below the cost at
+    theta and the trajectory of the point takes another path through the corners of its modes.
 
     Parameters
     ----------
@@ -246,11 +290,11 @@ def look_beyond_corners(
     cost : float
     covariance : (d, d)
     """
-    errors = np.sqrt(covariance.diagonal())
+    errors, models = np.sqrt(covariance.diagonal()), []
     if not any(map(has_corners, evaluator.structures)):
-        return None
+        return []
     evaluator.cost(theta)
-    lowest, best, path = cost - WORTH, None, evaluator.paths
+    path = evaluator.paths
     for place in np.flatnonzero(errors > 0.0):
         for side in (-1.0, 1.0):
             for distance in BEYOND:
@@ -261,10 +305,10 @@ def look_beyond_corners(
                 if evaluator.paths != path:
                     there = evaluator(point)
                     found = _minimize(there.gradient, there.hessian, errors > 0.0, int(place), -np.inf, np.inf)
-                    if found is not None and there.cost + found[0] < lowest:
-                        lowest, best = there.cost + found[0], point + found[1]
+                    if found is not None and there.cost + found[0] < cost - WORTH:
+                        models.append((there.cost + found[0], point + found[1]))
                     break
-    return best
+    return [start for _, start in sorted(models, key=lambda model: model[0])[:MOST]]
 
 
 PLACES = 60
