@@ -617,3 +617,30 @@ def test_a_wrong_sigma_is_told_from_modes():
     assert found.ending.reason == "sigma"
     assert abs(0.3 * found.ending.ratio - 1.0) < 0.15
     assert abs(found.best.residual_variance - 1.0) < 0.25
+
+
+def test_costs_of_modes_with_corners_are_those_of_an_estimate():
+    """A block that is driven, and comes to rest by dry friction."""
+
+    def drive(t, x, p):
+        return jnp.stack([x[1], p["a"] - 0.5 * x[1]])
+
+    def brake(t, x, p):
+        return jnp.stack([x[1], -p["b"] * jnp.sign(x[1])])
+
+    times, system = np.linspace(0.1, 10.0, 100), sf.HybridSystem({"drive": drive, "brake": brake}, [0.0, 0.0])
+
+    def pose(values, sequence, switches, a, b):
+        data = sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=0.02)
+        return sf.Problem(
+            system, sf.Experiment(data, sequence, switches, 0.0, 10.0), {"a": a, "b": sf.Parameter(b, lower=0.0)}
+        )
+
+    truth = ("drive", "brake", "drive", "brake")
+    exact = sf.simulate(pose(0.0 * times, truth, (2.0, 5.0, 7.0), 1.0, 0.8), times=times).states[:, 0]
+    values = exact + 0.02 * np.random.default_rng(0).normal(size=100)
+    search = sf.find_modes(pose(values, ("drive",), (), 1.2, 0.6), max_switches=4)
+    assert (search.status, search.mode_sequence) == (sf.ModeStatus.FOUND, truth)
+    for fitted in search.fitted:
+        own = pose(values, fitted.sequences[0], fitted.transition_times[0], *fitted.parameters)
+        assert fitted.cost == pytest.approx(sf.evaluate(own).cost, rel=1e-6)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Arguments, Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
+from switchfit.engine.branches import has_corners
 from switchfit.engine.jax import JaxEngine
 from switchfit.engine.native.engine import (
     FailedCheckError,
@@ -423,7 +424,8 @@ class Fitter:
     def _fit(self, schedules: list[Schedule], theta: FloatArray, failed: Fitted) -> Fitted:
         if not failed.has_unknowns:
             self.evaluations += 1
-            return replace(failed, cost=self.cost(schedules, failed.parameters))
+            cost = self._evaluate(schedules, failed.parameters)
+            return replace(failed, cost=cost if np.isfinite(cost) else np.inf)
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             evaluator = self.get_evaluator(schedules)
         held = self._hold(evaluator.problem.constraints, theta, failed.acting)
@@ -440,7 +442,8 @@ class Fitter:
             even = None if len(run.jump_times) else space_evenly(s.sequence, s.t0, s.tf, self.library)
             guesses.append(even or spread(s, self.library) or s)
         problem = self._build_problem(guesses)
-        if None in self._simulators or problem.system.guards or problem.constraint_names:
+        is_plain = None not in self._simulators and not any(map(has_corners, problem.structures))
+        if problem.constraint_names or not is_plain:
             return Evaluator(problem, meshes=self.meshes)
         found = object.__new__(Evaluator)
         found.problem, found.meshes, found.arguments = problem, self.evaluator.meshes, self.evaluator.arguments

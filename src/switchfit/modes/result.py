@@ -340,7 +340,8 @@ class ModeSearch(SearchRecord, Displayed):
         Fits, and evaluations of J with its derivatives.
     seconds : float
     fitted : tuple of ModeFit
-        The best sequence for each number of switches, ascending.
+        The best sequence that was met for each number of switches, ascending; those with fewer switches than the best
+        were fitted from few starts.
     chosen : tuple of ModeFit
         Sequences whose mBIC (see `ModeFit.weight`) is within 10 of the lowest, the best first.
     warnings : tuple of ModeWarning

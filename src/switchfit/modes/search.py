@@ -332,10 +332,10 @@ def _build_result(
 
 
 class _Search:
-    """One call of `find_modes`."""
+    """One call of `find_modes`; one inside it if it `assumes` other noise than is given."""
 
-    def __init__(self, problem: Problem, score: Score, settings: Settings) -> None:
-        self.problem, self.score, self.settings = problem, score, settings
+    def __init__(self, problem: Problem, score: Score, settings: Settings, *, assumes: bool = False) -> None:
+        self.problem, self.score, self.settings, self.assumes = problem, score, settings, assumes
         # Programs have room for the largest number of switches that a sequence has.
         self.library = replace(settings.library, max_switches=max(settings.library.possible_switches))
         self.fitter, self.pool = Fitter(problem, self.library), Pool(score, settings.criterion)
@@ -451,13 +451,13 @@ class _Search:
             What says so: of outliers a warning; where sigma is wrong, or the model, the data stay unexplained. None if
             the residuals are no such noise, or are not explained by it either.
         """
-        estimate = self._estimate_best() if self.score.has_chi_square else None
+        estimate = self._estimate_best() if self.score.has_chi_square and not self.assumes else None
         fault = "model" if estimate is None else measure_quality(estimate).suspect
         if estimate is None or fault == "model":
             return None
         problem = assume(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)
-        found = _Search(problem, score, self.settings).run()
+        found = _Search(problem, score, self.settings, assumes=True).run()
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None
         warnings, ending = found.warnings, found.ending
