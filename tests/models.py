@@ -65,8 +65,8 @@ def one_run(
     return sf.Problem(system, run, parameters or {}, **settings)
 
 
-def measure(problem: sf.Problem, truth: Any, seed: int) -> sf.Problem:
-    """Return the problem with values that its only log has at the truth, with noise of its sigma."""
+def simulate_log(problem: sf.Problem, truth: Any, seed: int) -> sf.Problem:
+    """Return the problem of one run whose first data are what they would be at the truth, with noise of their sigma."""
     (run,) = problem.experiments
     log, *others = run.data
     theta = np.array(truth, dtype=float)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
+from models import one_run
 from scipy.integrate import solve_ivp
 
 import switchfit as sf
@@ -390,8 +391,7 @@ def test_the_lagrangian_of_guards_and_terminal_constraints_has_its_derivatives()
     """Crossings, and a transition whose time is an unknown that a guard constrains."""
     system = sf.HybridSystem({"a": spring, "b": clipped}, [1.0, 0.0], guards={("a", "b"): lambda t, x, p: x[0] + 0.31})
     data = [samples(count=30), sf.TerminalConstraint(lambda x, p: x[0] - 0.2)]
-    run = sf.Experiment(data, ("a", "b"), (2.1,), 0.0, 4.0)
-    problem = sf.Problem(system, run, {"k": 4.0, "c": 0.3, "s": 0.4}, **TIGHT)
+    problem = one_run(system, data, ("a", "b"), (2.1,), 4.0, {"k": 4.0, "c": 0.3, "s": 0.4}, **TIGHT)
     evaluator, multipliers = Evaluator(problem), np.array([0.7, -0.4])
     found = evaluator.constrained(problem.initial_theta, multipliers=multipliers)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay, rest
+from models import decay, one_run, rest
 from numpy.polynomial import Polynomial
 
 import switchfit as sf
@@ -144,8 +144,7 @@ def test_a_broken_reference_signal_is_integrated_up_to_the_break_and_from_it():
 def test_a_sample_at_a_transition_with_a_reset_map_is_of_the_state_before_the_jump():
     """x = 1, halved at tau = 0.5, where a sample is: the cost is that of the 1, whatever the side of tau."""
     system = sf.HybridSystem({"a": rest}, [1.0], {("a", "a"): lambda t, x, p: p["e"] * x})
-    run = sf.Experiment(sf.Measurements([0.5, 1.0], [0.0, 0.0]), ("a", "a"), (0.5,), 0.0, 1.0)
-    problem = sf.Problem(system, run, {"e": 0.5})
+    problem = one_run(system, sf.Measurements([0.5, 1.0], [0.0, 0.0]), ("a", "a"), (0.5,), 1.0, {"e": 0.5})
     found = sf.evaluate(problem)
     assert found.cost == pytest.approx(0.5 * (1.0 + 0.25), rel=1e-14)
     assert found.gradient[1] == pytest.approx(0.5, rel=1e-14)
