@@ -75,6 +75,14 @@ def simulate_log(problem: sf.Problem, truth: Any, seed: int) -> sf.Problem:
     return replace(problem, experiments=replace(run, data=[replace(log, values=values), *others]))
 
 
+def fit_problem(problem: sf.Problem, status: Any = None, level: str | None = None, **settings: Any) -> sf.Estimate:
+    """Return the estimate; its status and the level of its verdict are those given, unless they do not matter."""
+    found = sf.estimate(problem, **settings)
+    assert status in (None, found.status), found.message
+    assert level in (None, found.verdict.level), str(found)
+    return found
+
+
 # A state at rest, for fits of a function of t and p
 
 
