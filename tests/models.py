@@ -75,9 +75,12 @@ def simulate_log(problem: sf.Problem, truth: Any, seed: int) -> sf.Problem:
     return replace(problem, experiments=replace(run, data=[replace(log, values=values), *others]))
 
 
-def fit_problem(problem: sf.Problem, status: Any = None, level: str | None = None, **settings: Any) -> sf.Estimate:
-    """Return the estimate; its status and the level of its verdict are those given, unless they do not matter."""
+def fit_problem(
+    problem: sf.Problem, *, success: Any = None, status: Any = None, level: Any = None, **settings: Any
+) -> sf.Estimate:
+    """Return the estimate, whose success, status and level of its verdict are those that are given."""
     found = sf.estimate(problem, **settings)
+    assert success in (None, found.success), found.message
     assert status in (None, found.status), found.message
     assert level in (None, found.verdict.level), str(found)
     return found

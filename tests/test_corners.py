@@ -548,8 +548,7 @@ def test_costs_do_not_depend_on_what_was_evaluated_before(rtol):
 def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
     times = samples(2.0).times
     values = value_of(block_at, times, [0.63, 6.0, 0.3]) + 1e-3 * np.random.default_rng(1).standard_normal(40)
-    fit = sf.estimate(block(0.6, {"a": 5.5, "mu": 0.33}, values, 1e-3))
-    assert fit.success
+    fit = fit_problem(block(0.6, {"a": 5.5, "mu": 0.33}, values, 1e-3), success=True)
     assert fit.verdict.level != "bad"
     _, slopes, _ = differentiate(lambda q: block_at(times, q), fit.theta)
     covariance = 1e-6 * np.linalg.inv(slopes.T @ slopes)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay, one_run, rest
+from models import one_run, rest
 from numpy.polynomial import Polynomial
 
 import switchfit as sf
@@ -197,16 +197,6 @@ def test_a_horizon_that_is_left_out_is_the_span_of_the_data(data, given, horizon
     assert (run.t0, run.tf) == horizon
     assert run.taken_from_data == tuple(name for name in ("t0", "tf") if given.get(name) is None)
     assert sf.Experiment(data, ("a", "b"), None, **given).initial_times[0] == pytest.approx(np.mean(horizon))
-
-
-def test_a_horizon_from_the_data_is_the_same_as_the_one_given():
-    """x' = -x from x(t0) = 1, t0 being the first sample; a free tf keeps its own end."""
-    data = ones([1.0, 2.0, 3.0])
-    problem = sf.Problem(sf.HybridSystem({"a": decay}, [1.0]), sf.Experiment(data, ("a",), ()), {"k": 1.0})
-    assert sf.evaluate(problem).cost == pytest.approx(0.5 * ((1 - np.exp(-1)) ** 2 + (1 - np.exp(-2)) ** 2), rel=1e-8)
-    assert sf.simulate(problem).times[[0, -1]].tolist() == [1.0, 3.0]
-    run = sf.Experiment(data, ("a",), (), tf=sf.Parameter(4.0, lower=3.0, upper=5.0))
-    assert (run.t0, run.end, run.taken_from_data) == (1.0, 5.0, ("t0",))
 
 
 def test_a_copy_with_other_data_keeps_the_horizon_unless_it_is_left_out_again():

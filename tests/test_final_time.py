@@ -155,8 +155,7 @@ def test_multistart_draws_tf_between_its_bounds_and_monte_carlo_varies_it():
 def test_a_constraint_that_hardly_depends_on_the_unknowns_at_the_start_is_met(start):
     """x(tf) is nearly 0 at the start whatever tf and k: its gradient there is no measure of the constraint. Nor has a
     violation stagnated for good that stays the same while a trust region that was small grows again."""
-    fit = sf.estimate(cooling(), start=start, strategy="local")
-    assert fit.success
+    fit = fit_problem(cooling(), start=start, strategy="local", success=True)
     assert fit.iterations < 60
     np.testing.assert_allclose(fit.theta[0], np.log(1 / LEVEL) / fit.theta[1], rtol=1e-7)
 
@@ -194,8 +193,7 @@ def minimum_time(upper=5.0):
     ],
 )  # fmt: skip
 def test_minimum_time_is_found_from_anywhere_whatever_the_upper_bound(upper, start):
-    fit = sf.estimate(minimum_time(upper), start=start, strategy="local")
-    assert fit.success
+    fit = fit_problem(minimum_time(upper), start=start, strategy="local", success=True)
     assert fit.evaluations < 40
     np.testing.assert_allclose(fit.theta, [1.0, 2.0], rtol=0, atol=1e-9)
     # T = 2 sqrt(q): 1 m more takes dT/dq = 1 s/m longer, which is what the multiplier says.

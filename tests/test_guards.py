@@ -41,8 +41,7 @@ def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
 
 
 def test_bouncing_ball_is_fitted_to_twelve_digits():
-    fit = sf.estimate(guarded_ball())
-    assert fit.success
+    fit = fit_problem(guarded_ball(), success=True)
     assert fit.parameters["e"] == pytest.approx(0.86655410543691079, abs=1e-12)
     assert max(abs(value) for _, value, _ in fit.constraints) < 1e-9
     assert "guard of tau_2 (air -> air)" in str(fit)
@@ -157,8 +156,7 @@ def constrain(psi):
 
 
 def test_constraints_that_cannot_be_met_are_named():
-    fit = fit_problem(constrain(lambda x, p: x[0] + 1.0), status=sf.Status.INFEASIBLE)
-    assert not fit.success
+    fit = fit_problem(constrain(lambda x, p: x[0] + 1.0), status=sf.Status.INFEASIBLE, success=False)
     assert "The constraints are not met: terminal constraint 1 = 1.0" in fit.message
 
 

@@ -44,14 +44,8 @@ def right():
     return sf.estimate(thermostat(tuple(TRUTH[:5])), strategy="local")
 
 
-@pytest.fixture(scope="module")
-def far_fit():
-    """A fit from a far guess, by default."""
-    return sf.estimate(thermostat(FAR))
-
-
-def test_by_default_the_right_answer_is_found_and_what_each_step_brought_is_told(right, far_fit):
-    assert far_fit.verdict.level == "good"
+def test_by_default_the_right_answer_is_found_and_what_each_step_brought_is_told(right):
+    far_fit = fit_problem(thermostat(FAR), level="good")
     assert far_fit.cost == pytest.approx(right.cost, rel=1e-6)
     np.testing.assert_allclose(far_fit.theta, right.theta, rtol=1e-5)
     np.testing.assert_array_equal(far_fit.initial_theta[:5], FAR)
