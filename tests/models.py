@@ -192,8 +192,7 @@ LINEAR = sf.HybridSystem({"A1": lambda t, x, p: A1 @ x, "A2": lambda t, x, p: A2
 def linear(times: Any = FIVE_SWITCHES, **settings: Any) -> sf.Problem:
     """J is the integral of x'x over one time unit; five switches unless told."""
     sequence = (("A1", "A2") * (len(times) + 1))[: len(times) + 1]
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 0.0, 1.0)
-    return sf.Problem(LINEAR, run, **settings)
+    return one_run(LINEAR, sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 1.0, **settings)
 
 
 # A bouncing ball

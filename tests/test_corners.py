@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from models import fit_problem, one_run
+from models import fit_problem, one_run, simulate_log
 from scipy.integrate import solve_ivp
 
 import switchfit as sf
@@ -770,9 +770,8 @@ def test_a_body_that_sticks_and_slips_and_rings(name):
 
 def fit_of(mode, start, truth, guess, tf, count, sigma):
     """A fit to simulated noisy samples of the first state, from a guess."""
-    clean = sf.simulate(problem_of(mode, start, truth, tf, count=count), times="samples").states[:, 0]
-    noisy = clean + sigma * np.random.default_rng(0).standard_normal(count)
-    return sf.estimate(problem_of(mode, start, guess, tf, samples(tf, count, noisy, sigma)))
+    problem = problem_of(mode, start, guess, tf, samples(tf, count, np.zeros(count), sigma))
+    return sf.estimate(simulate_log(problem, list(truth.values()), seed=0))
 
 
 def slowing(t, x, p):

@@ -324,20 +324,16 @@ def is_fixed(tau):
 
 def pose(logs, system=HEATER, parameters=GUESS, times=BAD, truth=(POWER, LOSS), **more):
     """Return a problem with a bad guess whose data are simulated at the truth, and the fit that begins there."""
-
-    def build(data, tau):
-        given = {"mode_sequence": SEQUENCE, "t0": 0.0, "tf": 10.0} | more
-        run = sf.Experiment(list(data), transition_times=tau, **given)
-        return sf.Problem(system, run, parameters)
-
+    given = {"mode_sequence": SEQUENCE, "t0": 0.0, "tf": 10.0} | more
+    run = sf.Experiment([log for log, _ in logs], transition_times=times, **given)
+    problem = sf.Problem(system, run, parameters)
     near = [tau for tau, given in zip(TAU, times, strict=True) if not is_fixed(given)]
-    problem = build([log for log, _ in logs], times)
     theta = np.concatenate([near, truth])
     seen = Evaluator(problem, theta).simulate(theta)[0].seen
     filled = [
         replace(log, values=values[: len(noise)] + noise) for (log, noise), values in zip(logs, seen, strict=True)
     ]
-    problem = build(filled, times)
+    problem = replace(problem, experiments=replace(run, data=filled))
     return problem, fit_briefly(problem, theta)
 
 
