@@ -7,6 +7,7 @@ else: nonlinear systems with every kind of cost, and the functions inside the pa
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import switchfit as sf
+from switchfit.fit.evaluator import Evaluator
 from switchfit.models import skid_steer
 
 # Vector fields and observations
@@ -47,6 +49,41 @@ def climb_at_one(t, x, p):
 def first_state(t, x, p):
     """The first state alone, (1,)."""
     return x[:1]
+
+
+# A problem of one run
+
+OF_RUN = ("inputs", "initial_state", "jumps", "name", "parameter_map", "time_unit")
+
+
+def one_run(
+    system: sf.HybridSystem, data: Any, sequence: Any, times: Any, tf: Any, parameters: Any = None, **settings: Any
+) -> sf.Problem:
+    """Return the problem of one run on [0, tf]; `settings` are those of `OF_RUN`, and of the problem."""
+    of_run = {name: settings.pop(name) for name in OF_RUN if name in settings}
+    run = sf.Experiment(data, sequence, times, 0.0, tf, **of_run)
+    return sf.Problem(system, run, parameters or {}, **settings)
+
+
+def simulate_log(problem: sf.Problem, truth: Any, seed: int) -> sf.Problem:
+    """Return the problem of one run whose first data are what they would be at the truth, with noise of their sigma."""
+    (run,) = problem.experiments
+    log, *others = run.data
+    theta = np.array(truth, dtype=float)
+    seen = Evaluator(problem, theta).simulate(theta)[0].seen[0][: len(log.times)]
+    values = seen + log.sigma * np.random.default_rng(seed).normal(size=seen.shape)
+    return replace(problem, experiments=replace(run, data=[replace(log, values=values), *others]))
+
+
+def fit_problem(
+    problem: sf.Problem, *, success: Any = None, status: Any = None, level: Any = None, **settings: Any
+) -> sf.Estimate:
+    """Return the estimate, whose success, status and level of its verdict are those that are given."""
+    found = sf.estimate(problem, **settings)
+    assert success in (None, found.success), found.message
+    assert status in (None, found.status), found.message
+    assert level in (None, found.verdict.level), str(found)
+    return found
 
 
 # A state at rest, for fits of a function of t and p
@@ -155,8 +192,7 @@ LINEAR = sf.HybridSystem({"A1": lambda t, x, p: A1 @ x, "A2": lambda t, x, p: A2
 def linear(times: Any = FIVE_SWITCHES, **settings: Any) -> sf.Problem:
     """J is the integral of x'x over one time unit; five switches unless told."""
     sequence = (("A1", "A2") * (len(times) + 1))[: len(times) + 1]
-    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 0.0, 1.0)
-    return sf.Problem(LINEAR, run, **settings)
+    return one_run(LINEAR, sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 1.0, **settings)
 
 
 # A bouncing ball

@@ -28,8 +28,9 @@ def free(d):
 
 def minimize(
     evaluate, start, *, constraints, breakpoints=(), hessian="exact", blocks=(), tolerance=1e-7, max_iterations=200,
-    size=0.0, idle=None, reach=None, equalities=(), accuracy=None, **settings,
+    size=0.0, idle=None, reach=None, equalities=(), accuracy=None, status=None, **settings,
 ):  # fmt: skip
+    """Return the result, whose status is the one given unless it does not matter."""
     start = np.array(start, float)
     labels = np.array(blocks, float) if hessian == "block-diagonal" else None
     size, usual = np.broadcast_to(np.asarray(size, float), start.shape), 0.1 * np.where(start, abs(start), 1.0)
@@ -37,7 +38,9 @@ def minimize(
         evaluate, constraints, Breakpoints.of(breakpoints), hessian, labels, tolerance, max_iterations, size, idle,
         usual if reach is None else np.asarray(reach, float), equalities, accuracy,
     )  # fmt: skip
-    return minimize_problem(problem, start, **settings)
+    result = minimize_problem(problem, start, **settings)
+    assert status in (None, result.status), result.status
+    return result
 
 
 def solve_qp(gradient, matrix, normals, offsets):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import climb, decay, rest, slow_guess, temperature
+from models import climb, decay, one_run, rest, slow_guess, temperature
 from optimizer import minimize, solve_qp
 from optimizer import rows as linear
 from scipy.optimize import nnls
@@ -250,8 +250,7 @@ def two_minima():
 
     def build(values, times):
         data = sf.Measurements(np.linspace(0.1, 9.9, 60), values, sigma=0.05)
-        run = sf.Experiment(data, ("rest", "pulse", "rest"), times, 0.0, 10.0)
-        return sf.Problem(system, run, min_duration=0.2)
+        return one_run(system, data, ("rest", "pulse", "rest"), times, 10.0, min_duration=0.2)
 
     guesses = ((2.0, 3.0), (7.0, 7.8))
     curves = [sf.simulate(build(np.zeros(60), guess), times="samples").states[:, 0] for guess in guesses]
@@ -619,8 +618,7 @@ def test_the_truth_of_a_study_lies_on_its_guard_however_coarse_the_mesh_of_the_g
     guards = {("decay", "rest"): lambda t, x, p: x[0] - 0.01}
     system = sf.HybridSystem({"decay": decay, "rest": rest}, [1.0], guards=guards)
     data = sf.Measurements(np.arange(0.1, 6.0, 0.1), np.zeros((59, 1)), sigma=0.01)
-    run = sf.Experiment(data, ("decay", "rest"), (4.0,), 0.0, 6.0)
-    problem = sf.Problem(system, run, {"k": sf.Parameter(1.0, lower=0.1)})
+    problem = one_run(system, data, ("decay", "rest"), (4.0,), 6.0, {"k": sf.Parameter(1.0, lower=0.1)})
     study = sf.monte_carlo(problem, 1, theta=[0.5, 9.0])
     assert study.truth[0] == pytest.approx(np.log(100) / 9, abs=1e-7)
 

@@ -68,8 +68,11 @@ def folder(tmp_path_factory):
     return folder
 
 
-def run(*arguments):
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+def run(*arguments, code=None, **given):
+    """Return what became of a command, whose exit code is `code` unless that does not matter."""
+    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments], **given)
+    assert code in (None, result.exit_code), (result.exception, result.stderr)
+    return result
 
 
 def read_json(result):
@@ -95,8 +98,7 @@ def catch_settings(monkeypatch, name):
 
 def test_fit_converged(folder, tmp_path):
     out = tmp_path / "a" / "b"
-    result = run("fit", folder / "problem.toml", "--out", out)
-    assert result.exit_code == 0, result.stderr
+    result = run("fit", folder / "problem.toml", "--out", out, code=0)
     assert sorted(path.name for path in out.iterdir()) == ["estimate.json", "fit.png", "report.html", "report.txt"]
     assert (out / "report.txt").read_text().strip() == result.stdout.strip()
     assert result.stderr == f"written to {out}\n"
@@ -130,8 +132,7 @@ def test_options_win_over_the_file(folder, tmp_path, monkeypatch):
 
 def test_interrupt_ends_the_fit_and_writes(folder, tmp_path, interrupted_fits):
     before = signal.getsignal(signal.SIGINT)
-    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")
-    assert result.exit_code == 1
+    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures", code=1)
     assert "Interrupted after 1 iteration " in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "report.txt"]
     assert signal.getsignal(signal.SIGINT) is before
@@ -144,9 +145,7 @@ def test_second_interrupt_stops_at_once(folder, monkeypatch):
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(sf, "estimate", estimate)
-    result = run("fit", folder / "problem.toml")
-    assert result.exit_code == 130
-    assert "interrupted before there was anything to write" in result.stderr
+    assert "interrupted before there was anything to write" in run("fit", folder / "problem.toml", code=130).stderr
 
 
 def test_check_fails_where_derivatives_are_wrong(folder, monkeypatch):
@@ -158,8 +157,7 @@ def test_check_fails_where_derivatives_are_wrong(folder, monkeypatch):
 
 
 def test_simulate(folder, tmp_path):
-    result = run("simulate", folder / "problem.toml", "--out", tmp_path / "new" / "x.csv")
-    assert result.exit_code == 0, result.stderr
+    result = run("simulate", folder / "problem.toml", "--out", tmp_path / "new" / "x.csv", code=0)
     assert result.stdout == ""
     header, *rows = csv.reader((tmp_path / "new" / "x.csv").read_text().splitlines())
     assert header == ["experiment", "t", "mode", "T"]
@@ -168,9 +166,7 @@ def test_simulate(folder, tmp_path):
     assert ({*modes}, {*runs}) == ({"on", "off"}, {"run1"})
     assert times[on].max() == times[~on].min() == 2.0
     np.testing.assert_allclose(states[on], 8 * (1 - np.exp(-0.05 * times[on])), atol=1e-8)
-    result = run("simulate", folder / "problem.toml")
-    assert result.exit_code == 2
-    assert "'--out'" in result.stderr
+    assert "'--out'" in run("simulate", folder / "problem.toml", code=2).stderr
 
 
 def test_version_and_help():
@@ -209,8 +205,7 @@ def test_whatever_a_model_file_raises_is_said_with_its_place(where, wild, tmp_pa
     (tmp_path / "bad.toml").write_text(problem)
     line = [text.strip() for text in bad.splitlines()].index(f"raise {wild}") + 1
     for command in ("check", "fit"):
-        result = run(command, tmp_path / "bad.toml")
-        assert result.exit_code == 2, (result.exception, result.stderr)
+        result = run(command, tmp_path / "bad.toml", code=2)
         assert f"{tmp_path / 'bad.py'}, line {line}" in result.stderr
         assert "Traceback" not in result.stderr
     assert "Traceback" in run("check", tmp_path / "bad.toml", "--debug").stderr
@@ -243,8 +238,7 @@ def test_check_without_running_the_model(folder, tmp_path):
     (tmp_path / "room.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
     path = tmp_path / "problem.toml"
     path.write_text(PROBLEM)
-    result = run("check", path, "--no-run")
-    assert result.exit_code == 0, result.stderr
+    result = run("check", path, "--no-run", code=0)
     for said in ("on -> off on [0, 6] s, at 2 s", "12 samples of T (K), 0.25 to 5.75", "No Python file was run"):
         assert said in result.stdout
     for old, new, message in (
@@ -261,8 +255,7 @@ def test_check_without_running_the_model(folder, tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_said(folder, tmp_path):
     (tmp_path / "report.txt").write_text("before")
-    result = run("fit", folder / "problem.toml", "--out", tmp_path / "report.txt")
-    assert result.exit_code == 2
+    result = run("fit", folder / "problem.toml", "--out", tmp_path / "report.txt", code=2)
     assert f"{tmp_path / 'report.txt'} cannot be read or written: File exists" in result.stderr
 
 
@@ -303,9 +296,7 @@ def test_quiet_prints_nothing(folder, command):
     said = f"switchfit: There is no problem file {folder / 'none.toml'}; check the name and the folder.\n"
     result = run(*command, folder / "none.toml", "--quiet")
     assert (result.exit_code, result.stdout, result.stderr) == (2, "", said)
-    result = run(*command, folder / "problem.toml", "--quiet", "--verbose")
-    assert result.exit_code == 2
-    assert "contradict each other" in result.stderr
+    assert "contradict each other" in run(*command, folder / "problem.toml", "--quiet", "--verbose", code=2).stderr
 
 
 def test_verbose_says_what_is_done(folder):
@@ -373,6 +364,5 @@ def test_ctrl_c_during_a_strategy_keeps_the_best(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(choice, "find_times", search)
     real = sf.estimate
     monkeypatch.setattr(sf, "estimate", lambda problem, **options: real(problem, **options, strategy="thorough"))
-    result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")
-    assert result.exit_code == 0, result.stderr
+    run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures", code=0)
     assert sf.Estimate.load(tmp_path / "estimate.json").steps[-1].strategy == "interrupted"

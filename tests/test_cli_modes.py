@@ -130,8 +130,7 @@ def test_the_sequence_is_written(found, folder):
 def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, folder, tmp_path):
     """From a folder of its own, with paths to where the data are; nothing is left to do for the fit."""
     _, out = found
-    result = run("fit", out / "best.toml", "--out", tmp_path, "--no-figures")
-    assert result.exit_code == 0, result.stderr
+    run("fit", out / "best.toml", "--out", tmp_path, "--no-figures", code=0)
     fit, best = sf.Estimate.load(tmp_path / "estimate.json"), sf.ModeSearch.load(out / "modes.json").best
     assert fit.theta_names == best.theta_names
     np.testing.assert_allclose(fit.theta, best.theta, rtol=1e-8)
@@ -149,8 +148,7 @@ def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, fol
 def test_options_override_the_library_of_the_file(folder, monkeypatch):
     defaults = {name: p.default for name, p in inspect.signature(sf.find_modes).parameters.items()}
     given = catch_settings(monkeypatch, "find_modes")
-    result = run("modes", folder / "problem.toml")
-    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
+    assert run("modes", folder / "problem.toml", code=2).stderr == "switchfit: enough\n"
     file = {"first": ["rise"], "min_duration": 0.2, "successions": {"rise": ["fall", "drift"], "fall": ["rise"]}}
     assert given == {name: (defaults | file)[name] for name in given}
     run("modes", folder / "problem.toml", "--criterion", "mbic", "--max-switches", 3, "--method", "beam")
@@ -169,8 +167,7 @@ def test_ctrl_c_keeps_the_best(folder, tmp_path, monkeypatch):
         return real(problem, callback=press, **settings)
 
     monkeypatch.setattr(sf, "find_modes", find_modes)
-    result = run("modes", folder / "problem.toml", "--out", tmp_path)
-    assert result.exit_code == 1
+    result = run("modes", folder / "problem.toml", "--out", tmp_path, code=1)
     assert result.stdout.startswith("Interrupted: the best so far is rise")
     assert result.stderr.startswith("stopping after this fit; Ctrl-C again to stop at once\n")
     assert (tmp_path / "modes.txt").read_text() == result.stdout
@@ -196,8 +193,7 @@ def test_other_commands_say_what_to_do_without_a_sequence(folder, command):
         (write_problem(folder, LIBRARY), "add [library] to the file: switchfit modes"),
         (folder / "problem.toml", finds),
     ):
-        result = run(*command, path)
-        assert result.exit_code == 2
+        result = run(*command, path, code=2)
         assert result.stderr.startswith(f"switchfit: {path}: experiments[1]: the key 'mode_sequence' is missing: name")
         assert remedy in result.stderr
 
@@ -222,9 +218,7 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
     ],
 )
 def test_what_is_wrong_with_a_library_is_said(folder, old, new, message):
-    result = run("modes", write_problem(folder, old, new), "--max-switches", 1)
-    assert result.exit_code == 2
-    assert message in result.stderr
+    assert message in run("modes", write_problem(folder, old, new), "--max-switches", 1, code=2).stderr
 
 
 def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import charge, first_state
+from models import charge, first_state, one_run
 from models import decay as decay_at_k
 
 import switchfit as sf
@@ -202,8 +202,7 @@ def test_the_compilation_cache_is_used_or_off_and_its_configuration_as_before(pl
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x * factor}, [1.0])
-    run = sf.Experiment(sf.Measurements([0.5, 1.0], [0.6, 0.4]), ("m",), (), 0.0, 1.0)
-    fit = sf.estimate(sf.Problem(system, run, {"k": 1.0}))
+    fit = sf.estimate(one_run(system, sf.Measurements([0.5, 1.0], [0.6, 0.4]), ("m",), (), 1.0, {"k": 1.0}))
     assert sf.simulate(fit.problem).times[-1] == 1.0
     assert [getattr(jax.config, name) for name in CACHE_SETTINGS] == before
     assert [path.name for path in tmp_path.iterdir()] == ([] if place == "off" else [place])

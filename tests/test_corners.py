@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
+from models import fit_problem, one_run, simulate_log
 from scipy.integrate import solve_ivp
 
 import switchfit as sf
@@ -390,8 +391,7 @@ def test_the_lagrangian_of_guards_and_terminal_constraints_has_its_derivatives()
     """Crossings, and a transition whose time is an unknown that a guard constrains."""
     system = sf.HybridSystem({"a": spring, "b": clipped}, [1.0, 0.0], guards={("a", "b"): lambda t, x, p: x[0] + 0.31})
     data = [samples(count=30), sf.TerminalConstraint(lambda x, p: x[0] - 0.2)]
-    run = sf.Experiment(data, ("a", "b"), (2.1,), 0.0, 4.0)
-    problem = sf.Problem(system, run, {"k": 4.0, "c": 0.3, "s": 0.4}, **TIGHT)
+    problem = one_run(system, data, ("a", "b"), (2.1,), 4.0, {"k": 4.0, "c": 0.3, "s": 0.4}, **TIGHT)
     evaluator, multipliers = Evaluator(problem), np.array([0.7, -0.4])
     found = evaluator.constrained(problem.initial_theta, multipliers=multipliers)
 
@@ -548,8 +548,7 @@ def test_costs_do_not_depend_on_what_was_evaluated_before(rtol):
 def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
     times = samples(2.0).times
     values = value_of(block_at, times, [0.63, 6.0, 0.3]) + 1e-3 * np.random.default_rng(1).standard_normal(40)
-    fit = sf.estimate(block(0.6, {"a": 5.5, "mu": 0.33}, values, 1e-3))
-    assert fit.success
+    fit = fit_problem(block(0.6, {"a": 5.5, "mu": 0.33}, values, 1e-3), success=True)
     assert fit.verdict.level != "bad"
     _, slopes, _ = differentiate(lambda q: block_at(times, q), fit.theta)
     covariance = 1e-6 * np.linalg.inv(slopes.T @ slopes)
@@ -771,9 +770,8 @@ def test_a_body_that_sticks_and_slips_and_rings(name):
 
 def fit_of(mode, start, truth, guess, tf, count, sigma):
     """A fit to simulated noisy samples of the first state, from a guess."""
-    clean = sf.simulate(problem_of(mode, start, truth, tf, count=count), times="samples").states[:, 0]
-    noisy = clean + sigma * np.random.default_rng(0).standard_normal(count)
-    return sf.estimate(problem_of(mode, start, guess, tf, samples(tf, count, noisy, sigma)))
+    problem = problem_of(mode, start, guess, tf, samples(tf, count, np.zeros(count), sigma))
+    return sf.estimate(simulate_log(problem, list(truth.values()), seed=0))
 
 
 def slowing(t, x, p):
@@ -952,8 +950,7 @@ def test_the_time_of_a_set_point_is_not_determined_between_two_clicks_of_the_rel
     case = relay_case()
     problem, starts = case.build_problem(), case.draw_starts(100)
     for start in starts[[0, 9, 14, 76]]:
-        fit = sf.estimate(problem, strategy="local", start=start)
-        assert fit.status is sf.Status.SINGULAR
+        fit = fit_problem(problem, strategy="local", start=start, status=sf.Status.SINGULAR)
         assert str(fit.verdict).startswith("Doubtful: converged; ")
         assert str(fit.verdict).endswith("; the data hardly determine tau_1: fix it or add data.")
         assert fit.flat_direction == (("tau_1", pytest.approx(1.0)),)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay, rest
+from models import one_run, rest
 from numpy.polynomial import Polynomial
 
 import switchfit as sf
@@ -144,8 +144,7 @@ def test_a_broken_reference_signal_is_integrated_up_to_the_break_and_from_it():
 def test_a_sample_at_a_transition_with_a_reset_map_is_of_the_state_before_the_jump():
     """x = 1, halved at tau = 0.5, where a sample is: the cost is that of the 1, whatever the side of tau."""
     system = sf.HybridSystem({"a": rest}, [1.0], {("a", "a"): lambda t, x, p: p["e"] * x})
-    run = sf.Experiment(sf.Measurements([0.5, 1.0], [0.0, 0.0]), ("a", "a"), (0.5,), 0.0, 1.0)
-    problem = sf.Problem(system, run, {"e": 0.5})
+    problem = one_run(system, sf.Measurements([0.5, 1.0], [0.0, 0.0]), ("a", "a"), (0.5,), 1.0, {"e": 0.5})
     found = sf.evaluate(problem)
     assert found.cost == pytest.approx(0.5 * (1.0 + 0.25), rel=1e-14)
     assert found.gradient[1] == pytest.approx(0.5, rel=1e-14)
@@ -198,16 +197,6 @@ def test_a_horizon_that_is_left_out_is_the_span_of_the_data(data, given, horizon
     assert (run.t0, run.tf) == horizon
     assert run.taken_from_data == tuple(name for name in ("t0", "tf") if given.get(name) is None)
     assert sf.Experiment(data, ("a", "b"), None, **given).initial_times[0] == pytest.approx(np.mean(horizon))
-
-
-def test_a_horizon_from_the_data_is_the_same_as_the_one_given():
-    """x' = -x from x(t0) = 1, t0 being the first sample; a free tf keeps its own end."""
-    data = ones([1.0, 2.0, 3.0])
-    problem = sf.Problem(sf.HybridSystem({"a": decay}, [1.0]), sf.Experiment(data, ("a",), ()), {"k": 1.0})
-    assert sf.evaluate(problem).cost == pytest.approx(0.5 * ((1 - np.exp(-1)) ** 2 + (1 - np.exp(-2)) ** 2), rel=1e-8)
-    assert sf.simulate(problem).times[[0, -1]].tolist() == [1.0, 3.0]
-    run = sf.Experiment(data, ("a",), (), tf=sf.Parameter(4.0, lower=3.0, upper=5.0))
-    assert (run.t0, run.end, run.taken_from_data) == (1.0, 5.0, ("t0",))
 
 
 def test_a_copy_with_other_data_keeps_the_horizon_unless_it_is_left_out_again():

@@ -19,10 +19,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from models import charge, decay, first_state, temperature
-from typer.testing import CliRunner
+from test_cli import run
 
 import switchfit as sf
-from switchfit.cli import app
 from switchfit.io.command_line import summarize_estimate, write_runs, write_unknowns
 from switchfit.io.problem_file import load_problem
 from switchfit.problem.dates import SECONDS, Dates, Origin, from_epoch, make_origin, read_dates
@@ -585,19 +584,17 @@ def test_mistakes_in_a_problem_file(experiment, log, data, message, write):
 def test_the_command_line(tmp_path):
     problem = EXAMPLES / "dates" / "problem.toml"
 
-    def run(*arguments):
-        done = CliRunner().invoke(app, [str(argument) for argument in arguments])
-        assert done.exit_code == 0, done.output
-        return done.output
-
-    assert "on -> off on [2020-03-10, 2020-04-04 13:00] (tf from the data), at 2020-03-20" in run("check", problem)
-    run("simulate", problem, "--out", tmp_path / "out.csv")
+    assert (
+        "on -> off on [2020-03-10, 2020-04-04 13:00] (tf from the data), at 2020-03-20"
+        in run("check", problem, code=0).output
+    )
+    run("simulate", problem, "--out", tmp_path / "out.csv", code=0)
     rows = list(csv.DictReader((tmp_path / "out.csv").read_text().splitlines()))
     assert rows[0]["date"] == "2020-03-10T00:00:00+01:00"
     for row in (rows[0], rows[-1]):
         moment = dt.datetime(2020, 3, 9, 23, tzinfo=dt.UTC) + dt.timedelta(days=float(row["t (d)"]))
         assert abs(dt.datetime.fromisoformat(row["date"]) - moment) <= dt.timedelta(microseconds=1)
-    run("fit", problem.with_name("warmth.csv"), "--problem", problem, "--table", tmp_path / "t.csv")
+    run("fit", problem.with_name("warmth.csv"), "--problem", problem, "--table", tmp_path / "t.csv", code=0)
     (row,) = csv.DictReader((tmp_path / "t.csv").read_text().splitlines())
     assert row["tau_1 (date)"].startswith("2020-03-2")
     off = dt.datetime.fromisoformat(row["tau_1 (date)"]) - dt.datetime(2020, 3, 22, 6, tzinfo=dt.UTC)

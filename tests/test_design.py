@@ -462,8 +462,7 @@ def folder(tmp_path):
 
 def test_a_design_is_printed_and_written(folder):
     out = folder / "out" / "deep"
-    result = run("design", folder / "problem.toml", "--out", out)
-    assert result.exit_code == 0, result.stderr
+    result = run("design", folder / "problem.toml", "--out", out, code=0)
     assert result.stdout.startswith("A-optimal design of run1 for k, b.\n")
     names = ["design.json", "design.png", "design.txt", "input.csv", "samples.csv"]
     assert sorted(path.name for path in out.iterdir()) == names
@@ -491,8 +490,7 @@ def test_options_override_the_file(folder, monkeypatch):
 
 def test_json_and_what_cannot_be_estimated(folder):
     (folder / "plan.csv").write_text((folder / "plan.csv").read_text().replace("1.0,0.2", "0.0,0.0"))
-    result = run("design", folder / "plain.toml", "--json")
-    assert result.exit_code == 1
+    result = run("design", folder / "plain.toml", "--json", code=1)
     assert "k, b cannot be estimated from such an experiment" in result.stderr
     shown = json.loads(result.stdout)
     assert (shown["theta_names"], shown["covariance"]) == (["k", "b"], [[None, None], [None, None]])
@@ -500,6 +498,4 @@ def test_json_and_what_cannot_be_estimated(folder):
 
 def test_a_mistake_in_the_file_is_said_with_its_key(folder):
     (folder / "problem.toml").write_text((PROBLEM + DESIGN).replace('criterion = "A"', 'criterion = "T"'))
-    result = run("design", folder / "problem.toml")
-    assert result.exit_code == 2
-    assert "design.criterion" in result.stderr
+    assert "design.criterion" in run("design", folder / "problem.toml", code=2).stderr

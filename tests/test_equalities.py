@@ -98,16 +98,14 @@ def test_a_published_problem_with_bounds_and_an_inequality():
     bounds = box([1.0, 1.0, 1.0, 1.0, 0.0], [5.0, 5.0, 5.0, 5.0, np.inf])
     constraints = lambda x: [x[0] * x[1] * x[2] * x[3] - x[4] - 25, jnp.sum(x[:4] ** 2) - 40]  # noqa: E731
     cost = lambda x: x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2]  # noqa: E731
-    found = solve(cost, constraints, [1.0, 5.0, 5.0, 1.0, 0.0], bounds)
-    assert found.status is Status.CONVERGED
+    found = solve(cost, constraints, [1.0, 5.0, 5.0, 1.0, 0.0], bounds, status=Status.CONVERGED)
     assert found.cost == pytest.approx(17.0140173, rel=1e-8)
     assert set(found.active) == {"low 0", "low 4"}
     assert found.free_basis.shape == (5, 1)
 
 
 def test_multipliers_hessian_and_free_directions_in_closed_form():
-    found = solve(lambda x: x[0] + x[1], ON_CIRCLE, [-2.0, 0.5])
-    assert found.status is Status.CONVERGED
+    found = solve(lambda x: x[0] + x[1], ON_CIRCLE, [-2.0, 0.5], status=Status.CONVERGED)
     np.testing.assert_allclose(found.theta, [-1.0, -1.0], atol=1e-9)
     assert found.equalities == (("c0", pytest.approx(0.0, abs=1e-9), pytest.approx(0.5, abs=1e-9)),)
     np.testing.assert_allclose(found.hessian, np.eye(2), atol=1e-8)
@@ -139,8 +137,7 @@ def test_convergence_is_quadratic():
 
 def test_the_penalty_is_raised_where_its_first_value_is_too_small():
     """At the start the cost is lowest: the multipliers are 0 there, and so is the first penalty."""
-    found = solve(lambda x: 0.5 * jnp.sum(x**2), lambda x: [jnp.exp(x[0]) - 3.0], [0.0, 0.0])
-    assert found.status is Status.CONVERGED
+    found = solve(lambda x: 0.5 * jnp.sum(x**2), lambda x: [jnp.exp(x[0]) - 3.0], [0.0, 0.0], status=Status.CONVERGED)
     np.testing.assert_allclose(found.theta, [np.log(3.0), 0.0], atol=1e-10)
 
 
@@ -165,8 +162,7 @@ def test_constraints_that_say_the_same_twice_are_met():
     ],
 )
 def test_constraints_that_cannot_be_met_are_named(constraints, violated, evaluations):
-    found = solve(lambda x: (x[0] - 3.0) ** 2 + x[1] ** 2, constraints, [2.0, 0.0])
-    assert found.status is Status.INFEASIBLE
+    found = solve(lambda x: (x[0] - 3.0) ** 2 + x[1] ** 2, constraints, [2.0, 0.0], status=Status.INFEASIBLE)
     assert not found.status.successful
     assert {name: value for name, value in found.violated if abs(value) > 1e-3} == pytest.approx(violated, abs=1e-3)
     assert found.evaluations < evaluations
@@ -175,15 +171,13 @@ def test_constraints_that_cannot_be_met_are_named(constraints, violated, evaluat
 def test_constraints_are_not_stuck_where_a_step_reduces_their_violation(monkeypatch):
     """However long it has stayed the same: here, from the first iteration on."""
     monkeypatch.setattr(step, "STAGNANT", 0)
-    found = solve(lambda x: x[0] + x[1], ON_CIRCLE, [3.0, -2.0])
-    assert found.status is Status.CONVERGED
+    found = solve(lambda x: x[0] + x[1], ON_CIRCLE, [3.0, -2.0], status=Status.CONVERGED)
     np.testing.assert_allclose(found.theta, [-1.0, -1.0], atol=1e-7)
 
 
 def test_a_saddle_on_a_surface_is_left():
     """On the unit circle x² - y² is highest at (1, 0), where a start is stationary, and lowest at (0, 1)."""
-    found = solve(lambda x: x[0] ** 2 - x[1] ** 2, ON_UNIT_CIRCLE, [1.0, 0.0])
-    assert found.status is Status.CONVERGED
+    found = solve(lambda x: x[0] ** 2 - x[1] ** 2, ON_UNIT_CIRCLE, [1.0, 0.0], status=Status.CONVERGED)
     np.testing.assert_allclose(np.abs(found.theta), [0.0, 1.0], atol=1e-7)
     assert found.cost == pytest.approx(-1.0)
 
@@ -270,15 +264,13 @@ def test_as_many_constraints_as_unknowns_need_one_evaluation_at_the_start():
 
 
 def test_constraints_that_are_not_finite_at_the_start():
-    found = solve(lambda x: x[0] ** 2 + 0 * x[1], lambda x: [jnp.log(x[1])], [1.0, -1.0])
-    assert found.status is Status.NONFINITE_START
+    found = solve(lambda x: x[0] ** 2 + 0 * x[1], lambda x: [jnp.log(x[1])], [1.0, -1.0], status=Status.NONFINITE_START)
     assert found.equalities == ()
 
 
 def test_points_where_constraints_are_not_finite_are_avoided():
     """From 5 a full step of log(x) = 0 leads below 0."""
-    found = solve(lambda x: (x[1] - 1) ** 2 + 0 * x[0], lambda x: [jnp.log(x[0])], [5.0, 0.0])
-    assert found.status is Status.CONVERGED
+    found = solve(lambda x: (x[1] - 1) ** 2 + 0 * x[0], lambda x: [jnp.log(x[0])], [5.0, 0.0], status=Status.CONVERGED)
     np.testing.assert_allclose(found.theta, [1.0, 1.0], atol=1e-8)
 
 

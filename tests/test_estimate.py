@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.stats
+from models import fit_problem
 
 import switchfit as sf
 from switchfit.estimation import estimator
@@ -59,8 +60,7 @@ def capacitor(values, *, k=GUESS[1:], tau=GUESS[0], **settings):
 
 def test_truth_from_noisy_samples():
     problem = capacitor(voltage(TIMES) + noise(0))
-    found = sf.estimate(problem)
-    assert found.status is sf.Status.CONVERGED
+    found = fit_problem(problem, status=sf.Status.CONVERGED)
     assert np.all(np.abs(found.theta - TRUTH) < 4 * found.standard_errors)
     assert 0.5 < found.residual_variance < 2.0
     assert np.all(found.standard_errors < 0.1)
@@ -156,22 +156,6 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
 # Ends
 
 
-def test_a_callback_that_returns_true_and_ctrl_c_stop_the_fit_at_the_best_point_so_far():
-    def interrupt(record):
-        if record.iteration == 2:
-            raise KeyboardInterrupt
-
-    for callback in (lambda record: record.iteration == 2, interrupt):
-        found = sf.estimate(capacitor(voltage(TIMES) + noise(0)), callback=callback)
-        assert found.status is sf.Status.INTERRUPTED
-        assert not found.success
-        assert found.iterations == 2
-        best = min(found.history, key=lambda record: record.cost)
-        assert (found.cost, found.theta.tolist()) == (best.cost, best.theta.tolist())
-        assert best.cost < found.history[0].cost
-        assert "Interrupted after 2 iterations" in found.message
-
-
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
     simulate = Mock(side_effect=estimator.compare)
     monkeypatch.setattr(estimator, "compare", simulate)
@@ -190,8 +174,7 @@ def test_a_budget_is_that_of_one_mesh():
     problem = refined_fit().problem
     first = evaluator_of(problem)
     on_first = minimize_cost(Follower(first), problem.initial_theta, "auto", 1e-7, 200).iterations
-    found = sf.estimate(problem, max_iterations=on_first)
-    assert found.success
+    found = fit_problem(problem, max_iterations=on_first, success=True)
     assert found.iterations == refined_fit().iterations > on_first
     np.testing.assert_array_equal(found.theta, refined_fit().theta)
 
@@ -223,9 +206,8 @@ def with_a_mode_too_many(sequence, times):
 def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     # From other guesses the fit ends at a lower cost, where the mode has a duration.
     problem = with_a_mode_too_many(("charge", "discharge", "drain", "discharge"), (0.6, 1.4, 1.5))
-    found = sf.estimate(problem, hessian="exact")
+    found = fit_problem(problem, hessian="exact", status=sf.Status.COLLAPSED)
     plain = sf.estimate(capacitor(voltage(TIMES) + noise(1), tau=0.6))
-    assert found.status is sf.Status.COLLAPSED
     assert found.idle == ("tau_2", "tau_3", "leak")
     assert found.theta[1] == found.theta[2]
     (active,) = found.active
@@ -241,8 +223,7 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
 
 
 def test_a_parameter_that_acts_only_in_a_mode_that_collapsed_at_the_start_is_named():
-    found = sf.estimate(with_a_mode_too_many(("drain", "charge", "discharge"), (0.2, 0.6)))
-    assert found.status is sf.Status.COLLAPSED
+    found = fit_problem(with_a_mode_too_many(("drain", "charge", "discharge"), (0.2, 0.6)), status=sf.Status.COLLAPSED)
     assert found.theta[0] == 0.0
     assert found.idle == ("leak",)
     assert "mode 1 ('drain') has collapsed to nothing" in map(str, found.active)
@@ -460,11 +441,3 @@ def test_default_tolerances_give_the_derivatives_to_about_1e_7(theta):
     error = np.linalg.norm(found.gradient - exact.gradient) / np.linalg.norm(exact.gradient)
     assert 1e-9 < error < 2e-7
     assert np.linalg.norm(found.hessian - exact.hessian) / np.linalg.norm(exact.hessian) < 1e-7
-
-
-def test_default_tolerances_give_the_solution_to_1e_8():
-    fit = sf.estimate(build_simulated_problem())
-    exact = sf.estimate(sf.Problem(fit.problem.system, fit.problem.experiments, fit.problem.parameters, rtol=1e-12))
-    assert fit.success
-    assert exact.success
-    np.testing.assert_allclose(fit.theta, exact.theta, rtol=1e-8, atol=0)

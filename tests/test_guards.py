@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from models import BALL_G, BALL_HEIGHT, ball, ball_system, decay, rest
+from models import BALL_G, BALL_HEIGHT, ball, ball_system, decay, fit_problem, rest
 
 import switchfit as sf
 
@@ -41,8 +41,7 @@ def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
 
 
 def test_bouncing_ball_is_fitted_to_twelve_digits():
-    fit = sf.estimate(guarded_ball())
-    assert fit.success
+    fit = fit_problem(guarded_ball(), success=True)
     assert fit.parameters["e"] == pytest.approx(0.86655410543691079, abs=1e-12)
     assert max(abs(value) for _, value, _ in fit.constraints) < 1e-9
     assert "guard of tau_2 (air -> air)" in str(fit)
@@ -106,8 +105,7 @@ def tank(inflow=0.8, rim=None, **more):
 
 
 def test_a_tank_that_overflows_is_fitted_with_the_covariance_of_its_closed_form():
-    fit = sf.estimate(tank())
-    assert fit.verdict.level == "good", str(fit.verdict)  # not: the cost does not depend on the rim
+    fit = fit_problem(tank(), level="good")  # not: the cost does not depend on the rim
     assert sf.identifiability(tank()).undetermined == 0
     overflow = -10 * np.log(1 - 2.2 / 5)
     np.testing.assert_allclose(fit.theta, [overflow, 0.5, 2.2], rtol=0, atol=1e-8)
@@ -158,9 +156,7 @@ def constrain(psi):
 
 
 def test_constraints_that_cannot_be_met_are_named():
-    fit = sf.estimate(constrain(lambda x, p: x[0] + 1.0))
-    assert fit.status is sf.Status.INFEASIBLE
-    assert not fit.success
+    fit = fit_problem(constrain(lambda x, p: x[0] + 1.0), status=sf.Status.INFEASIBLE, success=False)
     assert "The constraints are not met: terminal constraint 1 = 1.0" in fit.message
 
 

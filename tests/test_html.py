@@ -18,10 +18,9 @@ import numpy as np
 import pytest
 from bs4 import BeautifulSoup
 from models import RAMP
-from typer.testing import CliRunner
+from test_cli import run
 
 import switchfit as sf
-from switchfit import cli
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
 from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, find_range, list_places
@@ -77,8 +76,7 @@ def toss():
 def toss_page(tmp_path_factory):
     """What the command line writes of the same fit."""
     folder = tmp_path_factory.mktemp("toss")
-    done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(folder), "--strategy", "local"])
-    assert done.exit_code == 0, done.stderr
+    run("fit", TOSS, "--out", folder, "--strategy", "local", code=0)
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
@@ -333,9 +331,8 @@ def test_without_the_extra_it_says_how_to_get_it(heater, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "bokeh", None)
     with pytest.raises(ImportError, match=r"needs bokeh, which cannot be .*: pip install 'switchfit\[report\]'"):
         heater.save_report(tmp_path / "report.html")
-    done = CliRunner().invoke(cli.app, ["fit", str(TOSS), "--out", str(tmp_path)])
-    assert done.exit_code == 0
-    assert "no report.html: an HTML report needs bokeh" in done.stderr
+    said = run("fit", TOSS, "--out", tmp_path, code=0).stderr
+    assert "no report.html: an HTML report needs bokeh" in said
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "fit.png", "report.txt"]
 
 

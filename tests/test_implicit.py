@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from models import decay, first_state
+from models import decay, first_state, one_run
 from systems import P0, case
 
 import switchfit as sf
@@ -46,8 +46,7 @@ def friction(v, p):
 
 
 def one_mode(mode, start, parameters, tf, data=SQUARE, *, solver="stiff", **settings):
-    run = sf.Experiment(data, ("m",), (), 0.0, tf)
-    return sf.Problem(sf.HybridSystem({"m": mode}, start), run, parameters, solver=solver, **settings)
+    return one_run(sf.HybridSystem({"m": mode}, start), data, ("m",), (), tf, parameters, solver=solver, **settings)
 
 
 def block(**settings):
@@ -79,9 +78,8 @@ def everything(**settings):
         sf.TerminalCost(lambda x, p: x[1] ** 2 * p["k"]),
     ]
     inputs = sf.Input([0.0, 1.4, 3.0], [0.1, 0.3, 0.2], kind="linear")
-    run = sf.Experiment(data, ("cool", "follow", "cool"), (1.03, 2.08), 0.0, 3.0, inputs=inputs)
     given = {"k": 0.3, "rate": 1e5, "late": sf.Parameter(0.0513, lower=0.0, upper=0.08)}
-    return sf.Problem(system, run, given, **settings)
+    return one_run(system, data, ("cool", "follow", "cool"), (1.03, 2.08), 3.0, given, inputs=inputs, **settings)
 
 
 PROBLEMS = {

@@ -32,13 +32,11 @@ def write_log(path, header="t,level,idle,count", rows=list):
 
 def test_without_a_log_an_example_is_written_that_can_be_fitted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    result = run("init", "my room")
-    assert result.exit_code == 0, result.output
+    result = run("init", "my room", code=0)
     written = {path.name for path in Path("my room").iterdir()} - {"__pycache__"}
     assert written == {"log.csv", "model.py", "problem.toml"}
     for command in re.findall(r"^  switchfit (.*)$", result.stdout, re.MULTILINE):
-        done = run(*shlex.split(command))
-        assert done.exit_code == 0, done.output
+        run(*shlex.split(command), code=0)
     fit = sf.Estimate.load("my room/out/estimate.json")
     assert fit.verdict.level == "good"
     np.testing.assert_allclose(fit.theta, [5.3, 5.0, 0.2, 15.0], rtol=0.02)
@@ -47,8 +45,7 @@ def test_without_a_log_an_example_is_written_that_can_be_fitted(tmp_path, monkey
 def test_from_a_log(tmp_path):
     log = write_log(tmp_path / "tank.csv")
     folder = tmp_path / "tank"
-    result = run("init", folder, "--from", log)
-    assert result.exit_code == 0, result.output
+    run("init", folder, "--from", log, code=0)
     assert (folder / "tank.csv").read_bytes() == log.read_bytes()
     (data,) = tomllib.loads((folder / "problem.toml").read_text())["experiments"][0]["data"]
     assert (data["file"], data["time"], data["columns"]) == ("tank.csv", "t", ["level"])  # idle: constant; count: rows
@@ -111,9 +108,7 @@ def test_nothing_is_overwritten(tmp_path):
     assert run("init", room).exit_code == 0  # into an empty folder
     written = {path: path.read_text() for path in room.iterdir()}
     for command in (("init", room), ("examples", "toss", room), ("init", room / "log.csv")):
-        result = run(*command)
-        assert result.exit_code == 2
-        assert "exists already, and nothing is overwritten" in result.stderr
+        assert "exists already, and nothing is overwritten" in run(*command, code=2).stderr
     assert {path: path.read_text() for path in room.iterdir()} == written
 
 
@@ -125,9 +120,7 @@ def test_nothing_is_overwritten(tmp_path):
 def test_logs_that_cannot_be_used(rows, message, tmp_path):
     if rows:
         (tmp_path / "log.csv").write_text("t,a\n" + "".join(f"{k},{value}\n" for k, value in enumerate(rows)))
-    result = run("init", tmp_path / "new", "--from", tmp_path / "log.csv")
-    assert result.exit_code == 2
-    assert message in result.stderr
+    assert message in run("init", tmp_path / "new", "--from", tmp_path / "log.csv", code=2).stderr
     assert not (tmp_path / "new").exists()
 
 
@@ -148,9 +141,7 @@ def test_an_example_is_copied_and_can_be_fitted(tmp_path, monkeypatch):
     assert "python mine/own_model.py" in run("examples", "own_model", "mine").stdout
     assert Path("mine", "own_model.py").is_file()
     assert "switchfit modes covid/search.toml" in run("examples", "covid").output
-    result = run("examples", "moon")
-    assert result.exit_code == 2
-    assert "there is no example 'moon'; there are ball, covid" in result.stderr
+    assert "there is no example 'moon'; there are ball, covid" in run("examples", "moon", code=2).stderr
 
 
 def test_installed_examples_come_first(tmp_path, monkeypatch):

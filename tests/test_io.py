@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from test_cli import run
 
 import switchfit as sf
-from switchfit import cli
 from switchfit.io.problem_file import load_problem
 from switchfit.io.user_files import load_object
 from switchfit.report.text import write_problem
@@ -171,8 +170,7 @@ def test_times_out_of_order_are_said_with_their_line(folder, times, said, repair
 @pytest.mark.parametrize("options", [[], ["--no-run"]])
 def test_check_says_what_is_odd(folder, options):
     (folder / "log.csv").write_text("t,T\n" + "".join(f"{t},{t}\n" for t in (0, 0.1, 0.2, 0.3, 0.4, 0.5, 5.5)))
-    result = CliRunner().invoke(cli.app, ["check", str(folder / "problem.toml"), *options])
-    assert result.exit_code == 0, result.stderr
+    result = run("check", folder / "problem.toml", *options, code=0)
     assert "7 samples of T, 0 to 5.5 s" in result.stdout
     assert "log.csv, line 8: a gap of 5 after 0.5, where samples are" in result.stdout
 

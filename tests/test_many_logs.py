@@ -83,8 +83,7 @@ def test_a_pattern_is_a_run_for_each_log(pattern):
 
 def test_a_bad_log_is_left_out_of_a_problem(folder, pattern):
     spoil(folder)
-    result = run("check", pattern, "--no-run")
-    assert result.exit_code == 2
+    result = run("check", pattern, "--no-run", code=2)
     assert result.stderr.startswith("switchfit: Left out: ")
     assert "sunday.csv, line 3, column 'T': 'cold' is not a number; leave the cell empty" in result.stderr
     assert "monday" in result.stdout
@@ -120,8 +119,7 @@ def read(path):
 
 def test_logs_one_by_one(folder):
     logs, problem, out, table = (folder / name for name in ("logs", "problem.toml", "out", "new/table.csv"))
-    result = run("fit", logs, "--problem", problem, "--table", table, "--out", out, "--no-figures")
-    assert result.exit_code == 0, result.stderr
+    result = run("fit", logs, "--problem", problem, "--table", table, "--out", out, "--no-figures", code=0)
     rows = read(table)
     assert [row["log"] for row in rows] == [str(logs / "monday.csv"), str(logs / "tuesday.csv")]
     found = [[float(row[name]) for name in ("tau_1 (s)", "heating")] for row in rows]
@@ -141,8 +139,7 @@ def test_a_bad_log_does_not_end_the_run(folder):
     (folder / "logs" / "friday.csv").write_text("t;T\n" + waves)
     (folder / "logs" / "short.csv").write_text("t;U\n0;1\n")
     table, problem = folder / "table.csv", ("--problem", folder / "problem.toml")
-    result = run("fit", folder / "logs", *problem, "--table", table)
-    assert result.exit_code == 2
+    result = run("fit", folder / "logs", *problem, "--table", table, code=2)
     rows = {row["log"].rpartition("/")[2]: row for row in read(table)}
     assert [row["verdict"] for row in rows.values()] == ["bad", "good", "refused", "refused", "good"]
     assert "short.csv has no column 'T'; its columns are t, U." in rows["short.csv"]["message"]
@@ -166,16 +163,14 @@ def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):
         raise LookupError("no luck")
 
     monkeypatch.setattr(sf, "estimate", estimate)
-    result = run("fit", folder / "logs", "--problem", folder / "problem.toml")
-    assert result.exit_code == 2
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", code=2)
     assert "monday.csv: refused. LookupError: no luck" in result.stdout
     assert "2 logs: 1 fitted, 0 not, 1 refused" in result.stderr
 
 
 def test_ctrl_c_ends_the_run_and_leaves_the_table(folder, interrupted_fits):
     table = folder / "table.csv"
-    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", table)
-    assert result.exit_code == 1
+    result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", table, code=1)
     assert [row["status"] for row in read(table)] == ["INTERRUPTED"]
     assert "1 were not begun" in result.stderr
 
@@ -205,9 +200,7 @@ def test_what_is_missing_or_too_much(folder):
         ((problem, "--table", folder / "a.csv"), "name one problem file"),
         ((folder / "logs" / "x*.csv", "--problem", problem), "No file matches"),
     ):
-        result = run("fit", *arguments)
-        assert result.exit_code == 2
-        assert message in result.stderr
+        assert message in run("fit", *arguments, code=2).stderr
     problem.write_text(PROBLEM.replace('file = "log.csv"\n', ""))
     with pytest.raises(InputError, match=r"experiments\[1\]\.data\[1\]: the key 'file' is missing: name the log"):
         load_problem(problem)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from models import one_run
 
 import switchfit as sf
 from benchmarks.modes.truths import random_modes, three_modes
@@ -362,8 +363,7 @@ def test_guarded_transitions_are_found_on_their_guards():
     truth = sf.Experiment(cost, ("fill", "drain") * 3, tuple(switches), 0.0, 8.0)
     values = sf.simulate(sf.Problem(system, truth, {"inflow": 1.0, "high": 1.0}), times=TIMES).states[:, 0]
     log = sf.Measurements(TIMES, values + 0.02 * np.random.default_rng(0).standard_normal(81), sigma=0.02)
-    run = sf.Experiment(log, ("fill",), (), 0.0, 8.0)
-    problem = sf.Problem(system, run, {"inflow": 1.1, "high": sf.Parameter(0.9, lower=0.5, upper=1.5)})
+    problem = one_run(system, log, ("fill",), (), 8.0, {"inflow": 1.1, "high": sf.Parameter(0.9, lower=0.5, upper=1.5)})
     found = sf.find_modes(problem, max_switches=7)
     np.testing.assert_allclose(found.transition_times[0], switches, atol=0.05)
     assert abs(found.parameters["high"] - 1.0) < 0.02

@@ -122,8 +122,7 @@ def hiding(t, x, p):
 
 def hidden_problem(mode=hiding, t_on=1.7):
     data = sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
-    run = sf.Experiment(data, ("m",), (), 0.0, 4.0)
-    return sf.Problem(sf.HybridSystem({"m": mode}, [0.1]), run, {"k": 1.0, "t_on": t_on})
+    return models.one_run(sf.HybridSystem({"m": mode}, [0.1]), data, ("m",), (), 4.0, {"k": 1.0, "t_on": t_on})
 
 
 LINE = hiding.__code__.co_firstlineno + 1

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay
+from models import decay, one_run
 from systems import problem_of
 
 import switchfit as sf
@@ -100,8 +100,7 @@ SAMPLES = sf.Measurements(TIMES, np.stack([np.sin(TIMES), np.cos(TIMES)], 1), si
 
 
 def problem_with(mode, data=SAMPLES, **settings):
-    run = sf.Experiment(data, ("m",), (), 0.0, 3.0)
-    return sf.Problem(sf.HybridSystem({"m": mode}, [0.4, 0.1]), run, {"k": 1.0}, **settings)
+    return one_run(sf.HybridSystem({"m": mode}, [0.4, 0.1]), data, ("m",), (), 3.0, {"k": 1.0}, **settings)
 
 
 @pytest.mark.parametrize("mode", [copied, pytest.param(inner_copied, marks=pytest.mark.slow)])

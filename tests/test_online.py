@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay
+from models import decay, one_run
 
 import switchfit as sf
 from switchfit.engine.protocol import Hypotheses
@@ -32,8 +32,7 @@ def measure(states: np.ndarray, seed: int) -> np.ndarray:
 def vehicle(values: np.ndarray, modes: tuple[str, ...] = ("stick",), taus: tuple = ()) -> sf.Problem:
     times = TIMES[: len(values)]
     gps = sf.Measurements(times, values, lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))
-    run = sf.Experiment(gps, modes, taus, 0.0, float(times[-1]))
-    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
+    return one_run(skid_steer(), gps, modes, taus, float(times[-1]), {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +58,7 @@ def feed_all(online: sf.OnlineEstimator, log: np.ndarray, times: np.ndarray = TI
 
 def track(modes: dict, start: list, data, parameters: dict, tf: float | None = None) -> sf.Problem:
     """Return the problem of a log that begins in the first mode."""
-    run = sf.Experiment(data, (next(iter(modes)),), (), 0.0, tf, name="log")
-    return sf.Problem(sf.HybridSystem(modes, start), run, parameters)
+    return one_run(sf.HybridSystem(modes, start), data, (next(iter(modes)),), (), tf, parameters, name="log")
 
 
 # --- a drive ----------------------------------------------------------------------------------------------------------
@@ -469,10 +467,9 @@ def test_bad_settings_are_refused(problem, log):
 def test_data_without_a_known_sigma_are_refused(log):
     for sigma, message in ((None, "left out"), ("s", "is a parameter")):
         gps = sf.Measurements(TIMES, log, lambda t, x, p: x[:3], sigma)
-        run = sf.Experiment(gps, ("stick",), (), 0.0, 13.0)
         parameters = {"mu": sf.Parameter(0.8)} | ({"s": sf.Parameter(0.1, lower=1e-3)} if sigma else {})
         with pytest.raises(ValueError, match=message):
-            sf.OnlineEstimator(sf.Problem(skid_steer(), run, parameters))
+            sf.OnlineEstimator(one_run(skid_steer(), gps, ("stick",), (), 13.0, parameters))
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------

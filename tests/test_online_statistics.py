@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from test_online import MODES, SWITCHES, TIMES, measure, simulate, vehicle
+from test_online import MODES, SWITCHES, TIMES, measure, simulate, track, vehicle
 
 import switchfit as sf
 from switchfit.models import skid_steer
@@ -40,9 +40,8 @@ def test_false_alarms_come_as_often_as_was_asked(correlation):
     """Within a factor of two: 40 are expected in 200 runs of 20 s, of which a Poisson variable is within 28 to 53."""
     modes = {"full": lambda t, x, p: p["k"] * (3.0 - x), "part": lambda t, x, p: p["k"] * (2.8 - x)}
     times = 0.1 * np.arange(1, 201)
-    run = sf.Experiment(sf.Measurements(times, 0.0 * times, sigma=0.05), ("full",), t0=0.0)
-    problem = sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"k": sf.Parameter(0.7, lower=0.0)})
-    online = sf.OnlineEstimator(problem)
+    data = sf.Measurements(times, 0.0 * times, sigma=0.05)
+    online = sf.OnlineEstimator(track(modes, [0.0], data, {"k": sf.Parameter(0.7, lower=0.0)}))
     online.set_threshold(sf.calibrate(online, 0.01, correlation=correlation).threshold)
     rng, clean, alarms, retracted = np.random.default_rng(1000), 3.0 * (1.0 - np.exp(-0.7 * times)), 0, 0
     for _ in range(200):
@@ -147,9 +146,8 @@ def test_errors_of_a_value_that_is_new_with_its_mode():
 def test_errors_of_a_random_walk(sd, window):
     """x' = a(t), measured ten times a second with an error of 0.05; 50 runs."""
     times = 0.1 * np.arange(1, 201)
-    run = sf.Experiment(sf.Measurements(times, 0.0 * times, sigma=0.05), ("on",), t0=0.0)
-    system = sf.HybridSystem({"on": lambda t, x, p: jnp.stack([p["a"]])}, [0.0])
-    problem = sf.Problem(system, run, {"a": sf.Parameter(1.0)})
+    data = sf.Measurements(times, 0.0 * times, sigma=0.05)
+    problem = track({"on": lambda t, x, p: jnp.stack([p["a"]])}, [0.0], data, {"a": sf.Parameter(1.0)})
     online, errors = sf.OnlineEstimator(problem, window=window, drift={"a": sd}), []
     for seed in range(50):
         rng = np.random.default_rng(seed)

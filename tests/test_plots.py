@@ -59,12 +59,6 @@ def starts() -> sf.Multistart:
     return sf.multistart(heater_problem(), 8)
 
 
-@pytest.fixture(scope="module")
-def models(heater) -> sf.ModelComparison:
-    known = dict(heater.problem.parameters) | {"k": sf.Parameter(0.45, fixed=True)}
-    return sf.compare([sf.estimate(replace(heater.problem, parameters=known)), heater], names=("k known", "k free"))
-
-
 PLOTS = {
     "convergence": lambda car, starts, **ax: car.plot_convergence(**ax),
     "timeline": lambda car, starts, **ax: car.plot_timeline(**ax),
@@ -148,7 +142,7 @@ def test_path_in_the_plane(car, heater):
 # --- one line ---------------------------------------------------------------------------------------------------------
 
 
-def test_every_result_is_one_line(heater, starts, models):
+def test_every_result_is_one_line(heater, starts):
     problem, run = heater.problem, heater.problem.experiments[0]
     for result in (
         heater.profile("k"), heater.predict([1.0]), heater.comparisons[0][0], heater.residuals, heater.certificate,
@@ -160,6 +154,8 @@ def test_every_result_is_one_line(heater, starts, models):
         assert "\n" not in repr(result)
         assert len(repr(result)) < 500
     assert repr(heater) == "Estimate(good, J = 6.03062, tau_1 = 2.462, k = 0.3931)"
+    known = dict(heater.problem.parameters) | {"k": sf.Parameter(0.45, fixed=True)}
+    models = sf.compare([sf.estimate(replace(heater.problem, parameters=known)), heater], names=("k known", "k free"))
     assert repr(models) == "ModelComparison(k known (BIC +105), k free (BIC +0), 24 values)"
     assert repr(heater.validate(problem)) == "Validation(good, fit of thermometer 96.2 %)"
     assert repr(starts) == "Multistart(8 fits, 8 good, tau_1, k)"

@@ -40,8 +40,7 @@ def slopes(t, tau, power, k, *, jump=False):
 
 def room(values=0.0 * TIMES, *, system=ROOM, sigma=SIGMA):
     data = sf.Measurements(TIMES, values, sigma=sigma, names=("T",))
-    run = sf.Experiment(data, ("on", "off"), (2.1,), 0.0, 6.0)
-    return sf.Problem(system, run, {"power": 1.0, "k": 0.4}, rtol=1e-11, atol=1e-13)
+    return models.one_run(system, data, ("on", "off"), (2.1,), 6.0, {"power": 1.0, "k": 0.4}, rtol=1e-11, atol=1e-13)
 
 
 def noisy(sigma=SIGMA):

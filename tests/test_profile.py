@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from models import curve, rest
+from models import curve, one_run, rest
 from scipy.optimize import brentq
 
 import switchfit as sf
@@ -107,8 +107,7 @@ def test_others_are_fitted_again_and_pushed_away_in_time():
 
     def problem(tau_1):
         data = sf.Measurements(TIMES, values, sigma=0.3)
-        run = sf.Experiment(data, ("up", "rest", "half"), (tau_1, 2.6), 0.0, 4.0)
-        return sf.Problem(system, run, {"v": 1.0})
+        return one_run(system, data, ("up", "rest", "half"), (tau_1, 2.6), 4.0, {"v": 1.0})
 
     fit = sf.estimate(problem(1.9))
     found = fit.profile("tau_1")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay, rest
+from models import decay, one_run, rest
 
 import switchfit as sf
 from switchfit.engine.native import program
@@ -32,8 +32,7 @@ PARAMETERS = {"k": sf.Parameter(1.2, lower=0.1), "g": 0.8}
 
 
 def problem(data, sequence=("swing", "fall", "swing"), times=(1.1, 2.3), system=SYSTEM, parameters=None, **settings):
-    run = sf.Experiment(data, sequence, times, 0.0, 3.0)
-    return sf.Problem(system, run, PARAMETERS | (parameters or {}), **settings)
+    return one_run(system, data, sequence, times, 3.0, PARAMETERS | (parameters or {}), **settings)
 
 
 def samples(**settings):
@@ -95,8 +94,7 @@ def test_the_cost_of_transitions_in_closed_form():
     """x = x0 exp(-k t): ``mu = (x - a)^2 + c t`` at tau, of which the other transition has nothing."""
     modes = {"decay": decay, "stand": rest, "again": decay}
     cost = sf.TransitionCost(lambda t, x, p: (x[0] - 0.4) ** 2 + 0.3 * t, after="stand")
-    run = sf.Experiment(cost, ("decay", "stand", "again"), (0.8, 1.7), 0.0, 3.0)
-    given = sf.Problem(sf.HybridSystem(modes, [1.0]), run, {"k": 0.9})
+    given = one_run(sf.HybridSystem(modes, [1.0]), cost, ("decay", "stand", "again"), (0.8, 1.7), 3.0, {"k": 0.9})
     evaluator, (tau, _, k) = evaluator_of(given), given.initial_theta
     for method in ("auto", "forward"):
         found = evaluator(given.initial_theta, method=method)

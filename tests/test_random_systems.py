@@ -575,8 +575,7 @@ SHORT = {
 
 
 @pytest.mark.parametrize(
-    ("seed", "name"),
-    [pytest.param(*v, marks=[pytest.mark.slow] * (v[1] == "ten states")) for v in enumerate(SHORT)],
+    ("seed", "name"), [pytest.param(*v, marks=[pytest.mark.slow] * (v[1] == "ten states")) for v in enumerate(SHORT)]
 )
 def test_derivatives_of_random_systems_in_machine_code(seed, name):
     assert not differences(System(1000 + seed, **{**PLAIN, **SHORT[name]}), ())

@@ -45,8 +45,7 @@ def saved_project(tmp_path_factory):
     never = PROBLEM.replace('["on", "off"]', '["on"]').replace("transition_times = [2.0]\n", "")
     (folder / "never.toml").write_text(never + LOCAL)
     for name in ("problem", "never"):
-        result = run("fit", folder / f"{name}.toml", "--out", folder / "out" / name, "--no-figures", "--full")
-        assert result.exit_code == 0, result.stderr  # of a doubtful fit too
+        result = run("fit", folder / f"{name}.toml", "--out", folder / "out" / name, "--no-figures", "--full", code=0)
     assert result.stdout.startswith("Doubtful: ")
     sf.estimate(heater_problem(), strategy="local").save(folder / "heater.json")
     return folder
@@ -68,15 +67,13 @@ NEVER = Path("out/never/estimate.json")
 
 def succeed(*arguments):
     """What a command prints."""
-    result = run(*arguments)
-    assert result.exit_code == 0, result.stderr
-    return result.stdout
+    return run(*arguments, code=0).stdout
 
 
 def refuse(*arguments):
     """What a command says that ends with code 2 and prints nothing."""
-    result = run(*arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
+    result = run(*arguments, code=2)
+    assert result.stdout == ""
     return result.stderr
 
 
@@ -112,8 +109,7 @@ def test_validate_with_a_problem_file_for_a_run_that_differs(project):
 
 
 def test_a_run_for_which_the_parameters_do_not_hold_is_exit_code_1(project):
-    result = run("validate", FIT, "weaker.csv")
-    assert result.exit_code == 1
+    result = run("validate", FIT, "weaker.csv", code=1)
     assert result.stdout.startswith("Bad: the fitted parameters do not predict this run")
     assert result.stderr.startswith("switchfit: the parameters do not hold for this run")
     quiet = run("validate", FIT, "weaker.csv", "--quiet")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import approach, decay, fishing, heated_room
+from models import approach, decay, fishing, fit_problem, heated_room, one_run, simulate_log
 
 import switchfit as sf
 from benchmarks.sharp.problems import dry, valve
@@ -32,9 +32,8 @@ def temperatures(times, switches, power, k):
 
 def thermostat(guess=None, sigma=0.02, modes=("on", "off") * 3):
     values = temperatures(TIMES, TRUTH[:5], *TRUTH[5:]) + np.random.default_rng(1).normal(0.0, 0.02, len(TIMES))
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=sigma), modes, guess, 0.0, 10.0)
     parameters = {"power": sf.Parameter(1.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
-    return sf.Problem(HEATER, run, parameters)
+    return one_run(HEATER, sf.Measurements(TIMES, values, sigma=sigma), modes, guess, 10.0, parameters)
 
 
 FAR = (0.5, 1.0, 1.5, 2.0, 9.0)
@@ -45,14 +44,8 @@ def right():
     return sf.estimate(thermostat(tuple(TRUTH[:5])), strategy="local")
 
 
-@pytest.fixture(scope="module")
-def far_fit():
-    """A fit from a far guess, by default."""
-    return sf.estimate(thermostat(FAR))
-
-
-def test_by_default_the_right_answer_is_found_and_what_each_step_brought_is_told(right, far_fit):
-    assert far_fit.verdict.level == "good"
+def test_by_default_the_right_answer_is_found_and_what_each_step_brought_is_told(right):
+    far_fit = fit_problem(thermostat(FAR), level="good")
     assert far_fit.cost == pytest.approx(right.cost, rel=1e-6)
     np.testing.assert_allclose(far_fit.theta, right.theta, rtol=1e-5)
     np.testing.assert_array_equal(far_fit.initial_theta[:5], FAR)
@@ -95,23 +88,17 @@ def quench(t, x, p):
 
 def test_an_end_that_chi_square_allows_and_residuals_refute_is_not_the_end():
     # A flame is quenched at 160. Every sample interval may have a minimum: an early one is 165.8, J 61.1 for 50.
-    times = np.linspace(3.0, 300.0, 100)
     flame = sf.HybridSystem({"burn": burn, "quench": quench}, [0.01])
 
-    def pose(values, tau, a, q):
-        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("burn", "quench"), (tau,), 0.0, 300.0)
-        return sf.Problem(flame, run, {"a": a, "q": q})
-
-    truth = sf.simulate(pose(np.zeros((100, 1)), 160.0, 1.0, 0.05), times=times).states
-    values = truth + 0.01 * np.random.default_rng(7).normal(size=truth.shape)
-    near = pose(values, 166.6, 1.147, 0.044)
+    log = sf.Measurements(np.linspace(3.0, 300.0, 100), np.zeros(100), sigma=0.01)
+    near = one_run(flame, log, ("burn", "quench"), (166.6,), 300.0, {"a": 1.147, "q": 0.044})
+    near = simulate_log(near, [160.0, 1.0, 0.05], seed=7)
     wrong = sf.estimate(near, strategy="local")
     assert abs(wrong.transition_times[0][0] - 165.8) < 0.1
     assert choice.is_explained(near, wrong.cost)
     assert not choice.is_confirmed(near, wrong)
-    found = sf.estimate(near)
+    found = fit_problem(near, level="good")
     assert abs(found.transition_times[0][0] - 160.6) < 0.1
-    assert found.verdict.level == "good"
 
 
 def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, right):
@@ -219,12 +206,10 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
     before = times < 1.0
     values = np.where(before, 1 / (1 - 0.5 * np.minimum(times, 1.0)), 2.0 * np.exp(-(times - 1.0)))
     data = sf.Measurements(times, values + np.random.default_rng(0).normal(0, 0.01, 30), sigma=0.01)
-    run = sf.Experiment(data, ("grow", "rest"), (2.0,), 0.0, 3.0)
-    problem = sf.Problem(system, run, {"a": sf.Parameter(2.0, lower=0.0, upper=4.0)})
+    problem = one_run(system, data, ("grow", "rest"), (2.0,), 3.0, {"a": sf.Parameter(2.0, lower=0.0, upper=4.0)})
     with pytest.raises(ValueError, match=r"cannot be integrated|grows without bound"):
         sf.estimate(problem, strategy="local")
-    found = sf.estimate(problem)
-    assert found.verdict.level == "good"
+    found = fit_problem(problem, level="good")
     np.testing.assert_allclose(found.theta, [1.0, 0.5], atol=0.02)
 
 
@@ -339,20 +324,16 @@ def is_fixed(tau):
 
 def pose(logs, system=HEATER, parameters=GUESS, times=BAD, truth=(POWER, LOSS), **more):
     """Return a problem with a bad guess whose data are simulated at the truth, and the fit that begins there."""
-
-    def build(data, tau):
-        given = {"mode_sequence": SEQUENCE, "t0": 0.0, "tf": 10.0} | more
-        run = sf.Experiment(list(data), transition_times=tau, **given)
-        return sf.Problem(system, run, parameters)
-
+    given = {"mode_sequence": SEQUENCE, "t0": 0.0, "tf": 10.0} | more
+    run = sf.Experiment([log for log, _ in logs], transition_times=times, **given)
+    problem = sf.Problem(system, run, parameters)
     near = [tau for tau, given in zip(TAU, times, strict=True) if not is_fixed(given)]
-    problem = build([log for log, _ in logs], times)
     theta = np.concatenate([near, truth])
     seen = Evaluator(problem, theta).simulate(theta)[0].seen
     filled = [
         replace(log, values=values[: len(noise)] + noise) for (log, noise), values in zip(logs, seen, strict=True)
     ]
-    problem = build(filled, times)
+    problem = replace(problem, experiments=replace(run, data=filled))
     return problem, fit_briefly(problem, theta)
 
 
@@ -512,8 +493,7 @@ def test_where_no_beam_applies_it_says_why(reason):
 def pose_one_switch(values):
     """Return the problem of when the heater goes off, all else being known."""
     held = {"power": sf.Parameter(POWER, fixed=True), "k": sf.Parameter(LOSS, fixed=True)}
-    run = sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (9.0,), 0.0, 10.0)
-    return sf.Problem(HEATER, run, held)
+    return one_run(HEATER, sf.Measurements(TIMES, values), ("on", "off"), (9.0,), 10.0, held)
 
 
 def test_hops_find_the_lowest_of_the_sample_intervals_near_by():
@@ -584,30 +564,21 @@ def test_a_beam_of_which_no_hypothesis_is_left_proposes_nothing():
 def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found(friction):
     """The fields of a mass on two springs differ by nothing where it passes 0, at 6.8 s: a switch as long before it
     as the right one is behind leaves noise of the right size, too, and is 16 standard errors off."""
-    times = np.arange(0.0, 16.0, 0.1)
 
     def spring(kind):
         dry = (lambda v: friction * jnp.sign(v)) if friction else (lambda v: 0.0)
         return lambda t, x, p: jnp.stack([x[1], -p[kind] * x[0] - p["damping"] * x[1] - dry(x[1])])
 
-    springs = {kind: spring(kind) for kind in ("soft", "hard")}
-
-    def build(values, switch, guesses):
-        log = sf.Measurements(times, values, sigma=0.03, observe=lambda t, x, p: x[0])
-        run = sf.Experiment(log, ("hard", "soft"), (switch,), 0.0, 16.0)
-        names = ("hard", "soft", "damping")
-        return sf.Problem(sf.HybridSystem(springs, [1.0, 0.0]), run, dict(zip(names, guesses, strict=True)))
-
-    truth = np.array([7.0, 9.0, 4.0, 0.1])
-    exact = sf.simulate(build(np.zeros(160), truth[0], truth[1:]))
-    values = np.interp(times, exact.times, exact.states[:, 0]) + 0.03 * np.random.default_rng(10).normal(size=160)
-    problem = build(values, 6.66, (9.01, 4.02, 0.105))
-    near = sf.estimate(problem, strategy="local")
+    springs = sf.HybridSystem({kind: spring(kind) for kind in ("soft", "hard")}, [1.0, 0.0])
+    log = sf.Measurements(np.arange(0.0, 16.0, 0.1), np.zeros(160), sigma=0.03, observe=lambda t, x, p: x[0])
+    guess = {"hard": 9.01, "soft": 4.02, "damping": 0.105}
+    problem = one_run(springs, log, ("hard", "soft"), (6.66,), 16.0, guess)
+    problem = simulate_log(problem, [7.0, 9.0, 4.0, 0.1], seed=10)
+    near = fit_problem(problem, strategy="local", level="good")
     fit = sf.estimate(problem)
-    assert near.verdict.level == "good"
     assert [step.strategy for step in fit.steps] == ["local", choice.OTHER]
     assert fit.cost < near.cost - 1.0
-    assert abs(fit.theta[0] - truth[0]) < 3 * fit.standard_errors[0]
+    assert abs(fit.theta[0] - 7.0) < 3 * fit.standard_errors[0]
     again = sf.estimate(problem, start=fit.theta)
     assert not again.steps, "of two minima that are known the lower one is left as it is"
 
@@ -666,17 +637,13 @@ def test_a_minimum_behind_a_kink_where_a_pendulum_turns_once_more_is_found():
 def test_a_narrow_minimum_far_away_is_found_from_a_kink_too(seed, status):
     """A lag is driven in steps and leaks faster from 5.2 s on. It is at rest from 5.6 to 7.2 s: a switch there or a
     little later leaves noise of the right size."""
-    times, steps = np.linspace(0.1, 10.0, 67), [0.0, 0.7, 1.9, 3.3, 4.1, 5.6, 7.2, 8.8, 9.5]
+    steps = [0.0, 0.7, 1.9, 3.3, 4.1, 5.6, 7.2, 8.8, 9.5]
     command = sf.Input(steps, [0.0, 1.0, 2.0, 1.0, -1.0, 0.0, 2.0, 3.0, 1.0])
     leaks = {name: (lambda t, x, p, u, k=name: p["gain"] * u - p[k] * x) for name in ("slow", "fast")}
-
-    def build(values, switch, guesses):
-        log = sf.Measurements(times, values, sigma=0.03)
-        run = sf.Experiment(log, ("slow", "fast"), (switch,), 0.0, 10.0, inputs=command)
-        return sf.Problem(sf.HybridSystem(leaks, [0.0]), run, dict(zip(("gain", "slow", "fast"), guesses, strict=True)))
-
-    exact = sf.simulate(build(times, 5.2, (1.2, 0.5, 1.5)), times=times).states[:, 0]
-    problem = build(exact + 0.03 * np.random.default_rng(seed).normal(size=67), 7.5, (0.6, 1.0, 1.0))
+    log = sf.Measurements(np.linspace(0.1, 10.0, 67), np.zeros(67), sigma=0.03)
+    guess = {"gain": 0.6, "slow": 1.0, "fast": 1.0}
+    problem = one_run(sf.HybridSystem(leaks, [0.0]), log, ("slow", "fast"), (7.5,), 10.0, guess, inputs=command)
+    problem = simulate_log(problem, [5.2, 1.2, 0.5, 1.5], seed)
     near = sf.estimate(problem, strategy="local")
     assert (near.status, near.verdict.level) == (status, "good")
     assert near.theta[0] > 7.2
@@ -686,19 +653,15 @@ def test_a_narrow_minimum_far_away_is_found_from_a_kink_too(seed, status):
 def test_where_chi_square_is_rather_large_a_beam_has_the_last_word():
     """A motor is shorted, and coasts from 6.4 on. Where shorting it changes nothing, it may as well coast from 2.3 on,
     and a scan over that time shows nothing; what is left looks like noise."""
-    times = np.linspace(0.05, 10.0, 200)
     modes = {
         "on": lambda t, x, p: p["u"] - (p["short"] + p["loss"]) * x,
         "short": lambda t, x, p: -(p["short"] + p["loss"]) * x,
         "coast": lambda t, x, p: -p["loss"] * x,
     }
-
-    def build(values, switches, guesses):
-        run = sf.Experiment(sf.Measurements(times, values, sigma=0.035), tuple(modes), switches, 0.0, 10.0)
-        return sf.Problem(sf.HybridSystem(modes, [0.0]), run, dict(zip(("u", "short", "loss"), guesses, strict=True)))
-
-    exact = sf.simulate(build(times, (1.6, 6.4), (8.0, 0.25, 0.5)), times=times).states[:, 0]
-    problem = build(exact + 0.035 * np.random.default_rng(4).normal(size=200), (4.0, 8.7), (23.0, 0.12, 0.63))
+    log, guess = sf.Measurements(np.linspace(0.05, 10.0, 200), np.zeros(200), sigma=0.035), (4.0, 8.7)
+    parameters = {"u": 23.0, "short": 0.12, "loss": 0.63}
+    problem = one_run(sf.HybridSystem(modes, [0.0]), log, tuple(modes), guess, 10.0, parameters)
+    problem = simulate_log(problem, [1.6, 6.4, 8.0, 0.25, 0.5], seed=4)
     near, fit = sf.estimate(problem, strategy="local"), sf.estimate(problem)
     assert (near.verdict.level, near.theta[1] < 3.0) == ("good", True)
     assert fit.cost < near.cost - 15.0
@@ -707,25 +670,17 @@ def test_where_chi_square_is_rather_large_a_beam_has_the_last_word():
 
 def test_starts_are_drawn_where_an_unknown_has_no_effect():
     """At the guess the level does not reach the weir: no derivative, and no hypothesis of the beam, leads there."""
-    times = np.arange(0.0, 60.0, 1.0)
     flows = {
         "on": lambda t, x, p: p["inflow"] - p["rate"] * jnp.maximum(x - p["height"], 0.0) - 0.02 * x,
         "off": lambda t, x, p: -p["rate"] * jnp.maximum(x - p["height"], 0.0) - 0.02 * x,
     }
-
-    def build(values, switch, guesses):
-        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("on", "off"), (switch,))
-        names = ("inflow", "rate", "height")
-        parameters = {n: sf.Parameter(v, lower=0.0) for n, v in zip(names, guesses, strict=True)}
-        return sf.Problem(sf.HybridSystem(flows, [0.2]), run, parameters)
-
-    truth = (0.1, 0.25, 1.2)
-    exact = sf.simulate(build(np.zeros(60), 31.0, truth))
-    values = np.interp(times, exact.times, exact.states[:, 0]) + 0.01 * np.random.default_rng(1).normal(size=60)
-    fit = sf.estimate(build(values, 31.7, (0.076, 0.622, 3.6)), time_budget=60.0)
+    log, truth = sf.Measurements(np.arange(0.0, 60.0, 1.0), np.zeros(60), sigma=0.01), [31.0, 0.1, 0.25, 1.2]
+    guesses = {"inflow": 0.076, "rate": 0.622, "height": 3.6}
+    parameters = {name: sf.Parameter(value, lower=0.0) for name, value in guesses.items()}
+    problem = one_run(sf.HybridSystem(flows, [0.2]), log, ("on", "off"), (31.7,), 59.0, parameters)
+    fit = fit_problem(simulate_log(problem, truth, seed=1), time_budget=60.0, level="good")
     assert fit.steps[1].cost == fit.steps[0].cost, "the beam"
-    assert fit.verdict.level == "good"
-    np.testing.assert_allclose(fit.theta, (31.0, *truth), rtol=0.05)
+    np.testing.assert_allclose(fit.theta, truth, rtol=0.05)
 
 
 def test_a_guess_at_which_a_cost_has_no_slope_later_on_is_a_bad_start():
@@ -735,21 +690,15 @@ def test_a_guess_at_which_a_cost_has_no_slope_later_on_is_a_bad_start():
         return p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))
 
     modes = {"fill": lambda t, x, p: jnp.stack([p["q"] - flow(x, p)]), "drain": lambda t, x, p: -flow(x, p) + 0.0 * x}
-
-    def build(values, tau, q, k):
-        data = [sf.Measurements(times, values, sigma=0.01), sf.RunningCost(lambda t, x, p: 1e-3 * flow(x, p))]
-        parameters = {"q": sf.Parameter(q, 0.01, 5.0), "k": sf.Parameter(k, 0.01, 5.0)}
-        run = sf.Experiment(data, ("fill", "drain"), (tau,), 0.0, 8.0)
-        return sf.Problem(sf.HybridSystem(modes, [0.2]), run, parameters)
-
-    times = np.linspace(0.2, 8.0, 40)
-    exact = sf.simulate(build(np.zeros(40), 6.0, 0.5, 0.4), times=times).states[:, 0]
-    values, guess = exact + np.random.default_rng(1).normal(0.0, 0.01, 40), (3.0, 0.4, 0.9)
-    alone = sf.estimate(build(values, *guess), strategy="local")
-    assert alone.status is Status.NONFINITE_START
+    log = sf.Measurements(np.linspace(0.2, 8.0, 40), np.zeros(40), sigma=0.01)
+    data = [log, sf.RunningCost(lambda t, x, p: 1e-3 * flow(x, p))]
+    parameters = {"q": sf.Parameter(0.4, 0.01, 5.0), "k": sf.Parameter(0.9, 0.01, 5.0)}
+    problem = one_run(sf.HybridSystem(modes, [0.2]), data, ("fill", "drain"), (3.0,), 8.0, parameters)
+    problem = simulate_log(problem, [6.0, 0.5, 0.4], seed=1)
+    alone = fit_problem(problem, strategy="local", status=Status.NONFINITE_START)
     assert alone.reason.kind == "undefined"
     assert 3.0 < alone.reason.figures["t"] < 8.0
-    np.testing.assert_allclose(sf.estimate(build(values, *guess)).theta, [6.0, 0.5, 0.4], rtol=0.05)
+    np.testing.assert_allclose(sf.estimate(problem).theta, [6.0, 0.5, 0.4], rtol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -779,20 +728,13 @@ def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held, unit
     resets = {("first", "second"): shift(2.0), ("second", "third"): shift(1.3)}
     guards = dict.fromkeys(resets, lambda t, x, p: x[1] - p["limit"]) if limit else {}
     modes = {name: drive(ratio) for name, ratio in ratios.items()}
-    system, times = sf.HybridSystem(modes, [1.0, 30.0], resets, guards=guards), np.linspace(0.1, 20.0, 200)
-
-    def build(values, shifts, *guess):
-        log = sf.Measurements(times, values, lambda t, x, p: x[1:], sigma=3.0)
-        parameters = {n: sf.Parameter(v, lower=0.0) for n, v in zip(("a", "c", "limit"), guess, strict=False)}
-        return sf.Problem(system, sf.Experiment(log, tuple(ratios), shifts, 0.0, 20.0), parameters)
-
+    system = sf.HybridSystem(modes, [1.0, 30.0], resets, guards=guards)
+    log = sf.Measurements(np.linspace(0.1, 20.0, 200), np.zeros(200), lambda t, x, p: x[1:], sigma=3.0)
+    guesses = dict(zip(("a", "c", "limit"), (0.5, 0.003 / unit, *(1.2 * each for each in limit)), strict=False))
+    parameters = {name: sf.Parameter(value, lower=0.0) for name, value in guesses.items()}
     truth = (*((3.67996, 7.41272) if limit else (4.03, 10.07)), 1.0, 0.002 / unit, *limit)
-    exact = sf.simulate(build(np.zeros(200), truth[:2], *truth[2:]), times=times).states[:, 1]
-    values = exact + 3.0 * np.random.default_rng(seed).normal(size=200)
-    fit = sf.estimate(
-        build(values, (1.1 * truth[0], 1.1 * truth[1]), 0.5, 0.003 / unit, *(1.2 * each for each in limit))
-    )
-    assert fit.verdict.level == "good"
+    problem = one_run(system, log, tuple(ratios), (1.1 * truth[0], 1.1 * truth[1]), 20.0, parameters)
+    fit = fit_problem(simulate_log(problem, truth, seed), level="good")
     assert [step.strategy for step in fit.steps] == ["local", "beam along the log"]
     np.testing.assert_allclose(fit.theta, truth, rtol=0.03)
     assert [kink.value for kink in fit.kinks] == pytest.approx(held, abs=1e-7)
@@ -811,17 +753,12 @@ def test_the_impacts_of_a_ball_whose_speed_is_measured_are_found():
     """A sample on the wrong side of an impact is off by 240 sigma: a beam takes the spread of speeds for noise."""
     bounce = lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])  # noqa: E731
     fall = lambda t, x, p: jnp.stack([x[1], -p["g"] - p["drag"] * x[1]])  # noqa: E731
-    pairs, times = [("up", "down"), ("down", "up")], np.linspace(0.02, 2.0, 100)
+    pairs = [("up", "down"), ("down", "up")]
     guards = dict.fromkeys(pairs, lambda t, x, p: x[0])
     system = sf.HybridSystem({"up": fall, "down": fall}, [2.0, 0.0], dict.fromkeys(pairs, bounce), guards=guards)
-
-    def build(values, impacts, *guess):
-        log = sf.Measurements(times, values, lambda t, x, p: x[1:], sigma=0.05)
-        parameters = {n: sf.Parameter(v, lower=0.0) for n, v in zip(("g", "drag", "e"), guess, strict=True)}
-        return sf.Problem(system, sf.Experiment(log, ("up", "down", "up"), impacts, 0.0, 2.0), parameters)
-
-    truth = (0.64541959, 1.6293388, 9.81, 0.1, 0.8)
-    exact = sf.simulate(build(np.zeros(100), truth[:2], *truth[2:]), times=times).states[:, 1]
-    fit = sf.estimate(build(exact + 0.05 * np.random.default_rng(0).normal(size=100), (0.8, 1.4), 7.0, 0.15, 0.6))
-    assert fit.verdict.level == "good"
+    log = sf.Measurements(np.linspace(0.02, 2.0, 100), np.zeros(100), lambda t, x, p: x[1:], sigma=0.05)
+    guesses, truth = {"g": 7.0, "drag": 0.15, "e": 0.6}, (0.64541959, 1.6293388, 9.81, 0.1, 0.8)
+    parameters = {name: sf.Parameter(value, lower=0.0) for name, value in guesses.items()}
+    problem = one_run(system, log, ("up", "down", "up"), (0.8, 1.4), 2.0, parameters)
+    fit = fit_problem(simulate_log(problem, truth, seed=0), level="good")
     assert (np.abs(fit.theta - truth) < 4.0 * fit.standard_errors + 1e-3).all()

@@ -12,7 +12,7 @@ import pandas as pd
 import polars as pl
 import pytest
 import xarray as xr
-from models import RAMP, heated_room, temperature
+from models import RAMP, heated_room, one_run, temperature
 from test_cli import log_of, run
 from test_many_logs import folder  # noqa: F401  # a fixture
 from test_report import made, several, trajectory_of
@@ -245,8 +245,7 @@ def test_a_simulation_at_given_times_is_that_of_the_nodes(heater):
 
 def test_a_simulation_up_to_a_free_tf_and_times_outside():
     end, constant = sf.Parameter(1.7, lower=1.0, upper=5.0), {"v": sf.Parameter(2.0, fixed=True)}
-    run = sf.Experiment(sf.TerminalCost(lambda x, p: (x[0] - 3.0) ** 2), ("up",), (), 0.0, end)
-    problem = sf.Problem(RAMP, run, constant)
+    problem = one_run(RAMP, sf.TerminalCost(lambda x, p: (x[0] - 3.0) ** 2), ("up",), (), end, constant)
     path = sf.simulate(problem, times=[0.0, 1.0, 1.7])
     np.testing.assert_allclose(path.states[:, 0], [0.0, 2.0, 3.4], rtol=1e-9)
     inside = r"times must increase strictly inside \[t0, tf\] = "
@@ -268,12 +267,10 @@ def test_simulate_writes_the_times_that_are_asked_for(folder):  # noqa: F811
     (folder / "problem.toml").write_text((folder / "problem.toml").read_text().replace("log.csv", "logs/monday.csv"))
     out = folder / "path.csv"
     for given, times in (("0.5", np.arange(0.0, 6.25, 0.5)), ("4", [0.0, 4.0])):
-        result = run("simulate", folder / "problem.toml", "--out", out, "--times", given)
-        assert result.exit_code == 0, result.stderr
+        result = run("simulate", folder / "problem.toml", "--out", out, "--times", given, code=0)
         np.testing.assert_allclose(pd.read_csv(out)["t"], times)
     for wrong in ("often", "0", "-1", "nan", "1e-9"):
-        result = run("simulate", folder / "problem.toml", "--out", out, f"--times={wrong}")
-        assert result.exit_code == 2
+        result = run("simulate", folder / "problem.toml", "--out", out, f"--times={wrong}", code=2)
         assert "--times must be " in result.stderr
 
 
@@ -281,9 +278,7 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
     (folder / "logs" / "sunday.csv").write_text("t;T\n0;1\n1;cold\n")
 
     def fit(name):
-        result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", folder / name)
-        assert result.exit_code == 2
-        return result
+        return run("fit", folder / "logs", "--problem", folder / "problem.toml", "--table", folder / name, code=2)
 
     fit("table.csv")
     fit("table.parquet")
@@ -362,8 +357,7 @@ def test_the_command_writes_them_where_they_are_many(folder):  # noqa: F811
     text = (folder / "problem.toml").read_text().replace("log.csv", "logs/*.csv")
     (folder / "problem.toml").write_text(f'{text}\n[options]\nstrategy = "local"\n')
     out = folder / "out"
-    done = run("fit", folder / "problem.toml", "--out", out, "--no-figures")
-    assert done.exit_code == 0, done.output
+    done = run("fit", folder / "problem.toml", "--out", out, "--no-figures", code=0)
     assert sorted(path.name for path in out.iterdir()) == ["estimate.json", "report.txt", "runs.csv", "unknowns.csv"]
     said = " ".join(done.stdout.split())
     assert "and 9 more experiments" in said

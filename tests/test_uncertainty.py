@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from models import STILL, VEHICLE_TRUTH, curve, drive, positions
+from models import STILL, VEHICLE_TRUTH, curve, drive, one_run, positions
 from test_report import comparison_of, made, trajectory_of, warnings_of
 from test_report import write_report as report
 
@@ -328,8 +328,7 @@ def test_a_comparison_of_an_input_with_an_unknown_is_named_where_derivatives_fai
     knots = [0.0, 0.6, 1.2, 0.3, -0.5, -1.1, -0.4, 0.5, 1.3, 0.9, 0.2, -0.6, -0.2]
     command, times = sf.Input(np.arange(13.0), knots, kind="linear"), np.arange(0.25, 12.0, 0.25)
     data = sf.Measurements(times, 0.7 * np.sin(times), sigma=0.03)
-    run = sf.Experiment(data, ("m",), (), 0.0, 12.0, inputs=command)
-    problem = sf.Problem(sf.HybridSystem({"m": flow}, [0.0]), run, {"w": 0.3, "k": 0.7})
+    problem = one_run(sf.HybridSystem({"m": flow}, [0.0]), data, ("m",), (), 12.0, {"w": 0.3, "k": 0.7}, inputs=command)
     check = sf.check_derivatives(problem, paper=False)
     assert [issue.kind for issue in check.failures] == ["hidden switch"]
     assert re.search(r"mode 'm' bends with w at test_uncertainty.py:\d+, and derivatives leave out", str(check))
@@ -370,8 +369,7 @@ def location(values, loss="huber", sigma=1.0, m=0.1):
     times = np.arange(1.0, len(values) + 1)
     settings = {"loss": loss, "loss_scale": 1.5 if loss != "linear" else 1.0}
     data = sf.Measurements(times, values, observe=lambda t, x, p: p["m"] + 0 * x, sigma=sigma, **settings)
-    run = sf.Experiment(data, ("still",), (), 0.0, times[-1])
-    return sf.estimate(sf.Problem(STILL, run, {"m": m}), strategy="local")
+    return sf.estimate(one_run(STILL, data, ("still",), (), times[-1], {"m": m}), strategy="local")
 
 
 def test_the_sandwich_of_a_location_in_closed_form():

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from typer.testing import CliRunner
+from test_cli import run as invoke
 
 import switchfit as sf
-from switchfit import cli
 from switchfit.io.problem_file import load_problem
 from switchfit.report.text import write_problem
 from switchfit.uncertainty import certificate
@@ -124,10 +123,6 @@ import switchfit as sf
 
 room = sf.HybridSystem({"on": lambda t, x, p: p["heating"] - p["cooling"] * x, "off": lambda t, x, p: -x}, [15.0])
 """
-
-
-def invoke(*arguments):
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
 UNIT = "{0} %"
@@ -258,10 +253,9 @@ def test_one_column_of_times_has_one_unit_and_so_has_one_run(tmp_path):
         load_problem(path)
     other = FILE.partition("[[experiments]]")[2]
     path.write_text(f"{FILE}\n[[experiments]]\n{other.replace('min', 'h')}")
-    said = invoke("simulate", path, "--out", out)
-    assert said.exit_code == 2
-    assert "times in different units (h, min), and one column of the CSV file would mix them" in said.stderr
+    said = invoke("simulate", path, "--out", out, code=2).stderr
+    assert "times in different units (h, min), and one column of the CSV file would mix them" in said
     assert not out.exists()
     path.write_text(f"{FILE}\n[[experiments]]\n{other}")
-    assert invoke("simulate", path, "--out", out).exit_code == 0
+    invoke("simulate", path, "--out", out, code=0)
     assert out.read_text().splitlines()[0] == "experiment,t (min),mode,x1"

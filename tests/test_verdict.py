@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import STILL, curve, fishing, heated_room, linear, temperature
+from models import STILL, curve, fishing, fit_problem, heated_room, linear, one_run, temperature
 
 import switchfit as sf
 from benchmarks.starts.problems import build_case
@@ -222,8 +222,7 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     data = sf.Measurements(TIMES, values, observe=line, sigma=0.1, loss="huber")
 
     def fit(slope: sf.Parameter) -> sf.Estimate:
-        run = sf.Experiment(data, ("still",), (), 0.0, 10.0)
-        return sf.estimate(sf.Problem(STILL, run, {"a": 1.0, "b": slope}), strategy="local")
+        return sf.estimate(one_run(STILL, data, ("still",), (), 10.0, {"a": 1.0, "b": slope}), strategy="local")
 
     assert fit(sf.Parameter(0.3)).verdict.level == "good"
     wrong = fit(sf.Parameter(-0.2, fixed=True))  # nearly all samples are beyond the scale
@@ -359,8 +358,7 @@ def test_a_cost_without_data_is_judged_by_its_minimum():
 def test_wrong_ends_are_never_good(name):
     """Nine tenths of those of two turns explain 99 % of positions that go over hundreds of metres."""
     case = build_case(name)
-    right = sf.estimate(case.problem, start=case.near, strategy="local")
-    assert right.verdict.level == "good"
+    right = fit_problem(case.problem, start=case.near, strategy="local", level="good")
     seen = []
     for start in case.starts[:8]:
         end = sf.estimate(case.problem, start=start, strategy="local")
