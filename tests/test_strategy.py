@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import approach, decay, fishing, fit_problem, heated_room, one_run, simulate_log
+from models import approach, decay, first_state, fishing, fit_problem, heated_room, one_run, simulate_log
 
 import switchfit as sf
 from benchmarks.sharp.problems import dry, valve
@@ -587,7 +587,6 @@ def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found(friction)
 def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(seed, sigma):
     """A mass on a spring is driven by 2 sin(2 t) until 5 s: 4.4 s, as far before its zero, looks nearly the same. The
     first model of the interval in which J falls again lies above the fit, or has no minimum."""
-    times = np.arange(0.1, 10.0, 0.1)
 
     def mass(t, x, p, force=0.0):
         return jnp.stack([x[1], force - p["k"] * x[0] - 0.3 * x[1]])
@@ -595,21 +594,17 @@ def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(seed, s
     def driven(t, x, p):
         return mass(t, x, p, p["a"] * jnp.sin(2.0 * t))
 
-    def build(values, switch):
-        log = sf.Measurements(times, values, sigma=sigma, observe=lambda t, x, p: x[:1])
-        run = sf.Experiment(log, ("driven", "free"), (switch,), 0.0, 10.0)
-        return sf.Problem(sf.HybridSystem({"driven": driven, "free": mass}, [0.0, 0.0]), run, {"k": 1.0, "a": 2.0})
-
-    exact = sf.simulate(build(0.0 * times, 5.0), times=times).states[:, 0]
-    problem = build(exact + sigma * np.random.default_rng(seed).normal(size=99), 4.42)
-    near = sf.estimate(problem, strategy="local")
-    assert (near.verdict.level, near.theta[0] < 4.5) == ("good", True)
+    log = sf.Measurements(np.arange(0.1, 10.0, 0.1), np.zeros(99), sigma=sigma, observe=first_state)
+    system = sf.HybridSystem({"driven": driven, "free": mass}, [0.0, 0.0])
+    problem = one_run(system, log, ("driven", "free"), (4.42,), 10.0, {"k": 1.0, "a": 2.0})
+    problem = simulate_log(problem, [5.0, 1.0, 2.0], seed)
+    near = fit_problem(problem, strategy="local", level="good")
+    assert near.theta[0] < 4.5
     assert sf.estimate(problem).theta[0] == pytest.approx(5.0, abs=0.02)
 
 
 def test_a_minimum_behind_a_kink_where_a_pendulum_turns_once_more_is_found():
     """It is driven until 5.3 s, and rests by dry friction. Its J has two minima, 4 standard errors of mu apart."""
-    times = np.arange(0.1, 14.0, 0.1)
 
     def swing(t, x, p, drive=0.0):
         return jnp.stack([x[1], drive - 9.81 * jnp.sin(x[0]) - p["mu"] * jnp.sign(x[1]) - p["c"] * x[1]])
@@ -617,17 +612,12 @@ def test_a_minimum_behind_a_kink_where_a_pendulum_turns_once_more_is_found():
     def driven(t, x, p):
         return swing(t, x, p, p["torque"] * jnp.cos(2.5 * t))
 
-    def build(values, switch, guesses):
-        log = sf.Measurements(times, values, sigma=0.01, observe=lambda t, x, p: x[:1])
-        run = sf.Experiment(log, ("driven", "free"), (switch,), 0.0, 14.0)
-        system = sf.HybridSystem({"driven": driven, "free": swing}, [0.3, 0.0])
-        return sf.Problem(system, run, dict(zip(("mu", "c", "torque"), guesses, strict=True)))
-
+    log = sf.Measurements(np.arange(0.1, 14.0, 0.1), np.zeros(139), sigma=0.01, observe=first_state)
+    system = sf.HybridSystem({"driven": driven, "free": swing}, [0.3, 0.0])
+    guess = {"mu": 0.38, "c": 0.17, "torque": 2.0}
     truth = np.array([5.3, 0.4, 0.15, 2.0])
-    exact = sf.simulate(build(0.0 * times, truth[0], truth[1:]), times=times).states[:, 0]
-    problem = build(exact + 0.01 * np.random.default_rng(1).normal(size=139), 5.28, (0.38, 0.17, 2.0))
-    near, fit = sf.estimate(problem, strategy="local"), sf.estimate(problem)
-    assert near.verdict.level == "good"
+    problem = simulate_log(one_run(system, log, ("driven", "free"), (5.28,), 14.0, guess), truth, 1)
+    near, fit = fit_problem(problem, strategy="local", level="good"), sf.estimate(problem)
     assert fit.cost < near.cost - 1.0
     assert fit.cost == pytest.approx(sf.estimate(problem, start=truth, strategy="local").cost, rel=1e-6)
     assert fit.steps[-1].strategy == choice.OTHER
