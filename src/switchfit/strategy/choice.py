@@ -77,11 +77,12 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
             return False
         answer = fit.verdict.answers[-1]
         return not is_doubted(fit) and answer.kind == "fits" and answer.figures.get("known") == 1.0
+    items = [item for run in problem.experiments for item in run.data]
+    if not any(isinstance(item, Measurements | ReferenceSignal) for item in items):
+        # No quality of fit tells a local minimum from the lowest: a few starts have to.
+        return len(steps) > 2 and steps[-1].cost == steps[-2].cost
     if not is_doubted(fit):
-        # Where there are no data, no quality of fit tells a local minimum from the lowest: a few starts have to.
-        items = [item for run in problem.experiments for item in run.data]
-        has_data = any(isinstance(item, Measurements | ReferenceSignal) for item in items)
-        return has_data or (len(steps) > 2 and steps[-1].cost == steps[-2].cost)
+        return True
     # The beam has no derivative to follow where an unknown has no effect, as the height of a weir that is not reached.
     is_blind = len(steps) == 2 and any(issue.kind == "without effect" for issue in find_without_effect(fit))
     return steps[-1].cost == steps[-2].cost and not steps[-1].ended and not is_blind
