@@ -662,7 +662,7 @@ _STEPS = {
     "look at the fit": "look at the verdict on the fit that was resampled",
     "see failures": "see .failures",
     "take quantiles": "take quantiles of .theta in place of standard deviations",
-    "profiles": "take estimate.profile() for them",
+    "profiles": "take estimate.profile() for them, or sf.bootstrap where there are guards",
     "go on": "call it again with the same folder",
 }
 
