@@ -254,6 +254,7 @@ WRONG = [
     ("upper = 5.0 }", "uper = 5.0 }", r"'experiments\[1\]\.transition_times\[1\]\.uper'; did you mean 'upper'\?"),
     ('time = "t"', 'time = "t"\nwindow = [10, 20]', r"no time in column 't' lies in the window \[10\.0, 20\.0\]; "),
     ('observe = ["T"]', 'observe = ["x"]', r"data\[1\]: observe names the unknown state 'x'; the states are T"),
+    ('["T"]\nobserve = ["T"]', '["T", "u"]', r"2 columns are not the whole state \(T\): add observe, a list of"),
     ("sigma = 0.1", 'sigma = 0.1\nkind = "reference"', r"sigma does not belong to kind = 'reference': meas"),
     ("sigma = 0.1", 'sigma = ["sd", 0.1]', r"sigma must name columns of the file alone, or parameters and numb"),
     ("value = 0.3,", "value = 0.3, prior = { mean = 1.0 },", r"prior needs mean and sd \(normal\), or median"),

@@ -326,9 +326,14 @@ class _Run:
         """Return the observation h(t, x, p); None for the whole state."""
         if isinstance(table.observe, str):
             return self._load_function(f"{place}.observe", table.observe)
+        states = None if self.system is None else self.system.state_names
+        if table.observe is None and states and len(table.columns) != len(states):
+            raise ValueError(
+                f"{len(table.columns)} columns are not the whole state ({', '.join(states)}): add observe, a list of the "
+                "states that they measure, or 'file.py:function'."
+            )
         if self.system is None or table.observe is None:
             return None
-        states = self.system.state_names
         if states is None:
             raise ValueError("observe names states, but the model has no state_names; add them to it.")
         if unknown := [name for name in table.observe if name not in states]:
