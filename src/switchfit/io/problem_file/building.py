@@ -329,8 +329,8 @@ class _Run:
         states = None if self.system is None else self.system.state_names
         if table.observe is None and states and len(table.columns) != len(states):
             raise ValueError(
-                f"{len(table.columns)} columns are not the whole state ({', '.join(states)}): add observe, a list of the "
-                "states that they measure, or 'file.py:function'."
+                f"{len(table.columns)} columns are not the whole state ({', '.join(states)}): add observe, a list of "
+                "the states that they measure, or 'file.py:function'."
             )
         if self.system is None or table.observe is None:
             return None
