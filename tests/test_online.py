@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import decay, one_run
+from models import decay, one_run, simulate_log
 
 import switchfit as sf
 from switchfit.engine.protocol import Hypotheses
@@ -160,6 +160,24 @@ def test_the_data_of_the_problem_may_be_empty(problem, log):
             call(empty)
     with pytest.raises(ValueError, match="no samples to replay"):
         sf.replay(empty)
+
+
+def test_the_fit_of_what_is_kept_knows_corners_and_updates_warn():
+    """A block that is pushed until 2 s comes to rest by dry friction at 5.2 s."""
+    modes = {
+        "push": lambda t, x, p: jnp.stack([x[1], 1.0 - 0.5 * x[1]]),
+        "slide": lambda t, x, p: jnp.stack([x[1], -p["b"] * jnp.sign(x[1])]),
+    }
+    times = np.linspace(0.05, 10.0, 200)
+    log = sf.Measurements(times, np.zeros((200, 2)), sigma=0.01)
+    problem = one_run(sf.HybridSystem(modes, [0.0, 0.0]), log, ("push", "slide"), (2.0,), 10.0, {"b": 0.4})
+    problem = simulate_log(problem, [2.0, 0.4], 0)
+    with pytest.warns(RuntimeWarning, match=r"corners of the state \(test_online.py:\d+\): the steps of updates"):
+        online = sf.OnlineEstimator(problem)
+    feed_all(online, problem.experiments[0].data[0].values, times)
+    found, whole = online.estimate(), sf.estimate(problem)
+    np.testing.assert_allclose(found.theta, whole.theta, rtol=1e-6)
+    np.testing.assert_allclose(found.standard_errors, whole.standard_errors, rtol=1e-3)
 
 
 @pytest.mark.parametrize("engine", ["native", "jax"])

@@ -48,6 +48,7 @@ from switchfit.engine.choice import hypotheses_of
 from switchfit.engine.native.hypotheses import NativeHypotheses, OrderTables
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.fit.evaluator import assume_noise
+from switchfit.problem.corners import find_corners
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter, PriorTerms
@@ -263,6 +264,8 @@ class Beam:
     Attributes
     ----------
     modes : tuple of str
+    corners : list of str
+        Lines of the user's code with corners of the modes, which its steps do not know.
     births : int
         Largest number of births, S, at least 1.
     engine : NativeHypotheses
@@ -301,6 +304,8 @@ class Beam:
         self.births = max(len(run.transition_times) if library is None else library.max_switches, 1)
         structure, self.functions = trace_transitions(problem, e, library, self.births)
         self.modes = structure.mode_names
+        found = (line for mode in structure.modes for line in find_corners(mode).lines)
+        self.corners = list(dict.fromkeys(filter(None, found)))
         self.limits = limit_times(run.times if library is None else (), self.births)
         self.grid = choose_grid(run) if grid is None else grid
         is_near = np.diff(self.limits)[:, 0] < self.grid
