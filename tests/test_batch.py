@@ -25,6 +25,7 @@ from switchfit.batch.program import CHUNK, Batch, Limits, _minimize_fits
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
+from switchfit.models import heater_problem
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Breakpoints, Constraints, Task, minimize_traced, nonnegative_minimum
 from switchfit.problem.functions import use_float64
@@ -326,6 +327,14 @@ def test_a_log_that_needs_a_finer_mesh_is_done_again_by_itself():
 
 
 # Chunks
+
+
+def test_a_multistart_that_was_stopped_is_doubtful():
+    part = sf.multistart(heater_problem(), 2 * CHUNK, callback=lambda done, total: True)
+    assert (part.best.verdict.level, part.verdict.level) == ("good", "doubtful")
+    assert [reason.kind for reason in part.verdict.reasons] == ["stopped"]
+    assert f"noise; stopped, {CHUNK} of {2 * CHUNK} fits were not done: call it again" in str(part.verdict)
+    assert "stopped, " in str(replace(part, best=None).verdict)
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
+import pickle
 import re
 import types
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.models import heater_problem
 from switchfit.problem import functions
 from switchfit.problem.functions import Call, trace_function, use_float64
 
@@ -236,6 +239,37 @@ def test_a_problem_that_is_pickled_is_the_same_or_is_refused_if_its_functions_ha
     blob = cloudpickle.dumps(problem)
     with pytest.raises(ValueError, match=r"mode 'fall' does something else .* Build the problem anew"):
         cloudpickle.loads(blob)
+
+
+@pytest.mark.parametrize(
+    "send", [lambda value: pickle.loads(pickle.dumps(value)), copy.deepcopy], ids=["pickle", "copy"]
+)
+def test_problems_and_results_travel_by_the_standard_library(send):
+    """Where modes are functions of a module; programs stay behind, and meshes do not."""
+    problem, times = heater_problem(), [1.0, 5.0, 8.0]
+    fit = sf.estimate(problem)
+    results = [
+        fit.predict(times),
+        fit.profile("k"),
+        sf.compare([fit, fit]),
+        fit.validate(problem),
+        sf.multistart(problem, 3),
+    ]
+    sent, *others = send([fit, *results])
+    assert list(map(str, others)) == list(map(str, results))
+    assert (str(sent), repr(sent.problem)) == (str(fit), repr(fit.problem))
+    assert sent.problem is not fit.problem
+    for name in ("theta", "standard_errors", "hessian"):
+        np.testing.assert_array_equal(getattr(sent, name), getattr(fit, name))
+    for name in ("outputs", "output_errors"):
+        np.testing.assert_array_equal(getattr(sent.predict(times), name), getattr(fit.predict(times), name))
+    assert others[1].interval(0.99) == pytest.approx(results[1].interval(0.99), rel=1e-6)
+    assert sf.evaluate(send(problem)).cost == sf.evaluate(problem).cost
+
+
+def test_a_lambda_cannot_be_pickled_by_the_standard_library():
+    with pytest.raises((pickle.PicklingError, AttributeError), match="lambda"):
+        pickle.dumps(problem_of(lambda t, x, p: -p["a"] * x))
 
 
 def test_the_page_on_models_runs_and_prints_what_it_says(capsys):

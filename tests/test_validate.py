@@ -53,21 +53,23 @@ def by_hand(seed=0):
     return p, np.linalg.inv(X.T @ X), squares / (len(y) - 2)
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["sigma known", "sigma unknown"])
-def test_the_test_of_the_residuals_in_closed_form(known):
+@pytest.mark.parametrize("sigma", [SIGMA, None, "s"], ids=["sigma known", "sigma unknown", "sigma a parameter"])
+def test_the_test_of_the_residuals_in_closed_form(sigma):
     """Chi-square where sigma is known, Fisher's F where it is that of the residuals of the fit."""
-    fit, y = fit_line(SIGMA if known else None, seed=5), values(TEST, 1)
-    found = fit.validate(run(TEST, y, SIGMA if known else None))
+    named, known, y = {"s": sf.Parameter(0.5, scale="log")} if sigma == "s" else {}, sigma == SIGMA, values(TEST, 1)
+    fit = sf.estimate(pose(run(TRAIN, values(TRAIN, 5), sigma), **named))
+    found = fit.validate(run(TEST, y, sigma))
     p, C, variance = by_hand(seed=5)
     variance = SIGMA**2 if known else variance
     r, X, n = y - design(TEST) @ p, design(TEST), len(TEST)
     expected = r @ np.linalg.solve(variance * (np.eye(n) + X @ C @ X.T), r)
     assert found.chi_square == pytest.approx(expected, rel=1e-6)
-    assert (found.freedom, found.kept) == (n, ("a", "b"))
+    assert (found.freedom, found.kept) == (n, ("a", "b", *named))
     probability = scipy.stats.chi2.sf(expected, n) if known else scipy.stats.f.sf(expected / n, n, len(TRAIN) - 2)
     assert found.probability == pytest.approx(probability, rel=1e-5)
     assert r @ r / variance > 1.2 * expected, "otherwise the error of the parameters would not matter in this test"
-    np.testing.assert_allclose(found.covariance, variance * C, rtol=1e-6)
+    variance *= (len(TRAIN) - 2) / len(TRAIN) if named else 1.0  # the likelihood's
+    np.testing.assert_allclose(found.covariance[:2, :2], variance * C, rtol=1e-6)
     mean = y.mean()
     assert found.percent == pytest.approx(100 * (1 - np.linalg.norm(r) / np.linalg.norm(y - mean)), rel=1e-6)
     assert found.explained == pytest.approx(1 - r @ r / np.sum((y - mean) ** 2), rel=1e-6)
@@ -75,6 +77,39 @@ def test_the_test_of_the_residuals_in_closed_form(known):
     X = design(prediction.times)
     bands = np.sqrt(np.einsum("ki,ij,kj->k", X, variance * C, X))
     np.testing.assert_allclose(prediction.output_errors[:, 0], bands, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "spread", "freedom"),
+    [
+        (("s", "w"), None, 2 * 6 - 2),  # of as many values
+        (("s", SIGMA), None, 4 * 6 - 2),
+        (("s", "s"), 0.5, 2 * 6 + 0.5 / 0.5**2 - 2),  # the prior counts as 2 more values
+        (("s", SIGMA), 1e-4, np.inf),
+    ],
+    ids=["two sigmas", "one known", "prior", "prior that says it"],
+)
+def test_the_noise_is_known_as_well_as_the_sigmas_are(sigma, spread, freedom):
+    """The variance of chi-square is that of Satterthwaite's F."""
+    both = {"observe": lambda t, x, p: jnp.stack([x[0], x[0]]), "names": ("x", "y")}
+    named = {name: sf.Parameter(0.4, scale="log") for name in {*sigma} - {SIGMA}}
+    fitted, other = (
+        run(times, np.stack([values(times, seed) for seed in seeds], axis=1), sigma, **both)
+        for times, seeds in ((TRAIN, (0, 1)), (TEST, (2, 3)))
+    )
+    fit = sf.estimate(pose(fitted, **named))
+    if spread is not None:
+        prior = sf.LogNormal(fit.parameters["s"], spread)
+        fit = sf.estimate(pose(fitted, s=sf.Parameter(0.4, scale="log", prior=prior)))
+    found = fit.validate(other)
+    assert min(found.noise_freedom, 1e6) == pytest.approx(min(freedom, 1e6), rel=0.01)
+    assert f"F with 62 and {found.noise_freedom:.4g}" in str(found)
+
+
+def test_a_sigma_that_is_estimated_from_the_other_run_tests_nothing():
+    other = pose(run(TEST, values(TEST, 1), "s"), s=sf.Parameter(0.5, scale="log"))
+    assert np.isnan(fit_line().validate(other).chi_square)
+    assert fit_line().validate(other, refit=()).noise_freedom == np.inf
 
 
 def test_the_table_allows_for_correlated_residuals():

@@ -508,15 +508,22 @@ def judge_study(
     return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
 
 
-def judge_failed_starts(fits: Fits) -> Verdict:
-    """Return the verdict on fits from many starts none of which could be fitted to the end.
+def judge_starts(fits: Fits, best: Verdict | None) -> Verdict:
+    """Return the verdict on fits from many starts: that on the best end, and whether starts are left.
 
     Parameters
     ----------
     fits : Fits
+    best : Verdict or None
+        None where no start could be fitted to the end.
     """
-    everywhere = Doubt("not converged", "bad", np.ones(len(fits), dtype=bool))
-    return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
+    if best is None:
+        everywhere = Doubt("not converged", "bad", np.ones(len(fits), dtype=bool))
+        best = Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
+    for stop in _find_stop(fits):
+        level, against = (stop.level, ()) if best.level == "good" else (best.level, best.reasons)
+        best = Verdict(level, (*against, stop.reason), (*best.next_steps, Issue("next: go on")), best.answers)
+    return best
 
 
 def measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:

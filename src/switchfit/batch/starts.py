@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.fits import Fits, judge_failed_starts
+from switchfit.batch.fits import Fits, judge_starts
 from switchfit.batch.program import Limits, describe_failure
 from switchfit.batch.study import LongRun, Study, repeat
 from switchfit.discretization.mesh import Mesh
@@ -69,8 +69,8 @@ class Multistart(Fits):
 
     @cached_property
     def verdict(self) -> Verdict:
-        """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
-        return judge_failed_starts(self) if self.best is None else self.best.verdict
+        """That on the best end, doubtful if starts are left; most of the others may well be bad."""
+        return judge_starts(self, None if self.best is None else self.best.verdict)
 
     def plot(self, *, ax: Drawn | None = None) -> Drawn:
         """Draw a waterfall: the cost at the end of every start, ascending.

@@ -160,6 +160,10 @@ class Follower:
         self._accepted: _Point | None = None
         self._use(evaluator)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is copied and pickled: anew, on the meshes of the last accepted point."""
+        return Follower, (self.evaluator,)
+
     def __call__(
         self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact", arrow: bool = False
     ) -> Evaluation[Any]:

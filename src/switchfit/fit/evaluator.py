@@ -74,6 +74,10 @@ class Evaluator:
         self.arguments = list(arguments)
         self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is copied and pickled: on the same meshes, with programs of its own."""
+        return partial(Evaluator, meshes=self.meshes), (self.problem,)
+
     @cached_property
     def runs(self) -> tuple[Run, ...]:
         """The experiments, as all evaluators of the problem share them."""

@@ -109,6 +109,10 @@ class HybridSystem:
         if not callable(self.initial_state):
             self.check_labels_of(len(self.initial_state))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is copied and pickled: built again, from dicts, since a mappingproxy cannot be pickled."""
+        return type(self), tuple(dict(v) if isinstance(v, Mapping) else v for v in vars(self).values())
+
     def check_labels_of(self, n: int) -> None:
         """Raise ValueError unless names and units, if given, have one entry for each of n states.
 

@@ -79,7 +79,7 @@ def write_validation(found: Validation) -> str:
         sections.append([ALLOWED])
     sections.append(["Channels", *format_table(*tabulate_predicted(found))])
     if np.isfinite(found.chi_square):
-        kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"
+        kind = "" if np.isinf(found.noise_freedom) else f", F with {found.freedom} and {found.noise_freedom:.4g}"
         chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
         sections.append([f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"])
     if found.inputs:

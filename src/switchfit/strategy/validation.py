@@ -4,6 +4,12 @@ Chi-square is ``z . z``, z being the residuals without the part that the error o
 (`switchfit.strategy.validation`). With sigma unknown both in the fit and here, ``z . z / (n s^2)`` is compared with F
 of (n, degrees of freedom of the fit).
 
+Where sigmas are unknowns of the fit, chi-square is ``(1 - k / m) z . z``; over n it is compared with F of (n, m - k).
+The error of their logarithms (covariance L) adds ``4 c' L c`` to the variance of ``z . z``, c being the numbers of
+values of each sigma; F has that variance, about, if ``m = n^2 / (2 c' L c)``. The fit's k other unknowns make sigma too
+small; if the fit has N > m values, the part m / N of k counts. For one sigma without a prior m is N, and all is exactly
+as with sigma unknown. For several sigmas this is Satterthwaite's approximation ([4]_); a prior on sigma makes m larger.
+
 The problem of another run from a fit: its parameters, and what the run says of itself.
 
 Residuals of another run without the correlation that the error of the fitted parameters makes.
@@ -22,6 +28,8 @@ References
 .. [1] G. A. F. Seber, A. J. Lee, Linear Regression Analysis, 2nd ed., Wiley 2003, chapters 3 and 5.
 .. [2] T. Soderstrom, P. Stoica, System Identification, Prentice Hall 1989, section 11.2 (tests of cross-correlation).
 .. [3] L. Ljung, System Identification: Theory for the User, 2nd ed., Prentice Hall 1999, chapter 16 (fit in per cent).
+.. [4] F. E. Satterthwaite, An approximate distribution of estimates of variance components, Biometrics 2 (1946)
+   110-114.
 """
 
 from __future__ import annotations
@@ -55,6 +63,7 @@ from switchfit.uncertainty.prediction import (
     build_prediction,
     collect_sample_derivatives,
     compute_sensitivities,
+    count_values_by_sigma,
 )
 from switchfit.uncertainty.residuals import (
     CLEARLY_OFF,
@@ -343,14 +352,16 @@ class Validation(Displayed):
     comparisons : tuple of tuples of Comparison, one tuple for each experiment
     chi_square : float
         Sum of the squared residuals over what is expected of them, the error of the parameters included; NaN if the
-        noise or the covariance of the fit is unknown, a loss is robust, a delay is a parameter, or with reference
-        signals.
+        noise or the covariance of the fit is unknown, a loss is robust, a delay is a parameter, a sigma was estimated
+        from this run, or with reference signals.
     freedom : int
         Its degrees of freedom: values less own unknowns that were estimated.
     sigma_known : bool or None
         Whether the noise is known; None with other data than Measurements.
     residual_variance : float
         Variance of the noise by which residuals are divided where sigma is unknown: that of the fit.
+    noise_freedom : float
+        Degrees of freedom with which the fit knows the noise; infinite where no sigma was estimated.
     residuals : ResidualDiagnostics
         Tests of the residuals, those of `chi_square` where there is one.
     inputs : tuple of InputCorrelation
@@ -393,6 +404,7 @@ class Validation(Displayed):
     freedom: int
     sigma_known: bool | None
     residual_variance: float
+    noise_freedom: float
     residuals: ResidualDiagnostics = field(repr=False)
     inputs: tuple[InputCorrelation, ...] = ()
 
@@ -442,9 +454,9 @@ class Validation(Displayed):
         """Probability of such a chi-square, or a larger one, if model and noise are right; NaN without."""
         if not np.isfinite(self.chi_square) or self.freedom <= 0:
             return np.nan
-        if self.sigma_known:
+        if np.isinf(self.noise_freedom):
             return float(special.chdtrc(self.freedom, self.chi_square))
-        return float(special.fdtrc(self.freedom, self.fit.freedom, self.chi_square / self.freedom))
+        return float(special.fdtrc(self.freedom, self.noise_freedom, self.chi_square / self.freedom))
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -549,6 +561,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     noise = _choose_noise(estimate, problem)
     whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, found, noise)
     residuals, chi_square, freedom, covariance = whitened
+    noise_freedom, scale = _judge_noise(estimate, problem, theta, covariance, found)
     judged = [
         [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
         for run, shown in zip(comparisons, residuals, strict=True)
@@ -565,10 +578,11 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
         run_names=problem.run_names,
         trajectories=trajectories,
         comparisons=comparisons,
-        chi_square=chi_square,
+        chi_square=chi_square * scale,
         freedom=freedom,
         sigma_known=problem.is_sigma_known,
         residual_variance=noise**2,
+        noise_freedom=noise_freedom,
         residuals=diagnostics,
         inputs=tuple(_correlate_inputs(problem, diagnostics)),
     )
@@ -579,6 +593,29 @@ def _choose_noise(estimate: Estimate, problem: Problem) -> float:
     if problem.is_sigma_known:
         return 1.0
     return float(np.sqrt(estimate.residual_variance)) if estimate.sigma_known is False else np.nan
+
+
+def _judge_noise(
+    estimate: Estimate, problem: Problem, theta: FloatArray, covariance: FloatArray, refit: Estimate | None
+) -> tuple[float, float]:
+    """Return the degrees of freedom with which the fit knows the noise, and by what chi-square is multiplied.
+
+    NaN if a sigma was estimated from the run itself, or as many unknowns as values.
+    """
+    if problem.is_sigma_known is False:
+        return estimate.freedom, 1.0
+    counts = count_values_by_sigma(problem)
+    names = [name for name, count in zip(problem.theta_names, counts, strict=True) if count]
+    if refit is not None and set(names) & set(refit.theta_names):
+        return np.nan, np.nan
+    slope = counts / np.where(counts > 0, theta, 1.0)
+    variance = float(slope @ covariance @ slope) if names else 0.0
+    if variance == 0:
+        return np.inf, 1.0
+    m = sum(item.count for item in problem.measurements) ** 2 / (2 * variance)
+    others = estimate.samples - estimate.freedom - sum(name not in estimate.priors for name in names)
+    k = others * min(m / estimate.samples, 1.0)
+    return (m - k, 1 - k / m) if m > k else (np.nan, np.nan)
 
 
 def _correlate_inputs(problem: Problem, diagnostics: ResidualDiagnostics) -> list[InputCorrelation]:

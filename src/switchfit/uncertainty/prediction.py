@@ -218,16 +218,23 @@ def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDeriv
     samples : SampleDerivatives
         At theta.
     """
-    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
+    counts, weight = count_values_by_sigma(problem), samples.influence * samples.weight
+    # In log sigma each sample has the information 2, in sigma 2 / sigma^2.
+    of_sigma = 2.0 * counts / np.where(counts > 0, theta, 1.0) ** 2
+    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2] + of_sigma)
+    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
+
+
+def count_values_by_sigma(problem: Problem) -> FloatArray:
+    """Return of how many values each unknown is the sigma: (d,)."""
+    counts = np.zeros(len(problem.theta_names))
     for run in problem.experiments:
         for item in run.measurements:
             for values, name in zip(item.values.T, item.sigma_names, strict=False):
                 span = None if name is None else problem.unknowns.parameters.get(run.parameter_map.get(name, name))
                 if span is not None:  # it is not fixed
-                    # In log sigma each sample has the information 2, in sigma 2 / sigma^2.
-                    information[span, span] += 2.0 * np.count_nonzero(~np.isnan(values)) / theta[span] ** 2
-    weight = samples.influence * samples.weight
-    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
+                    counts[span] += np.count_nonzero(~np.isnan(values))
+    return counts
 
 
 @dataclass(frozen=True, eq=False)

@@ -176,7 +176,7 @@ class Profile(Tabular, Displayed):
         self.jumps: list[float] = []
         self._ends: dict[int, End] = {-1: "stopped", 1: "stopped"}
         self._interrupted = False
-        self._should_stop: Callable[[], bool] = lambda: False
+        self._should_stop: Callable[[], bool] = bool  # False; unlike a lambda, it can be pickled
 
     def __repr__(self) -> str:
         value = f"{self.name} = {self.value:.6g} ± {self.standard_error:.2g}{unit_suffix(self.unit)}"
@@ -601,5 +601,5 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
             found._find_regions(fit.quantile(level))
         except KeyboardInterrupt:
             found._interrupted = True
-    found._should_stop = lambda: False
+    found._should_stop = bool
     return found
