@@ -27,6 +27,7 @@ HYPOTHESES = "engine/native/hypotheses.py"
 KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
     f"engine/native/{name}.py" for name in ("kernels", "program", "templates", "arrays", "llvm")
 )
+CHOICE, HOPS = "strategy/choice.py", "strategy/hops.py"
 BEAM, FITTER, MODE_POOL = "strategy/beam.py", "modes/fitter.py", "modes/hunt.py"
 ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design.py"
 
@@ -54,6 +55,7 @@ TESTS = {
     ],
     "online": [["tests/test_online.py"]],
     "design": [["tests/test_design.py"]],
+    "other minima": [["tests/test_strategy.py", "-k", "a_minimum"]],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part that were thought of, one after the other until something does."""
@@ -222,6 +224,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "D ell behind tf in (11)": swap(PAPER, "jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)"),
     },
     "modes": {
+        "fits without corners": swap(FITTER, "not any(map(has_corners, problem.structures))", "True"),
         "parameters that do not act are free": swap(FITTER, "lower[held] = upper[held] = theta[held]", "pass"),
         "guarded times count": swap(MODE_POOL, 'if name == "cost" else fitted.free_switches', "if name else 0"),
         "a switch counts once in mBIC": swap("modes/criterion.py", 'each = 2 if name == "mbic" else 1', "each = 1"),
@@ -235,6 +238,13 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             "self._named[name][:] = which",
             "self._named[name][:] = which if name == 'modes' else -1",
         ),
+    },
+    "other minima": {
+        "points on the same path": swap(HOPS, "if evaluator.paths != path:", "if evaluator.paths == path:"),
+        "one point beside a minimum": swap(HOPS, "BEYOND = (2.0, 4.0)", "BEYOND = (2.0,)"),
+        "the exact Hessian alone": swap(HOPS, 'errors > 0.0, "gauss-newton")', 'errors > 0.0, "exact")'),
+        "one model of an interval": swap(HOPS, "MODELS, RIGHT = 4, 0.2", "MODELS, RIGHT = 1, 0.2"),
+        "re-insertion has the last word": swap(CHOICE, "return len(steps) > 2 and", "return len(steps) > 1 and"),
     },
     "beam": {
         "sign of the jump in Z": swap(HYPOTHESES, "+ sign * graph.loads(", "- sign * graph.loads("),

@@ -583,7 +583,7 @@ def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found(friction)
     assert not again.steps, "of two minima that are known the lower one is left as it is"
 
 
-@pytest.mark.parametrize(("seed", "sigma"), [(10, 0.04), (1, 0.06)])
+@pytest.mark.parametrize(("seed", "sigma"), [(10, 0.04), (5, 0.06)])
 def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(seed, sigma):
     """A mass on a spring is driven by 2 sin(2 t) until 5 s: 4.4 s, as far before its zero, looks nearly the same. The
     first model of the interval in which J falls again lies above the fit, or has no minimum."""
