@@ -137,6 +137,18 @@ def test_the_curvature_of_a_coordinate_that_a_kink_holds_does_not_count():
     np.testing.assert_allclose(found.theta, [2.0, 3.3, 4.1], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("weight", "held"), [(1e-8, False), (1e-2, True)])
+def test_a_jump_that_cannot_be_seen_in_the_cost_holds_nothing_in_the_program_either(weight, held):
+    weights = np.zeros((3, KNOTS.size))
+    weights[0, [0, 4]] = 1.0, weight
+    with use_float64():
+        given = [1.4, 3.2, 4.0], np.eye(3), [3.0, 3.3, 4.1], weights
+        found = jax.tree.map(np.asarray, fitted_with_kinks(*map(jnp.asarray, given)))
+    assert found.settled
+    assert found.theta[0] == pytest.approx(2.0, abs=1e-7)
+    np.testing.assert_array_equal(found.held, [held, False, False])
+
+
 # The same as single fits
 
 

@@ -117,6 +117,24 @@ def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     assert found.standard_errors[0] == 0.0
 
 
+@pytest.mark.parametrize("seed", [0, 8])
+def test_a_node_that_no_sample_is_taken_at_is_no_kink(seed):
+    """Only the sum of the time and of the delay is determined, and samples are of the state at their times less the
+    delay: at their times J jumps by integration error alone."""
+    system = sf.HybridSystem({"on": lambda t, x, p: p["h"] - p["c"] * x, "off": lambda t, x, p: -p["c"] * x}, [0.0])
+    times = np.linspace(1.03, 11.03, 41)
+    t, tau = times - 0.4, 6.1
+    rise = 2.0 * (1.0 - np.exp(-0.5 * np.minimum(t, tau))) * np.exp(-0.5 * np.maximum(t - tau, 0.0))
+    values = 0.5 * np.exp(-0.5 * t) + rise + 0.05 * np.random.default_rng(seed).normal(size=41)
+    data = sf.Measurements(times, values, sigma=0.05, delay="d")
+    run = sf.Experiment(data, ("on", "off"), (5.0,), t0=0.0, tf=12.0, initial_state=[sf.Parameter(1.0)])
+    bounds = {"c": sf.Parameter(0.4, lower=0.01), "d": sf.Parameter(0.2, lower=0.0, upper=0.9)}
+    found = sf.estimate(sf.Problem(system, run, {"h": 0.8, **bounds}))
+    assert found.verdict.level == "doubtful"
+    assert "the data hardly determine" in str(found.verdict)
+    assert not found.kinks
+
+
 # Unknowns that the data does not determine
 
 

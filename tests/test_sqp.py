@@ -169,6 +169,20 @@ def test_absolute_value_ends_exactly_on_its_kink(start, curvature, hessian):
     assert right == pytest.approx(1.0 + 0.7 * curvature)
 
 
+@pytest.mark.parametrize(("weight", "status"), [(1e-7, Status.SINGULAR), (1e-3, Status.CONVERGED_AT_KINK)])
+def test_a_jump_that_cannot_be_seen_in_the_cost_holds_nothing(weight, status):
+    """Along theta_1 = -theta_2 nothing is determined; a jump by integration error says that theta_1 is."""
+
+    def function(theta):
+        e = theta.sum() - 1.0
+        return 10.0 + 50.0 * e**2, np.full(2, 100.0 * e), np.full((2, 2), 100.0)
+
+    evaluate = with_kinks(function, [[0.7], []], [np.array([weight]), None])
+    result = minimize(evaluate, [0.7, 0.3], constraints=free(2), breakpoints=[[0.7], []])
+    assert result.status is status
+    assert len(result.kinks) == (weight == 1e-3)
+
+
 def assert_no_descent(evaluate, result, constraints, breakpoints):
     """First-order optimality by directions: none of many feasible ones decreases J before the next breakpoint."""
     rng = np.random.default_rng(1)

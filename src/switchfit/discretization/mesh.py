@@ -1,9 +1,10 @@
 """The mesh: fixed nodes, cut by the transition times; and the arrays of an experiment on it.
 
-The *nodes* of an experiment are t0, tf, all sample times, the knots of inputs and reference signals and a refinement
-grid. They are fixed while the optimizer runs. The transition times cut the *cells* between them into *rows*: one row is
-one Runge-Kutta step, in one mode, inside one cell. Samples, knots and transitions are thus always ends of rows, and
-only the two rows at a transition move with it.
+The *nodes* of an experiment are t0, tf, all sample times, the knots of inputs and reference signals, the times of
+corners that follow from t and the input alone (`corner_times`) and a refinement grid. They are fixed while the
+optimizer runs. The transition times cut the *cells* between them into *rows*: one row is one Runge-Kutta step, in one
+mode, inside one cell. Samples, knots and transitions are thus always ends of rows, and only the two rows at a
+transition move with it.
 
 Rows are numbered by ``cell + segment``, where a segment is the time a mode is active: no shape depends on the
 transition times.
@@ -105,14 +106,14 @@ class Mesh:
         return cls(np.concatenate([nodes, padding]), cells, stiffness)
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Mesh:
+    def of(cls, experiment: Experiment, *more: FloatArray) -> Mesh:
         """Return the mesh of the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon.
 
-        If tf is free, its upper bound is the last node.
+        If tf is free, its upper bound is the last node. `more` times are nodes too.
         """
         ends = np.array([experiment.t0, experiment.end])
         samples = (item.seen_times for item in experiment.measurements)
-        times = np.concatenate([ends, *samples, *(signal.knots for signal in experiment.signals)])
+        times = np.concatenate([ends, *samples, *(signal.knots for signal in experiment.signals), *more])
         mesh = cls.from_times(times[(times >= ends[0]) & (times <= ends[1])])
         return replace(mesh, has_rest=experiment.has_free_tf)
 

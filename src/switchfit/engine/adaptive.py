@@ -235,6 +235,9 @@ class _Solve:
         self._problem, self._structure, self._coarse, self._course = run.problem, run.structure, coarse, course
         self._library = structure
         self._experiment, self._settings, self._watch = run.experiment, settings, settings.watch or Watch()
+        inputs = run.experiment.inputs
+        # Inputs may jump at their knots: a step across one would be rejected down to its smallest size.
+        self._stops = np.union1d([] if inputs is None else inputs.times, run.corner_times)
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
         self._whole = whole = run.build_arguments(coarse)
@@ -255,14 +258,12 @@ class _Solve:
         """Return the accepted times from t0 to tf, strictly increasing."""
         structure, experiment, self._p = self._structure, self._experiment, p
         ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
-        inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
         steps, x = [ends[:1]], self._find_initial_state()
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 x = self._apply_reset(i - 1, ends[i], x)
-            # Inputs may jump at their knots: a step across one would be rejected down to its smallest size.
-            knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
-            stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+            inside = (self._stops > ends[i]) & (self._stops < ends[i + 1])
+            stops = np.concatenate([[ends[i]], self._stops[inside], [ends[i + 1]]])
             name = structure.mode_names[mode]
             is_explicit = not structure.implicit[mode] and name not in self._settings.implicit
             self._watch.enter(name, self._find_row_work(name, is_explicit))

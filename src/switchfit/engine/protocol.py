@@ -15,6 +15,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.discretization.corner_times import find_corner_times
 from switchfit.discretization.mesh import (
     Arguments,
     Mesh,
@@ -341,7 +342,12 @@ class Run:
     @cached_property
     def coarse(self) -> Mesh:
         """The nodes that every mesh of the experiment has."""
-        return Mesh.of(self.experiment)
+        return Mesh.of(self.experiment, self.corner_times)
+
+    @cached_property
+    def corner_times(self) -> FloatArray:
+        """Known times of corners, whatever theta is."""
+        return find_corner_times(self.structure, self.experiment, self._common.fixed)
 
     def vectors(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what its programs take at theta (d,): its times (N,) and its p (M,)."""

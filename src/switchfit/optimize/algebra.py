@@ -178,6 +178,22 @@ def mix_sides(right: Array, left: Array, sides: Array, xp: Any = np) -> Array:
     return xp.where(sides > 0, right, xp.where(sides < 0, left, 0.5 * (right + left)))
 
 
+def find_least_jump(curvature: Array, slopes: Any, cost: Any, xp: Any = np) -> Array:
+    """Return by how much a derivative of J jumps at least at a kink that holds an unknown: (d,).
+
+    Smaller jumps are rounding, or what integration makes at nodes that are no kinks of the model: without the jump J
+    would be lower by ``jump^2 / (2 curvature)`` at most, which is below its noise.
+
+    Parameters
+    ----------
+    curvature : (d,)
+        Second derivatives of J; those that are not positive, or NaN, count as 0.
+    slopes, cost : float
+        The largest derivative seen, and J.
+    """
+    return xp.maximum(SMALLEST_JUMP * slopes, xp.sqrt(2.0 * NOISE * xp.abs(cost) * xp.fmax(curvature, 0.0)))
+
+
 def choose_sides(left: Array, right: Array, xp: Any = np) -> Array:
     """Return the side to which each coordinate at a kink descends by itself, given its derivatives (d,): (d,) int.
 

@@ -224,7 +224,7 @@ class Point:
         """Whether no constraint is active and no coordinate at a kink."""
         return self.active.size == 0 and self.kink is None
 
-    def find_jumps(self, least: float) -> BoolArray:
+    def find_jumps(self, least: FloatArray | float) -> BoolArray:
         """Return which derivatives jump upwards at a breakpoint here by more than this: (d,)."""
         kink = np.zeros(self.theta.size, dtype=bool) if self.kink is None else self.kink
         return np.asarray(kink & (self.plus.gradient - self.minus.gradient > least))
@@ -704,8 +704,9 @@ class State(NamedTuple):
 
     @property
     def genuine_kinks(self) -> BoolArray:
-        """Coordinates on a breakpoint at which the derivative jumps upwards by more than rounding: (d,)."""
-        return self.point.find_jumps(algebra.SMALLEST_JUMP * self.gradient_scale)
+        """Coordinates on a breakpoint that is a kink of J: (d,)."""
+        curvature = self.point.plus.hessian.diagonal()
+        return self.point.find_jumps(algebra.find_least_jump(curvature, self.gradient_scale, self.point.cost))
 
     def curvature_at(self, problem: Problem, rows: IntArray) -> Curvature:
         """Return the curvature of J, unmodified, in the null space of the constraints at `rows` and off the kinks."""

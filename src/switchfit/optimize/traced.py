@@ -371,7 +371,8 @@ def build_outcome(state: State, constraints: Constraints) -> Outcome:
     interior = ~jnp.any(_active(constraints, point.theta, state.scale))
     # A convex kink, g- < g+, may hold its coordinate; where the derivatives are equal the breakpoint is none of J.
     jump = point.right.gradient - point.left.gradient
-    held = point.kink & (jump > algebra.SMALLEST_JUMP * state.gradient_scale)
+    curvature = jnp.diag(point.right.hessian)
+    held = point.kink & (jump > algebra.find_least_jump(curvature, state.gradient_scale, point.right.cost, jnp))
     hessian = _without(held, point.right.hessian)
     scaling = _compute_scaling(hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
     # The second-order condition on what is free: positive eigenvalues of the scaled Hessian, held rows being those of
