@@ -243,7 +243,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "points on the same path": swap(HOPS, "if evaluator.paths != path:", "if evaluator.paths == path:"),
         "one point beside a minimum": swap(HOPS, "BEYOND = (2.0, 4.0)", "BEYOND = (2.0,)"),
         "the exact Hessian alone": swap(HOPS, 'errors > 0.0, "gauss-newton")', 'errors > 0.0, "exact")'),
-        "one model of an interval": swap(HOPS, "MODELS, RIGHT = 4, 0.2", "MODELS, RIGHT = 1, 0.2"),
+        "one model of an interval": swap(HOPS, "RIGHT = 8, 4, 0.2", "RIGHT = 8, 1, 0.2"),
         "re-insertion has the last word": swap(CHOICE, "return len(steps) > 2 and", "return len(steps) > 1 and"),
     },
     "beam": {

@@ -58,9 +58,9 @@ SCAN_FIRST, SCAN_RATIO = 3.0, 1.6
 """Distance of the first place of a scan of J over a time, in standard errors, and of each place to that before it.
 Between two equal minima J is like (s (s - D))² at the distance s from one: at this ratio the places show the other."""
 
-MODELS, RIGHT = 4, 0.2
-"""Models of which each is about the minimum of the last, and the part of what a minimum is above the cost below which
-the error of J there makes no difference."""
+DIPS, MODELS, RIGHT = 8, 4, 0.2
+"""Dips of J that are looked into, the lowest; models of each, one about the minimum of the last; and the part of what a
+minimum is above the cost below which the error of J there makes no difference."""
 
 SCAN_STEP = 1 / 40
 """Largest distance of two places, as a part of the horizon: others may be narrow. A scan from a kink begins with it."""
@@ -136,9 +136,10 @@ def find_far_minima(evaluator: Evaluator, theta: FloatArray, cost: float, errors
     errors : (d,)
         Standard errors.
     """
-    problem = evaluator.problem
-    intervals = [list(_scan(evaluator, e, theta, errors)) for e in range(len(problem.experiments))]
-    found = []
+    problem, found = evaluator.problem, []
+    runs = range(len(problem.experiments))
+    dips = sorted((cost, e, interval) for e in runs for cost, interval in _scan(evaluator, e, theta, errors))[:DIPS]
+    intervals = [[interval for _, run, interval in dips if run == e] for e in runs]
     # Far away residuals are large at first, and so is their part of the exact Hessian.
     for lowest, start, find_lowest in _list_hops(evaluator, theta, intervals, errors > 0.0, "gauss-newton"):
         for _ in range(MODELS):
@@ -248,14 +249,16 @@ def _list_intervals(
                 yield place, float(low), float(high)
 
 
-def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -> Iterator[tuple[int, float, float]]:
-    """Yield the place of a time in theta, and the ends of an interval in which J, with all else as it is, is lower than
-    nearer to theta: another minimum.
+def _scan(
+    evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray
+) -> Iterator[tuple[float, tuple[int, float, float]]]:
+    """Yield by how much J of a run is above that at theta in another minimum, with all else as it is; and the place of
+    the time in theta, and the ends of the interval in which that is.
     """
     problem = evaluator.problem
     where, run = problem.unknowns.times[e], problem.experiments[e]
     ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
-    step = SCAN_STEP * (ends[-1] - ends[0])
+    step, here = SCAN_STEP * (ends[-1] - ends[0]), evaluator.engines[e].cost(*problem.vectors(theta, e))
     for i, place in enumerate(where.tolist()[: len(ends) - 2]):  # without a free tf
         nearest = SCAN_FIRST * errors[place] or step
         for end in (ends[i], ends[i + 2]):
@@ -273,7 +276,7 @@ def _scan(evaluator: Evaluator, e: int, theta: FloatArray, errors: FloatArray) -
             falls = np.append(costs[1:] < costs[:-1], False)
             for j in np.flatnonzero(falls[:-1] & ~falls[1:]).tolist():
                 low, high = sorted((times[j], times[j + 2] if j + 2 < count else end))
-                yield place, float(low), float(high)
+                yield float(costs[j + 1] - here), (place, float(low), float(high))
 
 
 def look_beyond_corners(
