@@ -127,6 +127,25 @@ def test_a_way_ends_where_the_others_are_not_determined():
     assert left[1, 1] == -9.0
 
 
+def test_a_way_ends_where_transition_times_lose_their_order():
+    """Another time y follows x to the left, y = 1 - x: a model cannot be evaluated where x is behind y."""
+    walks = Walks(
+        np.array([[0.0, 1.0]]), np.zeros(1, int), np.ones(1, int), np.array([[False, True]]),
+        np.array([[0.3, 0.8, 9.0, np.nan]]), np.array([9.0]), np.full((1, 2), -9.0), np.full((1, 2), 9.0),
+        np.full(1, 5.0),
+    )  # fmt: skip
+
+    def evaluate(which, thetas):
+        x, y = thetas.T
+        assert (x <= y).all()
+        off = y - 1.0 + x
+        H = np.tile([[2.0, 1.0], [1.0, 1.0]], (len(x), 1, 1))
+        return Derivatives(0.5 * x**2 + 0.5 * off**2, np.column_stack([x + off, off]), H)
+
+    (pieces,) = trace_walks(walks, np.zeros(1), evaluate, 4, [np.array([0, 1])])
+    assert pieces[np.isfinite(pieces[:, 0]), 0] == pytest.approx([0.0, 0.3])
+
+
 def with_other_data(seed, **changes):
     problem = charged(2.0, seed)
     run = problem.experiments[0]

@@ -101,7 +101,7 @@ def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], ba
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
         return batch.evaluate(fits[which], thetas, walks.side[which])
 
-    pieces = ways.trace_walks(walks, chunk.cost[fits], evaluate, MOST_KEPT)
+    pieces = ways.trace_walks(walks, chunk.cost[fits], evaluate, MOST_KEPT, groups[0][0].unknowns.times)
     found[fits, rows, (walks.side + 1) // 2] = pieces
     incomplete = np.isnan(found[:, :, :, 0, 0]).any(axis=2)
     found[incomplete] = np.nan

@@ -160,7 +160,7 @@ def _steer(sliding: tuple[bool, bool], constants: dict[str, Constant], t: Any, x
 
 MODES = ("grip", "slip")
 SPEEDS = ("w_l", "w_r (rad/s)")
-LOW_SPEED = 0.01  # m/s: below it, |V| in the sharpness of a turn is rounded off, so that it stays differentiable
+LOW_SPEED = 0.001  # m/s: below it, |V| in the sharpness of a turn is rounded off, so that it stays differentiable
 
 
 def differential_drive(
@@ -198,7 +198,8 @@ def differential_drive(
 
         v_x (1 - turn_slip abs(V_r - V_l) / (abs(V_l) + abs(V_r))),
 
-    which is 1 straight ahead and 1 - turn_slip where a side stands or turns back.
+    which is 1 straight ahead and 1 - turn_slip where a side stands or turns back; each abs(V) is rounded off to
+    ``sqrt(V^2 + s^2)``, less s above and once below the line, with s = 0.001 m/s.
 
     The state is ``(X, Y, theta)`` if the wheel speeds are measured. If they are commanded, the wheels follow with a
     first-order lag, ``w' = (u - w) / lag``, and the state is ``(X, Y, theta, w_l, w_r)``. With a delay the mode
@@ -308,7 +309,9 @@ def _move(slips: bool, commanded: bool, waits: bool, constants: Constants, t: An
     turn = (V_r - V_l) / (y_l - y_r)
     v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
     if slips and not is_absent(constants["turn_slip"]):
-        v_x = v_x * (1 - c["turn_slip"] * _magnitude(V_r - V_l) / (_magnitude(V_l) + _magnitude(V_r)))
+        # Rounded off so that it is 0 straight ahead, and has a value where the wheels stand.
+        sharpness = (_magnitude(V_r - V_l) - LOW_SPEED) / (_magnitude(V_l) + _magnitude(V_r) - LOW_SPEED)
+        v_x = v_x * (1 - c["turn_slip"] * sharpness)
     cos, sin = jnp.cos(theta), jnp.sin(theta)
     dX, dY = v_x * cos, v_x * sin
     if slips and not is_absent(constants["x_v"]):

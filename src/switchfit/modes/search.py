@@ -261,6 +261,8 @@ def _check_criterion(
 ) -> tuple[CriterionName | Callable[[Estimate], float], Score, CriterionName]:
     """Return how the number of switches is chosen, what criteria need, and the criterion of the search."""
     chooser: Any = criterion if callable(criterion) else as_choice(criterion, "criterion", CRITERIA)
+    if callable(criterion):
+        as_callable(criterion, "criterion", "a function criterion(estimate)", arguments=1)
     each = 0.0 if switch_cost is None else as_finite(switch_cost, "switch_cost")
     if each < 0:
         raise ValueError(f"switch_cost must be zero or positive; got {each}.")

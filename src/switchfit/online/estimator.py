@@ -209,7 +209,8 @@ class OnlineEstimator:
         self._walks = np.zeros(self._beam.into.shape[1])  # variances of random walks after one time unit
         for name in walks:
             self._find_places(name, "drift")
-            self._walks[self._slices[name]] = as_positive(walks[name], f"drift of {name}") ** 2
+            step = as_positive(walks[name], f"drift of {name}")
+            self._walks[self._slices[name]] = as_positive(step * step, f"the square of the drift of {name}")
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Path | None = None
@@ -679,7 +680,8 @@ class OnlineEstimator:
         inputs = self.problem.experiments[0].inputs
         if inputs is not None and self.held is not None:
             inputs = hold(inputs, feed.nodes[first:-1].copy(), feed.signals[first : feed.count - 1, 0].copy())
-        past, t0 = len(tracker.left), float(feed.nodes[first])
+        # The path of now may have fewer transitions than have left the window by another.
+        past, t0 = min(len(tracker.left), len(now.transition_times)), float(feed.nodes[first])
         sequence, times = now.mode_sequence[past:], now.transition_times[past:]
         given = {"inputs": inputs, "mode_sequence": sequence, "transition_times": times}
         return data, given | {"t0": t0, "tf": feed.last}

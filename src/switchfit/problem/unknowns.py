@@ -318,7 +318,6 @@ def _build_ordering(
             "min_duration must be 0 where transition times are on a logarithmic scale, or in different units "
             f"({join_names(sorted(units))}); got {max(durations.values())}."
         )
-    unit_rows = np.eye(d + 1, d)  # the last one, of times that are fixed, is zero
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
         run = "" if len(experiments) == 1 else labels[e]
         knots = experiment.ends_of_modes(experiment.initial_times)
@@ -333,7 +332,10 @@ def _build_ordering(
                     f"only {length:.6g}{unit}."
                 )
             if ends[i] >= 0 or ends[i + 1] >= 0:
-                rows.append(unit_rows[ends[i + 1]] - unit_rows[ends[i]])
+                row = np.zeros(d + 1)  # the last entry is that of times that are fixed
+                row[ends[i + 1]] += 1.0
+                row[ends[i]] -= 1.0
+                rows.append(row[:-1])
                 bounds.append(dwell - (known[i + 1] - known[i]))
                 kind: ConstraintKind = "collapsed" if dwell == 0 else "minimum duration"
                 constraints.append(Constraint(kind, dwell, mode=mode, position=i, run=run))

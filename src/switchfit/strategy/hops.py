@@ -201,6 +201,8 @@ def _find_lowest(
     side, away = 1 if point[place] < high else -1, (theta - point)[mine]
     for matrix in dict.fromkeys(("exact", otherwise)):
         there = _evaluate_run(evaluator, e, point, side, matrix)
+        if not np.isfinite(there.hessian).all():
+            break
         curvature = there.hessian[own[:, None], own]
         cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away
         gradient, hessian = whole.gradient.copy(), whole.hessian.copy()

@@ -186,7 +186,11 @@ def list_walks(
     # Unknowns follow along a straight line, which may lead a lag or a sigma on a logarithmic scale to 0.
     smallest = unknowns.origin + SMALLEST * (thetas - unknowns.origin)
     lower = np.where(unknowns.log, np.maximum(unknowns.lower, smallest), unknowns.lower)
-    upper = np.broadcast_to(unknowns.upper, thetas.shape)
+    upper = np.tile(unknowns.upper, (len(thetas), 1))
+    for run, where in zip(problem.experiments, unknowns.times, strict=True):
+        times = where[where >= 0]
+        lower[:, times] = np.maximum(lower[:, times], run.t0)
+        upper[:, times] = np.minimum(upper[:, times], run.end)
     # Bounds hold unknowns for a part of a way.
     at_bound = np.isclose(thetas, unknowns.lowest, rtol=AT_SAMPLE, atol=0.0) | (thetas >= unknowns.upper)
     others = free | (at_bound & ~unknowns.is_time)
@@ -218,7 +222,9 @@ def join_walks(ways: Sequence[Walks]) -> Walks:
     return Walks(*map(np.concatenate, zip(*ways, strict=True)))
 
 
-def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -> FloatArray:
+def trace_walks(
+    walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int, times: Sequence[NDArray[np.intp]] = ()
+) -> FloatArray:
     """Go all ways up to their thresholds: pieces (W, `most`, 5), outwards, NaN behind the last, which has no end of its
     own: it holds up to the limit.
 
@@ -231,6 +237,8 @@ def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -
         ``evaluate(which, thetas)`` returns the derivatives of some ways (n,) at thetas (n, d), to their sides.
     most : int
         Pieces that are kept.
+    times : sequence of (N,) int, one for each experiment
+        Places of its transition times in theta, -1 for those that are no unknowns; ways end where their order is lost.
     """
     count, d = walks.theta.shape
     pieces, kept = np.full((count, most, PIECE), np.nan), np.zeros(count, dtype=int)
@@ -241,7 +249,7 @@ def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -
     going = np.arange(count)
     # One piece a turn for all ways that go on.
     while going.size:
-        at = evaluate(going, theta[going])
+        at = _evaluate_ordered(evaluate, going, theta[going], times)
         # Ways whose derivatives are not finite end here; what they have so far is kept.
         sound = np.all(np.abs(at.gradient) < LARGEST, axis=1) & np.isfinite(at.hessian).all(axis=(1, 2))
         # A Newton step that has not lowered J is taken back, and a part of it tried.
@@ -289,6 +297,22 @@ def trace_walks(walks: Walks, cost: FloatArray, evaluate: Evaluate, most: int) -
         theta[going] = moved
         going = going[~last]
     return pieces
+
+
+def _evaluate_ordered(
+    evaluate: Evaluate, which: NDArray[np.intp], thetas: FloatArray, times: Sequence[NDArray[np.intp]]
+) -> Derivatives:
+    """Return the derivatives of ways at thetas (n, d), NaN where the transition times of a run are not in order."""
+    steps = [np.diff(thetas[:, where[where >= 0]], axis=1) for where in times]
+    ordered = np.all([(step >= 0).all(axis=1) for step in steps], axis=0)
+    if ordered.all():
+        return evaluate(which, thetas)
+    n, d = thetas.shape
+    found = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
+    if ordered.any():
+        for every, own in zip(found, evaluate(which[ordered], thetas[ordered]), strict=True):
+            every[ordered] = own
+    return found
 
 
 class _Eliminated(NamedTuple):
@@ -511,7 +535,8 @@ def trace_profiles(
         return Derivatives(*(np.array([getattr(one, name) for one in found]) for name in Derivatives._fields))
 
     most = MOST_PIECES + MOST_HALVINGS + 1
-    pieces = trace_walks(walks, np.full(len(walks.place), fit.cost), evaluate, most).reshape(-1, 2, most, PIECE)
+    costs = np.full(len(walks.place), fit.cost)
+    pieces = trace_walks(walks, costs, evaluate, most, problem.unknowns.times).reshape(-1, 2, most, PIECE)
     known = ~np.isnan(pieces[..., 0])
     complete = known[:, :, 0].all(axis=1)
     return pieces[complete, :, : int(known.sum(axis=2).max())], np.array(places)[complete]
