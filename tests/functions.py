@@ -316,7 +316,8 @@ FALLS_BACK = {
     "arrays: convolve": "calls jnp.convolve",
     "arrays: fft": "calls jnp.fft, which converts what depends on the state to complex128",
     "tables: too large a table": "calls jnp.interp, which searches a table of 200000 entries (limit: 100000)",
-    "tables: too many states": "calls jnp.interp, which takes one of 70 numbers by an index",
+    "tables: too many states": "calls jnp.interp, which takes one of 70 numbers by an index that depends on the state "
+    "(limit: 64)",
     "matrices: solve 6": "calls jnp.linalg.solve, which works with a matrix of 6 rows (limit: 5)",
     "matrices: det 6": "calls jnp.linalg.det, which works with a matrix of 6 rows (limit: 5)",
     "matrices: slogdet 6": "calls jnp.linalg.slogdet, which works with a matrix of 6 rows (limit: 5)",
