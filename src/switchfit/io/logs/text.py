@@ -181,6 +181,8 @@ def _read_clock(cell: str) -> float | None:
     return 3600 * int(match[1]) + 60 * int(match[2]) + float((match[3] or "0").replace(",", "."))
 
 
+DAY = 86400.0  # s
+
 GZIP = b"\x1f\x8b"
 COMMENTS = ("#", "%")
 NO_NUMBER = "is not a number; leave the cell empty where a value is missing."
@@ -455,6 +457,7 @@ def _read_times(table: _Table, column: int, options: Options) -> Log:
     if is_clock and day is None:
         what = "is not a time of day such as 12:34:56.789, as the others are."
         times, unit = np.array(_read_cells(table, column, cells, _read_clock, np.nan, what)), "s"
+        times = times + DAY * np.cumsum(np.append(0, np.diff(times) < -DAY / 2))  # days go on after midnight
     elif is_date(sample):
         what = "is not a date that can be read; write dates as 2024-05-01T12:34:56.789, or times as numbers."
         if is_clock and day is not None:
