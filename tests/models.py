@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
+from operator import call
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
@@ -84,6 +86,25 @@ def fit_problem(
     assert status in (None, found.status), found.message
     assert level in (None, found.verdict.level), str(found)
     return found
+
+
+# Calls that are refused
+
+
+def refused(*rows: Any, by: Any = call, error: Any = (TypeError, ValueError), exact: bool = False) -> Any:
+    """Return a test of rows (what `by` is given, message), or (what, error, message) where the error is another one.
+
+    `by` calls what it is given, unless told. An `exact` error is that itself, and none of its kinds.
+    """
+    table = [(row[0], row[1] if len(row) == 3 else error, row[-1]) for row in rows]
+
+    @pytest.mark.parametrize(("given", "expected", "message"), table)
+    def check(given: Any, expected: Any, message: str) -> None:
+        with pytest.raises(expected, match=message) as caught:
+            by(given)
+        assert not exact or type(caught.value) is expected
+
+    return check
 
 
 # A state at rest, for fits of a function of t and p

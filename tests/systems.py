@@ -153,10 +153,10 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Case:
-    """A problem, and all ways to evaluate and differentiate its cost, each compiled once.
+    """A problem, and two ways to evaluate and differentiate its cost, each compiled once.
 
-    Each returns `Derivatives`: `paper` by the paper's adjoint equations; `discrete` and `forward` of the discretised
-    cost, with a gradient backward and a Hessian forward over it, or both forward.
+    Each returns `Derivatives`: `paper` by the paper's adjoint equations; `discrete` of the discretised cost, with a
+    gradient backward and a Hessian forward over it.
     """
 
     def __init__(self, problem: Problem, implicit: tuple[bool, ...] | None = None) -> None:
@@ -166,7 +166,7 @@ class Case:
         self.tau = problem.experiments[0].initial_times
         self.N = len(self.tau)
         self.paper = compiled(self._compute_by_the_paper)
-        self.discrete, self.forward = map(self._differentiate, ("discrete-adjoint", "forward"))
+        self.discrete = compiled(self._differentiate)
 
     def arguments(self, kind: str = "all", *, halvings: int = 0) -> Arguments:
         """Arguments of one of `SYSTEMS`, on the mesh of `NODES` with each cell halved some times."""
@@ -178,8 +178,8 @@ class Case:
     def _compute_by_the_paper(self, arguments: Arguments, *at: Any) -> Derivatives:
         return Derivatives(*compute_paper_derivatives(Model(self.structure, arguments), *at))
 
-    def _differentiate(self, method: Any) -> Callable[..., Any]:
-        return compiled(lambda *at: Derivatives(*derivatives(*at, structure=self.structure, method=method)))
+    def _differentiate(self, *at: Any) -> Derivatives:
+        return Derivatives(*derivatives(*at, structure=self.structure, method="discrete-adjoint"))
 
 
 @cache

@@ -21,10 +21,6 @@ SMOOTH_KINDS = ("running", "reference", "terminal")
 VARIATIONS = [("resets", kind) for kind in reversed(KINDS)]
 VARIATIONS += [(name, kind) for name in ("stiff", "mixed") for kind in SMOOTH_KINDS]
 
-INSIDE = {"resets": [0.413, 0.791, 1.336], "stiff": [0.6187, 1.2812], "mixed": [0.6187, 1.2812]}
-"""Transition times that are not nodes."""
-
-
 BLOCKS = ("D_tau J", "D_p J", "tau-tau, i = j", "tau-tau, i > j", "tau-p", "p-p")
 
 
@@ -117,19 +113,3 @@ def test_closed_forms(name: str, method: str) -> None:
     assert found.cost == pytest.approx(J, rel=1e-8)
     np.testing.assert_allclose(found.gradient, gradient, rtol=first)
     np.testing.assert_allclose(found.hessian, hessian, rtol=second)
-
-
-# Derivatives of the discretised cost
-
-
-@pytest.mark.slow  # in the fast suite, `test_protocol.py` compares them
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["resets", "stiff", "mixed"])
-def test_adjoint_and_forward_agree_to_rounding(name: str, kind: str) -> None:
-    this = case(name)
-    at = this.arguments(kind), INSIDE[name], P0
-    expected, found = this.forward(*at), this.discrete(*at)
-    assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
-    relative = 1e-9 if any(this.structure.implicit) else 2e-12
-    for a, b in zip(found, expected, strict=True):
-        np.testing.assert_allclose(a, b, rtol=0.0, atol=relative * np.abs(b).max())

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import climb, decay, one_run, rest, slow_guess, temperature
+from models import climb, decay, one_run, refused, rest, slow_guess, temperature
 from optimizer import minimize, solve_qp
 from optimizer import rows as linear
 from scipy.optimize import nnls
@@ -248,10 +248,9 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("message", REFUSED)
-def test_what_is_refused(message):
-    with pytest.raises(TypeError if "client" in message else ValueError, match=message):
-        REFUSED[message]()
+test_what_is_refused = refused(
+    *((call, TypeError if "client" in said else ValueError, said) for said, call in REFUSED.items())
+)
 
 
 # Multistart

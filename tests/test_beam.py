@@ -63,7 +63,7 @@ def everything(running=True, solver="auto", **more):
     bounces = {("swing", "drift"): bounce, ("drift", "brake"): bounce}
     system = sf.HybridSystem({"swing": swing, "drift": drift, "brake": brake}, [sf.Parameter(0.5), 0.2], bounces)
     inputs = sf.Input([0.0, 1.0, 2.2, 4.0], [0.1, 0.5, -0.3, 0.0], kind="hold")
-    run = sf.Experiment(mode_sequence=SEQUENCE, t0=0.0, tf=4.0, inputs=inputs, **{"transition_times": TIMES} | given)
+    run = sf.Experiment(mode_sequence=SEQUENCE, transition_times=TIMES, t0=0.0, tf=4.0, inputs=inputs, **given)
     parameters = {"k": sf.Parameter(1.3, lower=0.2), "v": 0.6, "s": sf.Parameter(0.4, lower=0.01)}
     return sf.Problem(system, run, parameters, solver=solver)
 
@@ -149,32 +149,6 @@ def test_a_birth_at_a_sample_comes_after_it():
     assert gap(H, H_earlier) > 1e-2
 
 
-BIRTHS = (1.27, 2.43)
-
-
-def replay_births(problem, grid):
-    """Transitions at `BIRTHS`, which are no nodes, propagated anew from t0; the point of linearisation stays."""
-    track, _, p = begin_at(problem, grid)
-    S, D = track.births, track.births + len(track.places)
-    children = np.full((1, S, len(Column)), -1, dtype=np.int64)
-    for i in range(2):
-        children[0, i] = 0, i, i + 1, i, *track.functions[:, i, i + 1]
-    sequence, times = np.array([[2, 0]]), np.array([BIRTHS])
-    return track, track.engine.replay(without_priors(D), p[None], sequence, children, times, len(track.times) - 1)
-
-
-def test_births_at_any_time():
-    """Propagated anew from t0, transitions cut the cells as they do for the evaluator, on the way to tf or before."""
-    problem, in_time = everything(running=False, transition_times=BIRTHS), []
-    for grid in (0.2, 0.05):
-        track, found = replay_births(problem, grid)
-        J_e, g_e, H_e = evaluate_on(problem, track)
-        np.testing.assert_allclose(found.costs[0], J_e, rtol=1e-12)
-        in_time.append(max(gap(found.gradients[0], g_e), gap(found.matrices[0], H_e)))
-    assert in_time[0] > 50 * in_time[1]
-    assert in_time[1] < 1e-8
-
-
 # A system that is linear in its unknowns: its linearised cost is its cost
 
 
@@ -208,22 +182,6 @@ def test_two_names_of_one_parameter_are_one_unknown():
     proposal = beams.follow_order(problem, 0, np.array([1.3]))[0]
     np.testing.assert_allclose(proposal.parameters, fitted.parameters["k"], rtol=1e-4)
     np.testing.assert_allclose(proposal.cost, fitted.cost, rtol=1e-3)
-
-
-def test_the_point_of_linearisation_does_not_matter_for_a_linear_model():
-    problem = linear_problem()
-    track = beams.prepare(problem, 0, make_library(["rise"], most=1), 0.5)
-    q = problem.initial_theta
-    scores = []
-    once = beams.Pass(track, None, q, 0.0)
-    for bounds in (None, once.build_limits()):
-        states = track.engine.begin(q, once.build_start(np.zeros((1, 3))), (1e-4, 0.01, 0.0), bounds)
-        for first, last in zip(track.stops[:-1].tolist(), track.stops[1:].tolist(), strict=True):
-            states = track.engine.advance(states, np.array([[0, 0, 0, -1, -1, -1, -1]]), first, last)
-        scores.append(states.scores[0])
-    np.testing.assert_allclose(scores[1], scores[0], rtol=1e-9)
-    np.testing.assert_allclose(states.costs, states.scores, rtol=1e-9)
-    np.testing.assert_allclose(states.gradients, 0.0, atol=1e-8)
 
 
 def test_parameters_stay_inside_their_bounds():

@@ -21,16 +21,13 @@ from switchfit.io.problem_file import load_problem
 
 PROBLEM = """
 model = "room.py:room"
-
 [parameters]
 heating = 0.4
-
 [[experiments]]
 mode_sequence = ["on", "off"]
 transition_times = [2.0]
 t0 = 0.0
 tf = 6.0
-
 [[experiments.data]]
 file = "log.csv"
 time = "t"
@@ -40,13 +37,10 @@ sigma = 0.1
 
 ROOM = """
 import switchfit as sf
-
 def on(t, x, p):
     return p["heating"] - 0.05 * x
-
 def off(t, x, p):
     return -0.05 * x
-
 room = sf.HybridSystem(modes={"on": on, "off": off}, initial_state=[0.0], state_names=("T",))
 """
 

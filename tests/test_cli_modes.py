@@ -17,30 +17,22 @@ from switchfit.io.problem_file.writing import write_fitted_problem
 MODEL = """
 import jax.numpy as jnp
 import switchfit as sf
-
 def rise(t, x, p):
     return p["a"] * (3.0 - x)
-
 def fall(t, x, p):
     return -p["b"] * x
-
 def drift(t, x, p):
     return jnp.stack([p["c"]])
-
 def twice(t, x, p):
     return 2.0 * x
-
 def drop(t, x, p):
     return x - 0.3
-
 def pushed(t, x, p, u):
     return p["a"] * (u - x)
-
 system = sf.HybridSystem({"rise": rise, "fall": fall, "drift": drift}, [0.5], state_names=("T",))
 driven = sf.HybridSystem(
     {"pushed": pushed, "fall": lambda t, x, p, u: -p["b"] * x}, [sf.Parameter(0.4, lower=0.0)], state_names=("T",)
 )
-
 def build():
     data = sf.Measurements([0.0, 1.0, 2.0], [[0.5], [1.0], [2.0]], sigma=0.1)
     return sf.Problem(system, sf.Experiment(data, ["rise", "fall"], [1.0]), {"a": 1.0, "b": 1.0, "c": 0.0})
@@ -48,26 +40,21 @@ def build():
 
 PROBLEM = """
 model = "model.py:system"
-
 [parameters]
 a = { value = 0.5, lower = 0.0, unit = "1/s" }
 b = 0.6
 c = 0.1
-
 [[experiments]]
 t0 = 0.0
 tf = 8.0
-
 [[experiments.data]]
 file = "log.csv"
 time = "t"
 columns = ["T"]
 sigma = 0.02
-
 [library]
 first = "rise"
 min_duration = 0.2
-
 [library.successions]
 rise = ["fall", "drift"]
 fall = "rise"
@@ -232,11 +219,9 @@ def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):
 
 RICH = """
 model = { name = "models/model.py:driven" }
-
 [parameters]
 a = { value = 0.7, lower = 0.01, prior = { median = 0.7, log_sd = 0.5 }, scale = "log" }
 "b" = 0.4
-
 [[experiments]]
 name = "run \\"A\\""
 mode_sequence = ["pushed", "fall"]
@@ -244,7 +229,6 @@ transition_times = ["2024-05-01T10:00:02Z"]
 initial_state = [{ value = 0.4, lower = 0.0 }]
 inputs = { file = "inputs/*.csv", time = "t", epoch = "s", columns = ["u"], kind = "linear" }
 jumps = [{ time = "2024-05-01T10:00:05Z", map = "models/model.py:drop" }]
-
 [[experiments.data]]
 file = "logs/*.csv"
 time = "t"
@@ -253,7 +237,6 @@ columns = ["T"]
 observe = "models/model.py:twice"
 sigma = 0.04
 loss = "huber"
-
 [options]
 strategy = "local"
 min_duration = { fall = 0.5 }

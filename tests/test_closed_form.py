@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
+from jax.scipy.linalg import expm
 
 import switchfit as sf
 
@@ -46,7 +47,7 @@ def cost(theta):
     spans = [(i, knots[i + 1]) for i in range(3)]
     spans += [(i, t) for i, t in zip(SEGMENT_OF_SAMPLE, SAMPLES, strict=True)]
     powers = [jnp.block([[-A[i].T, Q], [jnp.zeros((3, 3)), A[i]]]) * (end - knots[i]) for i, end in spans]
-    E = exponentials(jnp.stack(powers))
+    E = jax.vmap(expm)(jnp.stack(powers))
     F, G = E[:, 3:, 3:], E[:, :3, 3:]
     x, J, starts = state_at_start(*theta[2:]), 0.0, []
     for i in range(3):
@@ -57,19 +58,6 @@ def cost(theta):
         r = jnp.where(np.isnan(VALUES[k]), 0.0, H @ F[3 + k] @ starts[i] - np.nan_to_num(VALUES[k])) / SIGMA
         J = J + 0.5 * r @ r
     return J
-
-
-def exponentials(powers):
-    """Exponentials of matrices (K, 6, 6) by scaling and squaring of Taylor's series."""
-    small, one = powers / 32, jnp.broadcast_to(jnp.eye(6), powers.shape)
-
-    def add(k, found):
-        total, term = found
-        term = term @ small / k
-        return total + term, term
-
-    total, _ = jax.lax.fori_loop(1, 21, add, (one, one))
-    return jax.lax.fori_loop(0, 5, lambda _, root: root @ root, total)
 
 
 @cache

@@ -80,6 +80,10 @@ MODES = {
     "clamp": (lambda x, p: jax.lax.clamp(-p["w"], x[0], p["w"]), 2),
     "relu": (lambda x, p: jax.nn.relu(x[0] - x[1]), 1),
     "cond": (lambda x, p: jax.lax.cond(x[0] > p["w"], lambda x: x[1], lambda x: x[0] * x[1], x), 1),
+    "corners of cases": (
+        lambda x, p: jax.lax.cond(x[0] > 0.3, lambda: jnp.abs(x[1]), lambda: jnp.maximum(x[1] - 0.2, p["w"] * x[0])),
+        3,
+    ),
     "inside jit": (lambda x, p: jax.jit(lambda y: jnp.where(y > 0, y, y**2))(x[0]), 1),
     "interp": (lambda x, p: jnp.interp(x[0], KNOTS, HEIGHTS), 4),
     "interp with an unknown height": (lambda x, p: jnp.interp(x[0], KNOTS, HEIGHTS * p["w"]), 4),
@@ -863,9 +867,8 @@ def test_an_output_with_an_infinite_slope_at_a_corner_has_derivatives_beyond(mod
     """The flow out of a tank, which is measured, is 0 once it is empty, or once its level is below the outlet."""
     times = np.linspace(0.1, 4.5, 45)
     data = sf.Measurements(times, np.cos(times), output, sigma=1.0)
-    problem = problem_of(
-        mode, lambda p: jnp.stack([p["x0"]]), {"x0": 1.53, "k": 0.8}, 4.5, data, rtol=1e-12, atol=1e-12
-    )
+    start, parameters = lambda p: jnp.stack([p["x0"]]), {"x0": 1.53, "k": 0.8}
+    problem = problem_of(mode, start, parameters, 4.5, data, rtol=1e-12, atol=1e-12)
     (J, g, *_), found = expect(flow, problem), sf.evaluate(problem)
     assert found.cost == pytest.approx(J, rel=1e-4)
     np.testing.assert_allclose(found.gradient, g, rtol=0, atol=1e-3 * np.abs(g).max())
@@ -908,9 +911,8 @@ def integrate_with_one_corner(problem, fixed):
 
     data = problem.experiments[0].data[0]
     start = [x0, *(entry.value for entry in problem.system.initial_state[1:])]
-    states, _ = integrate(
-        field, lambda x: [normals[0] @ x - d], start, 0.0, 2.0, data.times, rtol=1e-11, atol=1e-12, method="DOP853"
-    )
+    settings = {"rtol": 1e-11, "atol": 1e-12, "method": "DOP853"}
+    states, _ = integrate(field, lambda x: [normals[0] @ x - d], start, 0.0, 2.0, data.times, **settings)
     return 0.5 * np.sum((states - data.values) ** 2)
 
 
@@ -1146,22 +1148,6 @@ def test_a_rounded_state_jumps_at_each_integer(rounded, crossed):
     found = sf.evaluate(problem)
     np.testing.assert_allclose(found.cost, cost(0.6), rtol=1e-9)
     np.testing.assert_allclose(found.gradient, (cost(0.6 + 1e-6) - cost(0.6 - 1e-6)) / 2e-6, rtol=1e-6)
-
-
-def test_corners_inside_cases_are_found_whichever_is_taken():
-    def by_cases(t, x, p):
-        slope = jax.lax.cond(x[0] > 0.3, lambda: jnp.abs(x[1]), lambda: jnp.maximum(x[1] - 0.2, 0.0) + 0.1 * t)
-        return jnp.stack([p["w"] * jnp.cos(t), slope])
-
-    def by_entries(t, x, p):
-        slope = jnp.where(x[0] > 0.3, jnp.abs(x[1]), jnp.maximum(x[1] - 0.2, 0.0) + 0.1 * t)
-        return jnp.stack([p["w"] * jnp.cos(t), slope])
-
-    problems = [problem_of(mode, [0.0, -0.1], {"w": 1.1}) for mode in (by_cases, by_entries)]
-    assert [find_corners(problem.structures[0].modes[0]).count for problem in problems] == [3, 3]
-    found, expected = map(sf.evaluate, problems)
-    for name in ("cost", "gradient", "hessian"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-7)
 
 
 def test_jumps_of_rounding_and_of_the_integer_below_are_two_corners():

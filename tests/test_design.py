@@ -9,7 +9,7 @@ from itertools import combinations, product
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import STILL, curve, decay, first_state
+from models import STILL, curve, decay, first_state, refused
 from test_cli import catch_settings, run
 
 import switchfit as sf
@@ -369,29 +369,25 @@ def test_text_figure_and_file(tmp_path):
 ONE_SENSOR = "sensor 1"
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"criterion": "T"}, "criterion must be"),
-        ({"names": "c"}, "names has 'c', which is no unknown of the problem: a, b"),
-        ({"names": []}, "names is empty"),
-        ({"names": {"a": -1.0}}, "scale of a must be positive"),
-        ({"free": {"u": (0.0, 1.0)}}, "free must name inputs of the run: none; got 'u'"),
-        ({"samples": 0}, "samples of sensor 1 must be"),
-        ({"samples": {"X": 3}}, "samples names 'X'; the sensors are sensor 1"),
-        ({"sensors": {"X": 3.0}, "budget": 1.0}, "sensors names 'X'"),
-        ({"sensors": {ONE_SENSOR: 3.0}}, "budget and the costs of sensors belong together"),
-        ({"sensors": 1, "budget": 2.0}, "budget and the costs of sensors belong together"),
-        ({"sensors": {ONE_SENSOR: 3.0}, "budget": 2.0}, "no sensor is within the budget of 2"),
-        ({"sensors": {ONE_SENSOR: -3.0}, "budget": 2.0}, "cost of sensor 1 must be positive"),
-        ({"experiment": 1}, "experiment must lie in 0..0; got 1"),
-        ({"theta": [1.0]}, "theta must have shape"),
-        ({"starts": -1}, "starts must not be negative"),
-    ],
+test_wrong_settings_of_a_line = refused(
+    ({"criterion": "T"}, "criterion must be"),
+    ({"names": "c"}, "names has 'c', which is no unknown of the problem: a, b"),
+    ({"names": []}, "names is empty"),
+    ({"names": {"a": -1.0}}, "scale of a must be positive"),
+    ({"free": {"u": (0.0, 1.0)}}, "free must name inputs of the run: none; got 'u'"),
+    ({"samples": 0}, "samples of sensor 1 must be"),
+    ({"samples": {"X": 3}}, "samples names 'X'; the sensors are sensor 1"),
+    ({"sensors": {"X": 3.0}, "budget": 1.0}, "sensors names 'X'"),
+    ({"sensors": {ONE_SENSOR: 3.0}}, "budget and the costs of sensors belong together"),
+    ({"sensors": 1, "budget": 2.0}, "budget and the costs of sensors belong together"),
+    ({"sensors": {ONE_SENSOR: 3.0}, "budget": 2.0}, "no sensor is within the budget of 2"),
+    ({"sensors": {ONE_SENSOR: -3.0}, "budget": 2.0}, "cost of sensor 1 must be positive"),
+    ({"experiment": 1}, "experiment must lie in 0..0; got 1"),
+    ({"theta": [1.0]}, "theta must have shape"),
+    ({"starts": -1}, "starts must not be negative"),
+    by=lambda settings: sf.design(line(), **settings),
+    error=ValueError,
 )
-def test_wrong_settings_of_a_line(settings, message):
-    with pytest.raises(ValueError, match=message):
-        sf.design(line(), **settings)
 
 
 @pytest.mark.parametrize("limits", [(1.0, 0.0), (0.0,), 3.0, (0.0, np.inf), (np.zeros(3), 1.0), ("a", 1.0)])

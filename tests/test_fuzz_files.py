@@ -63,9 +63,8 @@ def change_text(text: str, pieces: tuple[str, ...], rng: random.Random) -> bytes
     for _ in range(rng.choice([1, 1, 2, 5])):
         a, b = sorted((rng.randrange(len(text) + 1), rng.randrange(len(text) + 1)))
         b = min(b, a + rng.choice([1, 3, 40]))
-        text = rng.choice(
-            [text[:a] + text[b:], text[:a] + text[a:b] * 2 + text[b:], text[:a] + rng.choice(pieces) + text[b:]]
-        )
+        changed = [text[:a] + text[b:], text[:a] + text[a:b] * 2 + text[b:], text[:a] + rng.choice(pieces) + text[b:]]
+        text = rng.choice(changed)
     data = text.encode(rng.choice(["utf-8"] * 8 + ["utf-16", "utf-8-sig"]), "replace")
     if rng.random() < 0.1:
         data = data[: len(data) // 2] + bytes([rng.randrange(256)]) + data[len(data) // 2 :]

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from models import refused
 
 import switchfit as sf
 
@@ -100,26 +101,17 @@ def test_columns_of_a_data_frame():
     np.testing.assert_array_equal(plain.values, ARRAY)
 
 
-@pytest.mark.parametrize(
-    ("values", "error", "message"),
-    [
-        ({}, ValueError, "Input values must have a name for each entry of u, .*; got an empty dict"),
-        ({"a": SAMPLES, "b": SAMPLES[:3]}, ValueError, r"Input 'b' needs .* got \(7,\) and \(3,\)"),
-        ({"a": np.ones((7, 2))}, ValueError, r"Input 'a' needs .* values of shape \(K,\); got \(7,\) and \(7, 2\)"),
-    ],
-)  # fmt: skip
-def test_bad_values(values, error, message):
-    with pytest.raises(error, match=message):
-        sf.Input(SAMPLES, values)
-
-
-@pytest.mark.parametrize(
-    ("left", "values", "message"),
-    [
-        ("k", NAMED, "mode 'pull' reads 'k', which is not there: p has k; u has left, right"),
-        ("left", np.ones((7, 2)), r"mode 'pull'.* u has no names: give sf.Input a dict of name -> samples"),
-    ],
+test_bad_values = refused(
+    ({}, ValueError, "Input values must have a name for each entry of u, .*; got an empty dict"),
+    ({"a": SAMPLES, "b": SAMPLES[:3]}, ValueError, r"Input 'b' needs .* got \(7,\) and \(3,\)"),
+    ({"a": np.ones((7, 2))}, ValueError, r"Input 'a' needs .* values of shape \(K,\); got \(7,\) and \(7, 2\)"),
+    by=lambda values: sf.Input(SAMPLES, values),
 )
-def test_modes_that_ask_for_what_is_not_there(left, values, message):
-    with pytest.raises(ValueError, match=message):
-        problem_of(system_of(left, "right" if isinstance(values, dict) else 1), values)
+
+
+test_modes_that_ask_for_what_is_not_there = refused(
+    ((system_of("k", "right"), NAMED), "mode 'pull' reads 'k', which is not there: p has k; u has left, right"),
+    ((system_of("left", 1), np.ones((7, 2))), r"mode 'pull'.* u has no names: give sf.Input a dict of name -> samples"),
+    by=lambda given: problem_of(*given),
+    error=ValueError,
+)

@@ -177,17 +177,6 @@ def test_guards_move_with_the_pulse(engine):
     assert found.rate[r, found.modes.index("rest")] == pytest.approx(slope, rel=1e-4)
 
 
-@pytest.mark.slow
-def test_implicit_steps_have_rates_too():
-    given = problem(samples(), system=sf.HybridSystem(MODES, [0.4, 0.1]), solver="stiff")
-    found, explicit = sf.insertion(given), sf.insertion(replace(given, solver="explicit"))
-    for mode in range(3):
-        at = np.interp(explicit.times, found.times, found.rate[:, mode])
-        away = ~np.isin(explicit.times, samples().times) & (np.gradient(explicit.active) == 0)
-        scale = np.nanmax(abs(explicit.rate))
-        assert np.median(abs(at - explicit.rate[:, mode])[away]) < 0.02 * scale
-
-
 # Proposals where the rate is lowest, and the search from an empty schedule
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from models import fishing, fit_problem, linear, tracked_drive
+from models import fit_problem, linear, tracked_drive
 
 import switchfit as sf
 
@@ -27,16 +27,6 @@ def test_five_switches_from_equal_spacing():
     assert found.cost == pytest.approx(4.504794324332318, abs=1e-11)
     expected = [0.10021709786456, 0.29739223936426, 0.43294465994443, 0.64175816832317, 0.76662528600859]
     np.testing.assert_allclose(found.transition_times[0], expected, rtol=0, atol=1e-9)
-
-
-def test_fishing_from_published_times():
-    published = (2.4434718158206916, 4.122552522089049, 4.433072844963807, 4.68252002334217,
-                 5.201667827750571, 5.369908894975762, 6.376845190917198, 6.47160340206027)  # fmt: skip
-    found = sf.estimate(fishing(published, rtol=1e-11, atol=1e-13))
-    assert found.cost == pytest.approx(1.345295218283, abs=1e-9)
-    expected = [2.4420392297, 4.1168721058, 4.4197702383, 4.6699644285,
-                5.1828371488, 5.3537063284, 6.3557436884, 6.4527645889]  # fmt: skip
-    np.testing.assert_allclose(found.transition_times[0], expected, rtol=0, atol=1e-6)
 
 
 def test_exact_orders_of_the_skid_steered_vehicle():

@@ -1,6 +1,5 @@
-"""Rows against a construction in plain Python; the nodes of a problem; the default tolerances; adaptive steps."""
+"""Rows against a construction in plain Python; the nodes of a problem; adaptive steps."""
 
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -22,7 +21,6 @@ from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.native.engine import native_experiment
 from switchfit.engine.protocol import runs_of
 from switchfit.engine.stiffness import Watch
-from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 
 # Rows
@@ -120,15 +118,6 @@ def test_mesh_of_times_in_any_order(times):
     assert mesh.times.tolist() == sorted({t / 7.0 for t in times})
     assert len(mesh.nodes) == pad_length(mesh.cells) + 1
     assert np.all(mesh.nodes[mesh.cells :] == mesh.times[-1])
-
-
-# The tolerances
-
-
-def test_default_tolerances_give_the_cost_to_about_1e_8():
-    problem = models.fishing((2.4, 4.3))
-    exact = Evaluator(replace(problem, rtol=1e-12, atol=1e-14)).cost(problem.initial_theta)
-    assert 0 < abs(Evaluator(problem).cost(problem.initial_theta) / exact - 1) < 1e-8
 
 
 # The adaptive solve

@@ -16,9 +16,8 @@ TIMES = np.linspace(0.0, 1.0, 9)
 
 
 def problem_of(mode=None, initial_state=(1.0,), data=None):
-    system = sf.HybridSystem(
-        {"on": mode or (lambda t, x, p: -p["a"] * x), "off": lambda t, x, p: -0.5 * x}, initial_state
-    )
+    modes = {"on": mode or (lambda t, x, p: -p["a"] * x), "off": lambda t, x, p: -0.5 * x}
+    system = sf.HybridSystem(modes, initial_state)
     data = data or sf.Measurements(TIMES, np.exp(-TIMES), sigma=0.1)
     return sf.Problem(system, sf.Experiment(data, ("on", "off"), (0.4,), 0.0, 1.0), {"a": 0.8})
 

@@ -234,6 +234,5 @@ def test_bands_and_sigma_of_a_late_sensor_are_at_its_stamps(delay):
     for figure in (fit.plot(), fit.predict().plot()):
         curve = next(line for line in figure.axes[0].lines if line.get_label() in {"fitted", "predicted"})
         for band in figure.axes[0].collections:
-            assert (
-                band.get_datalim(figure.axes[0].transData).x0 == pytest.approx(0.25, rel=1e-3) == curve.get_xdata()[0]
-            )
+            begin = band.get_datalim(figure.axes[0].transData).x0
+            assert begin == pytest.approx(0.25, rel=1e-3) == curve.get_xdata()[0]

@@ -619,25 +619,3 @@ def test_derivatives_of_random_systems_with_both_kinds_of_steps(seed):
 def test_derivatives_of_random_systems_by_each_method(seed):
     """In machine code, and by one of the others, which JAX takes 20 s to compile; in each tenth JAX does it all."""
     assert not differences(System(seed), (METHODS[seed % len(METHODS)],), "jax" if seed % 10 == 0 else "auto")
-
-
-def test_the_reference_knows_a_closed_form():
-    """x' = -a x, then -b x from tau on, a sample before and one after it: J and its derivatives by hand."""
-    a, b, tau, x0, sigma = 0.7, 1.9, 0.6, 1.3, 0.2
-
-    def decay(name: str) -> Callable[..., Any]:
-        return lambda t, x, p: [-p[name] * x[0]]
-
-    samples = reference.Samples(np.array([0.4, 1.0]), np.array([[0.4], [0.3]]), lambda t, x, p: [x[0]], sigma=sigma)
-    modes, names = [decay("a"), decay("b")], {"a": "a", "b": "b"}
-    run = reference.Run(modes, 0.0, 1.0, [0], [x0], names, [None], [None], samples=[samples])
-    found = reference.Reference([run], {"a": (slice(1, 2), ()), "b": b}).derivatives(np.array([tau, a]))
-    early, late = x0 * np.exp(-0.4 * a), x0 * np.exp(-a * tau - b * (1 - tau))
-    r = np.array([early - 0.4, late - 0.3]) / sigma
-    slopes = np.array([[0, -0.4 * early], [(b - a) * late, -tau * late]])
-    curvatures = np.array([[[0, 0], [0, 0.16 * early]], late * np.outer([b - a, -tau], [b - a, -tau])])
-    curvatures[1] += late * np.array([[0, -1.0], [-1.0, 0]])
-    assert found.cost == pytest.approx(0.5 * r @ r, rel=1e-13)
-    np.testing.assert_allclose(found.gradient, r @ slopes / sigma, rtol=1e-12)
-    hessian = slopes.T @ slopes / sigma**2 + np.einsum("k,kij->ij", r, curvatures) / sigma
-    np.testing.assert_allclose(found.hessian, hessian, rtol=1e-9)

@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
+from models import refused
 
 import switchfit as sf
 from switchfit.batch.program import Inputs, Layout
 from switchfit.engine.native.program import _program_of
-from switchfit.fit import solution
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.solution import minimize_cost
 from switchfit.problem.functions import Call, trace_function
 from switchfit.strategy.beam import follow_order
 
@@ -142,10 +141,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("message", WRONG)
-def test_what_is_wrong_is_said(message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        WRONG[message]()
+test_what_is_wrong_is_said = refused(*((call, said) for said, call in WRONG.items()))
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
@@ -179,9 +175,8 @@ def tank(e, samples=25, sigma=0.02, seed=0, names=None, **given):
     data = sf.Measurements(times, values, sigma=sigma)
     own = {"r": f"r_{e}"} if names is None else names
     start = [sf.Parameter(1.5 + e, lower=0.0, upper=20.0)]
-    return sf.Experiment(
-        data, ("fall", "rise"), (2.0,), 0.0, 4.0, initial_state=start, parameter_map=own, name=f"tank{e}", **given
-    )
+    settings = {"initial_state": start, "parameter_map": own, "name": f"tank{e}"} | given
+    return sf.Experiment(data, ("fall", "rise"), (2.0,), 0.0, 4.0, **settings)
 
 
 def tanks(count, samples=None, system=TANK, **given):
@@ -198,18 +193,6 @@ def test_the_truth_is_found():
     truth = [1.93, 2.13, *TRUTH.values(), *GROWTH, 2.0, 3.0]
     assert np.all(np.abs(fitted.theta - truth) < 3.5 * fitted.standard_errors)
     assert [x.tolist() for x in fitted.initial_state] == [[fitted.theta[6]], [fitted.theta[7]]]
-
-
-def test_by_blocks_a_fit_is_the_same(monkeypatch):
-    problem = tanks(6)
-    evaluator = evaluator_of(problem)
-    full = minimize_cost(evaluator, problem.initial_theta, "exact", 1e-7, 200)
-    monkeypatch.setattr(solution, "MANY_RUNS", 6)
-    blocks = minimize_cost(evaluator, problem.initial_theta, "exact", 1e-7, 200)
-    np.testing.assert_allclose(blocks.theta, full.theta, rtol=1e-8, atol=1e-9)
-    at, arrow = evaluator(full.theta), evaluator(full.theta, arrow=True)
-    np.testing.assert_allclose(arrow.gradient, at.gradient, rtol=1e-14, atol=1e-10)
-    np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
 
 
 def test_a_batch_of_runs_with_times_that_are_known():

@@ -330,9 +330,7 @@ def pose(logs, system=HEATER, parameters=GUESS, times=BAD, truth=(POWER, LOSS), 
     near = [tau for tau, given in zip(TAU, times, strict=True) if not is_fixed(given)]
     theta = np.concatenate([near, truth])
     seen = Evaluator(problem, theta).simulate(theta)[0].seen
-    filled = [
-        replace(log, values=values[: len(noise)] + noise) for (log, noise), values in zip(logs, seen, strict=True)
-    ]
+    filled = [replace(log, values=y[: len(noise)] + noise) for (log, noise), y in zip(logs, seen, strict=True)]
     problem = replace(problem, experiments=replace(run, data=filled))
     return problem, fit_briefly(problem, theta)
 
@@ -359,6 +357,7 @@ RESET = sf.HybridSystem({"on": on, "off": decay}, [0.2], reset_maps={("off", "on
 DRIVEN = sf.HybridSystem({"on": heat, "off": leak}, [0.2])
 INPUT = sf.Input([0.0, 3.0, 6.0, 10.0], [1.0, 1.3, 0.8, 1.0], kind="hold")
 THIRD = {"noise": sf.Parameter(0.1, lower=1e-3, upper=1.0)}
+KNOWN_LOSS = GUESS | {"k": sf.Parameter(LOSS, fixed=True)}
 LATE = {"late": sf.Parameter(0.05, lower=0.0, upper=0.2)}
 
 CASES = {
@@ -367,9 +366,7 @@ CASES = {
     "bounded times": lambda: pose([measure()], times=BOUNDED),
     "bounds nearer than samples": lambda: pose([measure()], times=NARROW),
     "a prior of a time": lambda: pose([measure()], times=PRIOR),
-    "a fixed parameter": lambda: pose(
-        [measure()], parameters=GUESS | {"k": sf.Parameter(LOSS, fixed=True)}, truth=(POWER,)
-    ),
+    "a fixed parameter": lambda: pose([measure()], parameters=KNOWN_LOSS, truth=(POWER,)),
     "priors": lambda: pose([measure()], parameters=PRIORS),
     "logarithmic scales": lambda: pose([measure()], parameters=LOGARITHMIC),
     "sigma unknown": lambda: pose([measure(sigma=None)]),

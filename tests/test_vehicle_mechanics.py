@@ -257,11 +257,16 @@ def test_power_of_a_rolling_body_is_what_friction_takes(mode, v, omega, k):
     """On a slope: Coulomb's force takes mu N times the speed of the surface, rolling resistance rho N v.
 
     The moment of momentum about a line on the ground knows nothing of friction: gravity and resistance alone change it.
+    A body rolls once its surface rests on the ground.
     """
     R, mu, rho, slope = 0.11, 0.2, 0.01, 0.3
     body = rolling_body(radius=R, inertia=k, mu=mu, rolling=rho, slope=slope)
-    dx, dv, domega = evaluate(body.modes[mode], [0.0, v, omega], {"v_0": v, "omega_0": omega})
+    start, known = [0.0, v, omega], {"v_0": v, "omega_0": omega}
+    dx, dv, domega = evaluate(body.modes[mode], start, known)
     assert dx == v
+    np.testing.assert_array_equal(body.initial_state(known), start)
+    for slip in body.guards.values():
+        assert evaluate(slip, start, known) == pytest.approx(v - R * omega, rel=1e-12, abs=1e-12)
     power = v * dv + k * R**2 * omega * domega + G * np.sin(slope) * v  # of a unit of mass
     normal = G * np.cos(slope)
     lost = rho * normal * v if mode == "roll" else mu * normal * abs(v - R * omega)

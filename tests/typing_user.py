@@ -43,9 +43,7 @@ def make_problem() -> sf.Problem:
         t0=0,
         tf=8,
         inputs=None,
-        initial_state=[
-            sf.Parameter(0.1),
-        ],
+        initial_state=[sf.Parameter(0.1)],
         parameter_map={"heating": "power"},
         jumps=[sf.Jump([2.5], lambda t, x, p: x), sf.Jump(5, lambda t, x, p: x)],
     )
