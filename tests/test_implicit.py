@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 from models import decay, first_state, one_run
 from systems import P0, case
 
@@ -137,6 +138,31 @@ def test_stages_one_at_a_time(monkeypatch):
     """As where functions would become too long."""
     monkeypatch.setattr(kernels, "SHORT", 0)
     drop_programs()
+
+
+def last_of_chain(n, times, q):
+    """The last of n states at times (K,), ``x_i' = k (x_{i-1} - 2 x_i + x_{i+1}) + c`` between walls at 0, from 1."""
+    rates, V = np.linalg.eigh(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    gone = jnp.exp(-q[0] * jnp.outer(times, rates))
+    return (gone + q[1] / q[0] * (1 - gone) / rates[None]) @ (V.T @ np.ones(n) * V[-1])
+
+
+@pytest.mark.parametrize("n", [12, pytest.param(40, marks=pytest.mark.slow)])
+def test_many_states_have_the_derivatives_of_their_closed_form(n):
+    """The heat equation by lines."""
+
+    def conduct(t, x, p):
+        return p["k"] * (jnp.append(x[1:], 0.0) - 2.0 * x + jnp.append(0.0, x[:-1])) + p["c"]
+
+    times = np.linspace(0.05, 1.0, 8)
+    data = sf.Measurements(times, np.zeros((8, 1)), lambda t, x, p: x[-1:], sigma=1.0)
+    given = {"k": float(n**2), "c": 0.7}
+    problem = one_mode(conduct, np.ones(n), given, 1.0, data, engine="native", rtol=1e-10, atol=1e-12)
+    found = Evaluator(problem)(problem.initial_theta)
+    x, first, second = differentiate(lambda q: last_of_chain(n, times, q), problem.initial_theta)
+    assert found.cost == pytest.approx(0.5 * x @ x, rel=1e-8)
+    assert_close(found.gradient, x @ first, 1e-7)
+    assert_close(found.hessian, first.T @ first + np.einsum("k,kij->ij", x, second), 1e-6)
     this = case("mixed")
     arguments = this.arguments()
     native = native_experiment(this.structure, arguments, np.unique(np.asarray(arguments.nodes)), Order.HESSIAN)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import one_run, refused
+from models import first_state, one_run, refused, simulate_log
 
 import switchfit as sf
 from benchmarks.modes.truths import random_modes, three_modes
@@ -623,18 +623,13 @@ def test_costs_of_modes_with_corners_are_those_of_an_estimate():
     def brake(t, x, p):
         return jnp.stack([x[1], -p["b"] * jnp.sign(x[1])])
 
-    times, system = np.linspace(0.1, 10.0, 100), sf.HybridSystem({"drive": drive, "brake": brake}, [0.0, 0.0])
-
-    def pose(values, sequence, switches, a, b):
-        data = sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=0.02)
-        run = sf.Experiment(data, sequence, switches, 0.0, 10.0)
-        return sf.Problem(system, run, {"a": a, "b": sf.Parameter(b, lower=0.0)})
-
-    truth = ("drive", "brake", "drive", "brake")
-    exact = sf.simulate(pose(0.0 * times, truth, (2.0, 5.0, 7.0), 1.0, 0.8), times=times).states[:, 0]
-    values = exact + 0.02 * np.random.default_rng(0).normal(size=100)
-    search = sf.find_modes(pose(values, ("drive",), (), 1.2, 0.6), max_switches=4)
+    system = sf.HybridSystem({"drive": drive, "brake": brake}, [0.0, 0.0])
+    log, truth = sf.Measurements(TIMES[1:], np.zeros(80), first_state, sigma=0.02), ("drive", "brake") * 2
+    parameters = {"a": 1.2, "b": sf.Parameter(0.6, lower=0.0)}
+    given = simulate_log(one_run(system, log, truth, (2.0, 4.0, 6.0), 8.0, parameters), [2.0, 4.0, 6.0, 1.0, 1.1], 0)
+    search = sf.find_modes(given.with_sequences([("drive",)], [()]), max_switches=4)
     assert (search.status, search.mode_sequence) == (sf.ModeStatus.FOUND, truth)
     for fitted in search.fitted:
-        own = pose(values, fitted.sequences[0], fitted.transition_times[0], *fitted.parameters)
-        assert fitted.cost == pytest.approx(sf.evaluate(own).cost, rel=1e-6)
+        own = given.with_sequences(fitted.sequences, fitted.transition_times)
+        theta = np.concatenate([*fitted.transition_times, fitted.parameters])
+        assert fitted.cost == pytest.approx(sf.evaluate(own, theta).cost, rel=1e-6)

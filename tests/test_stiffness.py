@@ -7,6 +7,7 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 from test_implicit import SQUARE, robertson, van_der_pol
 from test_implicit import one_mode as stiff_mode
 
@@ -48,6 +49,20 @@ def test_the_mesh_is_that_of_the_stiff_solver(given):
     mesh, expected = (refine_mesh(p, 0, p.initial_theta) for p in (problem, stiff))
     np.testing.assert_array_equal(mesh.nodes, expected.nodes)
     assert evaluator_of(problem).cost(problem.initial_theta) == evaluator_of(stiff).cost(stiff.initial_theta)
+
+
+def test_robertsons_problem_agrees_with_scipy():
+    """Explicit steps at the limit of stability are wrong by 2e-5 on their own mesh."""
+    problem = one_mode(*ROBERTSON)
+
+    def slope(t, y):
+        return [*np.asarray(robertson(t, y[:3], ROBERTSON[2])), y[0] ** 2]
+
+    y = scipy.integrate.solve_ivp(slope, (0.0, 40.0), [1.0, 0, 0, 0], method="Radau", rtol=1e-9, atol=1e-12).y[:, -1]
+    cost = evaluator_of(problem).cost(problem.initial_theta)
+    assert cost == pytest.approx(y[3], rel=1e-7)
+    explicit = replace(problem, solver="explicit")
+    assert abs(evaluator_of(explicit).cost(problem.initial_theta) / y[3] - 1) > 1e-6
 
 
 def test_the_explicit_solve_is_given_up_once_it_is_clear_that_stability_limits_it(monkeypatch):
