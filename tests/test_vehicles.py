@@ -135,14 +135,14 @@ def test_differential_drive_turns_about_its_centers_of_rotation():
 
 @pytest.mark.parametrize(
     ("w", "kept"),
-    [((0.0, 40.0), 0.4), ((-40.0, 40.0), 0.4), ((20.0, 40.0), 0.8), ((-20.0, -40.0), 0.8), ((40.0, 40.0), 1.0)],
+    [((0.0, 40.0), 0.4), ((-40.0, 40.0), 0.4), ((20.0, 40.0), 0.8), ((-20.0, -40.0), 0.8), ((0.3, 0.3), 1.0)],
 )
 def test_wheels_that_are_dragged_sideways_lose_speed_forward(w, kept):
     """The yaw rate stays; a side that stands loses the whole share, half its speed a third of it, straight nothing."""
     p, x = {"y_l": 0.9, "y_r": -0.9, "x_v": -0.1, "loss": 0.6}, np.zeros(3)
     slip, plain = (differential_drive(turn_slip=loss).modes["slip"] for loss in ("loss", 0.0))
     with_loss, without = (evaluate(mode, x, p, np.array(w)) for mode in (slip, plain))
-    np.testing.assert_allclose(with_loss, without * [kept, 1.0, 1.0], rtol=0, atol=2e-2)
+    np.testing.assert_allclose(with_loss, without * [kept, 1.0, 1.0], rtol=0, atol=2e-3)
     assert evaluate(slip, x, p, np.zeros(2)) == pytest.approx([0.0, 0.0, 0.0])
     grip = differential_drive(turn_slip="loss").modes["grip"]
     np.testing.assert_allclose(evaluate(grip, x, {}, np.array(w))[0], 0.0825 * sum(w), rtol=1e-14)
