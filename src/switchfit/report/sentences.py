@@ -319,9 +319,9 @@ _ISSUES: dict[str, Sentence] = {
     "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
     "sigma too small": "The reduced chi-square is {chi-square:.3g}, not 1: sigma is too small, or the model misses "
-    "something (look at the residuals). If it is sigma, standard errors are too small by the root of that.",
+    "something (look at the residuals). If it is sigma, standard errors are {factor:.3g} times too small.",
     "sigma too large": "The reduced chi-square is {chi-square:.3g}, not 1: sigma is too large, or the samples were "
-    "smoothed before. If it is sigma, standard errors are too large by the root of that.",
+    "smoothed before. If it is sigma, standard errors are {factor:.3g} times too large.",
     "correlated residuals": "Neighbouring residuals are correlated in {correlated}: the {values:.0f} values are worth "
     "about {effective:.0f} independent ones, and standard errors are too small by a factor of up to {narrowing:.2g}.",
     "known to second order": "To first order the fitted values hardly depend on {names}: its standard errors are "

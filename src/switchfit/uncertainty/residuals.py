@@ -232,7 +232,8 @@ def find_residual_issues(fit: Fit) -> Iterator[Issue]:
     if fit.sigma_known and np.isfinite(variance):
         probability, is_size = compare_with_sigma(2 * fit.cost, fit.freedom)
         if probability < UNLIKELY or not is_size:
-            yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})
+            figures = {"chi-square": variance, "factor": max(variance, 1 / max(variance, 1e-300)) ** 0.5}
+            yield Issue("sigma too small" if variance > 1 else "sigma too large", figures=figures)
     if fit.sigma_known is not None:
         yield from diagnose(fit).issues
 
