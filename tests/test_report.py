@@ -224,6 +224,7 @@ FITS: dict[str, Fit] = {
     "an indefinite Hessian": made(hessian=np.diag([1.0, -4.0, 1.0]), status=Status.SADDLE),
     "a singular Hessian": made(**correlated(0.0), status=Status.SINGULAR),
     "a nearly singular Hessian": made(**correlated(1e-7)),
+    "stopped in a valley": made(**correlated(1e-7), status=Status.MAX_ITERATIONS),
     "an unknown that is not determined": made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR),
     "called like a time": made(**HEATED, **correlated(1e-3), parameter_units={"tau_heat": ""}),
     "idle, and called like a time": made(**HEATED, idle=("tau_heat",), parameter_units={"tau_heat": ""}),

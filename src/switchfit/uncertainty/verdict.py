@@ -484,7 +484,12 @@ def _find_ending(fit: Fit) -> Iterator[Finding]:
         subjects = (*subjects, fit.reason.kind, *fit.reason.subjects)
         figures |= fit.reason.figures
         steps = SEARCH_FAILED.get(fit.reason.kind, ("more starts",))
-    yield Finding("bad", Issue("not converged", subjects, figures), steps)
+    smallest, names = _find_weakest(fit)
+    if fit.status is Status.MAX_ITERATIONS and abs(smallest) < BARELY_DETERMINED:  # it creeps along a valley
+        yield Finding("bad", Issue("not converged", subjects, figures))
+        yield Finding("doubtful", Issue("not determined", names, {"eigenvalue": smallest}), (FIX, *steps[:1]))
+    else:
+        yield Finding("bad", Issue("not converged", subjects, figures), steps)
 
 
 def _find_collapsed(fit: Fit) -> Iterator[Finding]:
