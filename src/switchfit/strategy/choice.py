@@ -27,7 +27,7 @@ from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_callable, as_choice, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
-from switchfit.strategy.hops import can_reinsert, find_far_minima, look_beyond_corners, reinsert_modes
+from switchfit.strategy.hops import can_reinsert, find_far_minima, look_beyond_corners, look_near, reinsert_modes
 from switchfit.strategy.known_order import explain_no_beam, find_times
 from switchfit.strategy.starts import (
     End,
@@ -310,6 +310,7 @@ def find_other_minima(fit: Estimate, *, in_times: bool = True) -> list[FloatArra
         return []
     try:
         hops = find_far_minima(evaluator, fit.theta, fit.cost, fit.standard_errors) if in_times else []
+        hops += look_near(evaluator, fit.theta, fit.cost, fit.standard_errors)
         if hops or evaluator.problem.constraint_names:
             return hops
         return look_beyond_corners(evaluator, fit.theta, fit.cost, fit.covariance)

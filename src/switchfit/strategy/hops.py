@@ -65,6 +65,9 @@ minimum is above the cost below which the error of J there makes no difference."
 SCAN_STEP = 1 / 40
 """Largest distance of two places, as a part of the horizon: others may be narrow. A scan from a kink begins with it."""
 
+NEAR = 5.0
+"""Standard errors of a time within which another sample interval has to begin, if a minimum in it may be lower."""
+
 BEYOND = (2.0, 4.0)
 """Standard errors from a minimum, along each unknown with the others following, at which other paths are looked for. Of
 48 fits of a pendulum with dry friction 10 ended 0.6 to 2.8 above another minimum, which these found in all cases."""
@@ -100,7 +103,11 @@ def is_lower(cost: float, than: float) -> bool:
 
 
 def choose_hops(
-    evaluator: Evaluator, theta: FloatArray, cost: float, free: NDArray[np.bool_] | None = None
+    evaluator: Evaluator,
+    theta: FloatArray,
+    cost: float,
+    free: NDArray[np.bool_] | None = None,
+    reach: FloatArray | None = None,
 ) -> list[FloatArray]:
     """Return starts in sample intervals near by where J may be lower than the cost at theta, the best first.
 
@@ -111,16 +118,38 @@ def choose_hops(
     cost : float
     free : (d,) bool, optional
         Unknowns that may move; those at a bound do not.
+    reach : (d,), optional
+        Largest distance of an interval from a time; any if left out.
     """
     unknowns = evaluator.problem.unknowns
+    far = np.full(len(theta), np.inf) if reach is None else reach
     intervals = [
-        list(_list_intervals(run, unknowns.times[e], list_sample_times(run), theta))
+        [
+            (place, low, high)
+            for place, low, high in _list_intervals(run, unknowns.times[e], list_sample_times(run), theta)
+            if max(low - theta[place], theta[place] - high) <= far[place]
+        ]
         for e, run in enumerate(evaluator.problem.experiments)
     ]
     hops = _list_hops(evaluator, theta, intervals, np.ones(len(theta), bool) if free is None else free)
     near = sorted(hops, key=lambda hop: hop[0])[:MOST]
     again = [find_lowest(start) for lowest, start, find_lowest in near if np.isfinite(lowest)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
+
+
+def look_near(evaluator: Evaluator, theta: FloatArray, cost: float, errors: FloatArray) -> list[FloatArray]:
+    """Return starts in sample intervals beside a minimum where J may be lower by more than noise hides, the best first.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+        A minimum.
+    cost : float
+    errors : (d,)
+        Standard errors; 0 of unknowns that are held, as by a kink.
+    """
+    return choose_hops(evaluator, theta, cost - WORTH, errors > 0.0, np.where(errors > 0.0, NEAR * errors, np.inf))
 
 
 def find_far_minima(evaluator: Evaluator, theta: FloatArray, cost: float, errors: FloatArray) -> list[FloatArray]:
