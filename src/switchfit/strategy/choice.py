@@ -42,7 +42,7 @@ from switchfit.strategy.starts import (
     try_starts,
 )
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
-from switchfit.uncertainty.residuals import UNLIKELY, compare_with_sigma
+from switchfit.uncertainty.residuals import CLEARLY_OFF, UNLIKELY, compare_with_sigma
 from switchfit.uncertainty.verdict import NEARLY_ALL, find_without_effect
 
 MORE_STARTS = "next: more starts"
@@ -137,6 +137,29 @@ def is_explained(problem: Problem, cost: float, least: float = UNLIKELY) -> bool
     return freedom > 0 and bool(compare_with_sigma(2 * cost, freedom)[0] >= least)
 
 
+def is_shallow(problem: Problem, fit: Estimate) -> bool:
+    """Return whether chi-square may hide that a transition of a good fit is in the wrong place: J does not rise by a
+    large multiple of what it hides before the time is half through the shorter mode beside it.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : Estimate
+    """
+    if not (problem.is_sigma_known and problem.is_least_squares):
+        return False
+    # J is accepted up to this above its mean, freedom / 2, and the lowest may be two standard deviations below it.
+    hidden = 0.5 * CLEARLY_OFF * fit.freedom + 2 * np.sqrt(0.5 * fit.freedom)
+    for e, run in enumerate(problem.experiments):
+        places = problem.unknowns.times[e]
+        modes = np.diff(run.ends_of_modes(np.where(places >= 0, fit.theta[places], run.initial_times)))
+        for i in np.flatnonzero(places[: len(modes) - 1] >= 0).tolist():
+            half, error = 0.5 * min(modes[i], modes[i + 1]), fit.standard_errors[places[i]]
+            if not error > 0.0 or not 0.5 * (half / error) ** 2 > DEEP * hidden:
+                return True
+    return False
+
+
 def is_doubted(fit: Estimate) -> bool:
     """Return whether a better end may be elsewhere, by what the verdict says.
 
@@ -165,6 +188,9 @@ MOST_LEFT = 4
 
 MORE = "more iterations"
 """Name of what is no search: a fit that has not converged goes on."""
+
+DEEP = 20.0
+"""Multiple of what chi-square hides by which J rises at least around a time that is in no doubt."""
 
 LEAST_TIME, TIMES_LOCAL = 2.0, 20.0
 """Seconds that searches take at most where no budget is given, or so many times what the first fit took."""
@@ -285,16 +311,17 @@ def estimate(
                 raise
             failure = error
         others: list[FloatArray] = []
-        is_over = strategy == "local"
+        is_over, is_settled = strategy == "local", False
         if best is not None and strategy == "auto":
             only_few = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # were asked for
             is_over = hessian != "auto" or only_few
             if not is_over and is_enough(problem, best):
                 others = find_other_minima(best)
-                is_over = not others
+                is_settled = not is_shallow(problem, best) or bool(explain_no_beam(problem))
+                is_over = is_settled and not others
         if best is not None and is_over:
             return best
-        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, others)
+        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, others, is_settled)
         search.run(callback, budget, compiled)
         if failure is not None and search.best is None:
             raise failure
@@ -356,6 +383,7 @@ class Search:
     began: float
     line: Line
     others: Sequence[FloatArray] = ()
+    is_settled: bool = False
     starts: Starts | None = None
     running: ClassVar[int] = 0
 
@@ -372,7 +400,7 @@ class Search:
         """
         Search.running += 1
         try:
-            strategies = [] if self.others else self._list_strategies()  # compiles
+            strategies = [] if self.is_settled else self._list_strategies()  # compiles
             took = self.steps[0].seconds - compiled
             most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * took)
             with limit_time(most if budget is None else budget - (time.perf_counter() - self.began), callback):

@@ -52,6 +52,12 @@ MOST = 4
 """Intervals, those with the lowest models, of which a second model is made, about the minimum of the first. That about
 the middle of an interval errs by 1e-4 of J: of five fits that began there with ten joint tosses, one lowered J."""
 
+INSIDE = 1e-3
+"""Least distance of a start from the ends of its interval, as a part of the interval."""
+
+DOUBTED = 1e-3
+"""Part of J by which the first model may be above it for a second one."""
+
 ROUNDS = 12
 
 SCAN_FIRST, SCAN_RATIO = 3.0, 1.6
@@ -65,7 +71,7 @@ minimum is above the cost below which the error of J there makes no difference."
 SCAN_STEP = 1 / 40
 """Largest distance of two places, as a part of the horizon: others may be narrow. A scan from a kink begins with it."""
 
-NEAR = 5.0
+NEAR = 3.0
 """Standard errors of a time within which another sample interval has to begin, if a minimum in it may be lower."""
 
 BEYOND = (2.0, 4.0)
@@ -133,7 +139,7 @@ def choose_hops(
     ]
     hops = _list_hops(evaluator, theta, intervals, np.ones(len(theta), bool) if free is None else free)
     near = sorted(hops, key=lambda hop: hop[0])[:MOST]
-    again = [find_lowest(start) for lowest, start, find_lowest in near if np.isfinite(lowest)]
+    again = [find_lowest(start) for lowest, start, find_lowest in near if lowest < cost + DOUBTED * abs(cost)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
 
 
@@ -237,7 +243,8 @@ def _find_lowest(
         gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
         np.add.at(gradient, mine, (there.gradient - here.gradient)[own] + curvature @ away)
         np.add.at(hessian, (mine[:, None], mine), curvature - here.hessian[own[:, None], own])
-        found = _minimize(gradient, hessian, free, place, low - theta[place], high - theta[place])
+        inside = INSIDE * (high - low)  # where a reset map acts, J at the end is that of the next interval
+        found = _minimize(gradient, hessian, free, place, low + inside - theta[place], high - inside - theta[place])
         if found is not None:
             return float(cost + found[0]), theta + found[1]
     return np.inf, theta
