@@ -81,6 +81,10 @@ BEYOND = (2.0, 4.0)
 WORTH = 0.1
 """By how much J has to be lower on another path for a fit: the data cannot tell less, and the model errs as much."""
 
+MATRICES: tuple[Matrix, ...] = ("exact", "gauss-newton")
+"""Of models far from a minimum: the second where the first leads to none, since residuals are large at first, and so is
+their part of the exact Hessian."""
+
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
 
@@ -175,8 +179,7 @@ def find_far_minima(evaluator: Evaluator, theta: FloatArray, cost: float, errors
     runs = range(len(problem.experiments))
     dips = sorted((cost, e, interval) for e in runs for cost, interval in _scan(evaluator, e, theta, errors))[:DIPS]
     intervals = [[interval for _, run, interval in dips if run == e] for e in runs]
-    # Far away residuals are large at first, and so is their part of the exact Hessian.
-    for lowest, start, find_lowest in _list_hops(evaluator, theta, intervals, errors > 0.0, "gauss-newton"):
+    for lowest, start, find_lowest in _list_hops(evaluator, theta, intervals, errors > 0.0, MATRICES):
         for _ in range(MODELS):
             point = make_feasible(problem, start)
             there = evaluator.cost(point)
@@ -194,13 +197,13 @@ def _list_hops(
     theta: FloatArray,
     intervals: Sequence[list[tuple[int, float, float]]],
     free: NDArray[np.bool_],
-    otherwise: Matrix = "exact",
+    matrices: Sequence[Matrix] = MATRICES[:1],
 ) -> Iterator[tuple[float, FloatArray, FindLowest]]:
     """Yield for each of some intervals of each run the lowest J of the quadratic model about its middle, theta there,
     and a function that returns both of the model about another point.
 
     The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
-    point; with the matrix `otherwise` where its exact Hessian leads to no minimum.
+    point, with the first of some matrices that leads to a minimum.
     """
     if not any(intervals):
         return
@@ -209,7 +212,7 @@ def _list_hops(
     for e, listed in enumerate(intervals):
         here = _evaluate_run(evaluator, e, theta) if listed else whole
         for place, low, high in listed:
-            model = partial(_find_lowest, evaluator, e, whole, here, theta, free, otherwise, place, low, high)
+            model = partial(_find_lowest, evaluator, e, whole, here, theta, free, matrices, place, low, high)
             middle = theta.copy()
             middle[place] = 0.5 * (low + high)
             yield *model(middle), model
@@ -222,7 +225,7 @@ def _find_lowest(
     here: Evaluation[FloatArray],
     theta: FloatArray,
     free: NDArray[np.bool_],
-    otherwise: Matrix,
+    matrices: Sequence[Matrix],
     place: int,
     low: float,
     high: float,
@@ -234,7 +237,7 @@ def _find_lowest(
     check_time()
     own, mine = evaluator.problem.own_places[e]
     side, away = 1 if point[place] < high else -1, (theta - point)[mine]
-    for matrix in dict.fromkeys(("exact", otherwise)):
+    for matrix in matrices:
         there = _evaluate_run(evaluator, e, point, side, matrix)
         if not np.isfinite(there.hessian).all():
             break
@@ -343,12 +346,16 @@ def look_beyond_corners(
                 point = make_feasible(evaluator.problem, point)
                 if not np.isfinite(evaluator.cost(point)):
                     break
-                if evaluator.paths != path:
-                    there = evaluator(point)
+                if evaluator.paths == path:
+                    continue
+                for matrix in MATRICES:
+                    there = evaluator(point, matrix=matrix)
                     found = _minimize(there.gradient, there.hessian, errors > 0.0, int(place), -np.inf, np.inf)
-                    if found is not None and there.cost + found[0] < cost - WORTH:
-                        models.append((there.cost + found[0], point + found[1]))
-                    break
+                    if found is not None:
+                        break
+                if found is not None and there.cost + found[0] < cost - WORTH:
+                    models.append((there.cost + found[0], point + found[1]))
+                break
     return [start for _, start in sorted(models, key=lambda model: model[0])[:MOST]]
 
 
