@@ -246,8 +246,10 @@ def estimate(
         Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
     time_budget : float, optional
         Seconds after which strategies end, at the next evaluation of J. The fit from the first guess is made in any
-        case, and so is the one that ends the search. Left out, strategies take at most 2 s after it, or 20 times what
-        it took, beside the compilation of their programs; "thorough" as long as they need.
+        case, and so is the one that ends the search. With it, "auto" tries all strategies as long as a better end may
+        be elsewhere. Left out, it also ends with the first that finds nothing lower, and strategies take at most 2 s
+        after the fit, or 20 times what it took, beside the compilation of their programs; "thorough" as long as they
+        need.
 
     Returns
     -------
@@ -341,7 +343,7 @@ def find_other_minima(fit: Estimate, *, in_times: bool = True) -> list[FloatArra
         if hops or evaluator.problem.constraint_names:
             return hops
         return look_beyond_corners(evaluator, fit.theta, fit.cost, fit.covariance)
-    except (KeyboardInterrupt, NotIntegrableError):  # the fit stays
+    except (KeyboardInterrupt, NotIntegrableError, OutOfTimeError):  # the fit stays
         return []
 
 
@@ -385,6 +387,7 @@ class Search:
     others: Sequence[FloatArray] = ()
     is_settled: bool = False
     starts: Starts | None = None
+    has_budget: bool = False
     running: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
@@ -399,6 +402,7 @@ class Search:
         first fit has taken, the seconds in which programs were compiled do not count.
         """
         Search.running += 1
+        self.has_budget = budget is not None
         try:
             strategies = [] if self.is_settled else self._list_strategies()  # compiles
             took = self.steps[0].seconds - compiled
@@ -526,5 +530,7 @@ class Search:
         if self.best is None:
             return ended != "interrupted"
         looked = self.steps[:1] if name == MORE else self.steps  # which goes on from where the fit ended
-        is_settled = self.strategy == "auto" and is_enough(self.problem, self.best, looked)
+        # Who gives seconds wants them used as long as a better end may be elsewhere.
+        goes_on = self.has_budget and is_doubted(self.best)
+        is_settled = self.strategy == "auto" and is_enough(self.problem, self.best, looked) and not goes_on
         return not (is_settled or was_interrupted(self.best) or ended == "interrupted")
