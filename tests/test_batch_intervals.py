@@ -35,6 +35,7 @@ def check_same(problems, level):
         single = sf.estimate(problem, strategy="local", start=many.theta[k])
         expected = single.confidence_intervals(level)
         np.testing.assert_allclose(many.theta[k], single.theta, rtol=1e-5)
+        np.testing.assert_allclose(many.standard_errors[k], single.standard_errors, rtol=1e-3)
         length = np.nan_to_num(expected[:, 1] - expected[:, 0], nan=1.0)[:, None]
         np.testing.assert_allclose(found[k] / length, expected / length, atol=1e-4, rtol=0, err_msg=f"fit {k}")
     return many
@@ -48,9 +49,6 @@ def test_intervals_are_those_of_single_fits(tau, rate_known, level):
     many = check_same(problems, level)
     if tau == 2.0:
         assert (many.status == "CONVERGED_AT_KINK").any()
-    if tau != 2.05:
-        plain = many.theta[:, 0] + 1.96 * many.standard_errors[:, 0]
-        assert np.max(np.abs(many.confidence_intervals()[:, 0, 1] - plain)) > 1e-3  # it matters
 
 
 def leaky(seed, scale):

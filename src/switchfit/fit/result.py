@@ -770,7 +770,8 @@ def measure_kink_variance(slopes: FloatArray, curvatures: FloatArray) -> FloatAr
         Z = sqrt(pi / 2 s) erfcx(u / sqrt(2)),     M1 = (1 - g Z) / s,     M2 = (Z - g M1) / s,                      (1)
 
     M1 and M2 by parts, from s x exp(-J) = -d exp(-J) / dx - g exp(-J). Without curvature Z = 1 / g and M2 = 2 / g^3.
-    The result is (M2 + M2) / (Z + Z) of both sides; 0 where it is not finite, as without a slope and a curvature.
+    The result is (M2 + M2) / (Z + Z) of both sides. It is 0, the unknown stays held, where there is no slope and no
+    curvature, and where J falls again before it has risen by 1/2: g x + s x^2 / 2 has its maximum -g^2 / 2 s.
 
     Parameters
     ----------
@@ -786,7 +787,8 @@ def measure_kink_variance(slopes: FloatArray, curvatures: FloatArray) -> FloatAr
         steep = ~(u < STEEP)
         Z, M2 = np.where(steep, 1.0 / g, Z), np.where(steep, 2.0 / g**3, M2)
         variances = M2.sum(axis=1) / Z.sum(axis=1)
-    return np.where(np.isfinite(variances), variances, 0.0)
+    falls = (g**2 < -s).any(axis=1)
+    return np.where(np.isfinite(variances) & ~falls, variances, 0.0)
 
 
 def moves_by_itself(basis: FloatArray) -> NDArray[np.bool_]:

@@ -260,7 +260,9 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
             value, relative = format_time(fit.theta[i], run, errors[i]), ""
         low, high = (format_end(end, wide[i], run) for end in wide[i])
         sides = np.sort(np.abs(wide[i] - fit.theta[i]))
-        apart = name in kinks or not errors[i] > 0 or sides[1] > ONE_SIDED * sides[0]
+        # At a kink a profile may be narrower than the standard error says.
+        usual = fit.quantile(0.95) * errors[i] if name in kinks and errors[i] > 0 else sides[0]
+        apart = not errors[i] > 0 or max(sides[1], usual) > ONE_SIDED * min(sides[0], usual)
         sided = i in joins and sides[0] > 0 and apart
         within = f"95 % in [{low}, {high}]" if high and (sided or name in fit.log_scaled) and not ends else ""
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
