@@ -243,7 +243,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
     "kinks": {
         "what follows a kink": swap("fit/result.py", "+ follow @ V @ follow.T", "+ 0.0 * follow @ V @ follow.T"),
         "second moment": swap("fit/result.py", "(Z - g * (1.0 - g * Z) / s) / s", "(Z + g * (1.0 - g * Z) / s) / s"),
-        "slopes in units of the noise": swap("fit/result.py", " / np.sqrt(scale)", ""),
     },
     "other minima": {
         "points on the same path": swap(HOPS, "if evaluator.paths != path:", "if evaluator.paths == path:"),

@@ -270,7 +270,5 @@ def test_the_kinks_of_samples_with_a_delay_are_where_the_state_was_measured(dela
 def test_intervals_cover_a_transition_on_beside_and_between_samples(tau, rate_known):
     """Three standard errors of 2000 logs are 1.5 %."""
     found = coverage.measure_coverage(tau, 2000, rate_known=rate_known)
-    assert abs(found.piecewise - 0.95) < 0.015
-    assert abs(found.many - 0.95) < 0.015
-    assert abs(found.exact - 0.95) < 0.015
+    np.testing.assert_allclose([found.piecewise, found.many, found.exact], 0.95, rtol=0, atol=0.015)
     assert (found.quadratic < 0.9) == (tau == 2.01)

@@ -80,8 +80,7 @@ def measure_moment(left, right, curvature):
     """The second moment of exp(-g |x| - s x^2 / 2), g being the slope to each side."""
 
     def integrate(power, g):
-        far = 60.0 / max(g, curvature**0.5)
-        return quad(lambda x: x**power * np.exp(-g * x - curvature * x**2 / 2), 0.0, far, epsabs=0.0)[0]
+        return quad(lambda x: x**power * np.exp(-g * x - curvature * x**2 / 2), 0.0, np.inf, epsabs=0.0)[0]
 
     return sum(integrate(2, g) for g in (left, right)) / sum(integrate(0, g) for g in (left, right))
 
@@ -94,19 +93,17 @@ def test_the_variance_at_a_kink_is_the_second_moment_of_its_density():
     np.testing.assert_allclose(measure_kink_variance(np.array(slopes), curvatures), [*expected, 0.0, 0.0], rtol=1e-5)
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.3])
-def test_what_follows_unknowns_at_kinks_is_as_uncertain(scale):
+@pytest.mark.parametrize(("scale", "left", "right"), [(1.0, 0.5, 3.0), (0.3, 0.5, 3.0), (1.0, 0.0, 0.0)])
+def test_what_follows_unknowns_at_kinks_is_as_uncertain(scale, left, right):
     """The inverse is that of H with 1 / v in place of the curvatures along kinks; without slopes it is that of H."""
     root = np.random.default_rng(0).standard_normal((8, 5))
     H, inverse, held, free = root.T @ root, np.zeros((5, 5)), [3, 1], np.ix_([0, 2, 4], [0, 2, 4])
     inverse[free] = np.linalg.inv(H[free])
     curvatures, stiffer = np.diag(np.linalg.inv(np.linalg.inv(H)[np.ix_(held, held)])), H.copy()
     for place, s in zip(held, curvatures, strict=True):
-        stiffer[place, place] += scale / measure_moment(0.5 / scale, place / scale, s / scale) - s
-    found = free_kinks(inverse, H, [(place, -0.5, place) for place in held], scale)
+        stiffer[place, place] += scale / measure_moment(left / scale, place * right / scale, s / scale) - s
+    found = free_kinks(inverse, H, [(place, -left, place * right) for place in held], scale)
     np.testing.assert_allclose(found, np.linalg.inv(stiffer), rtol=1e-9)
-    smooth = free_kinks(inverse, H, [(place, 0.0, 0.0) for place in held], scale)
-    np.testing.assert_allclose(smooth, np.linalg.inv(H), rtol=1e-9)
 
 
 def test_no_covariance_of_another_kind():
