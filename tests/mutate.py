@@ -55,6 +55,7 @@ TESTS = {
     ],
     "online": [["tests/test_online.py"]],
     "design": [["tests/test_design.py"]],
+    "kinks": [["tests/test_uncertainty.py", "-k", "kink"]],
     "other minima": [["tests/test_strategy.py", "-k", "a_minimum"]],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
@@ -238,6 +239,10 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             "self._named[name][:] = which",
             "self._named[name][:] = which if name == 'modes' else -1",
         ),
+    },
+    "kinks": {
+        "what follows a kink": swap("fit/result.py", "+ follow @ V @ follow.T", "+ 0.0 * follow @ V @ follow.T"),
+        "second moment": swap("fit/result.py", "(Z - g * (1.0 - g * Z) / s) / s", "(Z + g * (1.0 - g * Z) / s) / s"),
     },
     "other minima": {
         "points on the same path": swap(HOPS, "if evaluator.paths != path:", "if evaluator.paths == path:"),

@@ -107,14 +107,16 @@ def test_a_transition_that_ends_at_a_sample_is_reported_as_a_kink(guess):
     data = sf.Measurements([0.5, 0.8, 1.0], [-1.0, 0.5, 0.6], sigma=1.0)
     found = sf.estimate(sf.Problem(models.LATE_RAMP, sf.Experiment(data, ("wait", "ramp"), (guess,), 0.0, 1.0)))
     assert found.status is sf.Status.CONVERGED_AT_KINK
-    assert found.success
-    assert found.theta[0] == 0.5
     (kink,) = found.kinks
-    assert (kink.unknown, kink.value) == ("tau_1", 0.5)
+    assert (kink.unknown, kink.value, found.theta[0]) == ("tau_1", 0.5, 0.5)
     assert (kink.left, kink.right) == pytest.approx((-0.7, 0.3), rel=1e-9)
     assert "kink of the cost: tau_1 = 0.5, where the derivative jumps from -7.0e-01 to 3.0e-01" in found.message
     assert found.optimality < 1e-12
-    assert found.standard_errors[0] == 0.0
+    # Of exp(-0.7 |x| - x^2) and exp(-0.3 x - x^2).
+    assert found.standard_errors[0] == pytest.approx(0.6212692, rel=1e-6)
+    assert found.covariance_from("gauss-newton") == pytest.approx(found.covariance)
+    assert np.isfinite(found.confidence_intervals(hessian="sandwich")).all()
+    assert replace(found, constraints=(("guard", 0.0, 1.0),)).covariance == found.held_covariance == 0.0
 
 
 @pytest.mark.parametrize("seed", [0, 8])

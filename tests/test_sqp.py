@@ -165,8 +165,7 @@ def test_absolute_value_ends_exactly_on_its_kink(start, curvature, hessian):
     assert result.optimality == 0.0
     assert result.iterations <= 60
     ((_, left, right),) = result.kinks
-    assert left == pytest.approx(-1.0 + 0.7 * curvature)
-    assert right == pytest.approx(1.0 + 0.7 * curvature)
+    assert (left, right) == pytest.approx((-1.0 + 0.7 * curvature, 1.0 + 0.7 * curvature))
 
 
 @pytest.mark.parametrize(("weight", "status"), [(1e-7, Status.SINGULAR), (1e-3, Status.CONVERGED_AT_KINK)])

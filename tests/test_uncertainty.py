@@ -9,6 +9,7 @@ import pytest
 import scipy.signal
 import scipy.stats
 from models import STILL, VEHICLE_TRUTH, curve, drive, one_run, positions
+from scipy.integrate import quad
 from test_report import comparison_of, made, trajectory_of, warnings_of
 from test_report import write_report as report
 
@@ -16,7 +17,7 @@ import switchfit as sf
 from benchmarks import vehicle_coverage
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.result import disagreement
+from switchfit.fit.result import disagreement, free_kinks, measure_kink_variance
 from switchfit.models import heater_problem, lugre
 from switchfit.optimize import Status
 from switchfit.uncertainty.certificate import LARGEST_GAP, Identifiability, analyse, certify, measure_derivative_gap
@@ -73,6 +74,36 @@ def test_the_factor_between_the_covariances_goes_either_way(part):
 def test_what_no_sample_shows_to_first_order_is_not_hidden_by_rounding():
     hessian, unseen = np.array([[100.0, 60.0, 0.0], [60.0, 400.0, 0.0], [0.0, 0.0, 900.0]]), np.diag([1.0, 1e-11, 1.0])
     assert disagreement(made(hessian=hessian, saved_gauss_newton=unseen @ hessian @ unseen)).factor > 1e10
+
+
+def measure_moment(left, right, curvature):
+    """The second moment of exp(-g |x| - s x^2 / 2), g being the slope to each side."""
+
+    def integrate(power, g):
+        return quad(lambda x: x**power * np.exp(-g * x - curvature * x**2 / 2), 0.0, np.inf, epsabs=0.0)[0]
+
+    return sum(integrate(2, g) for g in (left, right)) / sum(integrate(0, g) for g in (left, right))
+
+
+def test_the_variance_at_a_kink_is_the_second_moment_of_its_density():
+    """The last are a steep one, one without curvature, jumps of J, and a J that falls again at once."""
+    slopes = [[1.0, 2.0], [0.0, 5.0], [30.0, 0.1], [0.0, 0.0], [99.0, 0.5], [2.0, 7.0], [np.inf, np.inf], [1e-9, 150.0]]
+    curvatures = np.array([3.0, 0.4, 2.0, 4.0, 1e-2, 0.0, 1.0, -4.0])
+    expected = [measure_moment(*g, s) for g, s in zip(slopes[:-2], curvatures[:-2], strict=True)]
+    np.testing.assert_allclose(measure_kink_variance(np.array(slopes), curvatures), [*expected, 0.0, 0.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("scale", "left", "right"), [(1.0, 0.5, 3.0), (0.3, 0.5, 3.0), (1.0, 0.0, 0.0)])
+def test_what_follows_unknowns_at_kinks_is_as_uncertain(scale, left, right):
+    """The inverse is that of H with 1 / v in place of the curvatures along kinks; without slopes it is that of H."""
+    root = np.random.default_rng(0).standard_normal((8, 5))
+    H, inverse, held, free = root.T @ root, np.zeros((5, 5)), [3, 1], np.ix_([0, 2, 4], [0, 2, 4])
+    inverse[free] = np.linalg.inv(H[free])
+    curvatures, stiffer = np.diag(np.linalg.inv(np.linalg.inv(H)[np.ix_(held, held)])), H.copy()
+    for place, s in zip(held, curvatures, strict=True):
+        stiffer[place, place] += scale / measure_moment(left / scale, place * right / scale, s / scale) - s
+    found = free_kinks(inverse, H, [(place, -left, place * right) for place in held], scale)
+    np.testing.assert_allclose(found, np.linalg.inv(stiffer), rtol=1e-9)
 
 
 def test_no_covariance_of_another_kind():

@@ -256,20 +256,6 @@ def test_the_error_of_a_time_is_corrected_by_its_own_run():
     np.testing.assert_allclose(factors[2:], factors[1], rtol=1e-14)
 
 
-# --- modes, bounds, directions, kinks ---------------------------------------------------------------------------------
-
-
-def test_a_kink_is_a_note_and_no_doubt():
-    """The ramp ends at a sample whose noise holds the time there."""
-    times, held = np.linspace(0.25, 6.0, 24), sf.Parameter(0.5, fixed=True)
-    for seed in range(20):
-        fit = rooms(times, [temperature(times, 3.0, 2.0, 0.5) + noise(0.05, 24, seed)], 0.05, k=held)
-        if fit.kinks:
-            break
-    assert (fit.verdict.level, kinds(fit)) == ("good", ["fits", "at kinks"])
-    assert str(fit.verdict).endswith("; tau_1 at a kink of the cost.")
-
-
 # --- integration, derivatives, starts ---------------------------------------------------------------------------------
 
 

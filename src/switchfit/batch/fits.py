@@ -101,6 +101,8 @@ class Fits(Ends, Tabular, Displayed):
         A sentence with a remedy where a fit is not an ordinary minimum, otherwise empty.
     free : (R,) int
         Directions that constraints and kinks leave free.
+    kinks : (R, d, 2)
+        Derivatives of J to the left and right of an unknown that ended at a kink; 0 for others.
     covariance : (R, d, d)
         As `Estimate.covariance`; NaN where the cost has no noise model.
     samples : (R,) int
@@ -213,7 +215,7 @@ class Fits(Ends, Tabular, Displayed):
         """Return intervals theta +- quantile x standard error of each fit: (R, d, 2).
 
         Of a transition time with a few samples near, or at a kink, the profile is followed from sample to sample, as by
-        `Estimate.confidence_intervals`. NaN for any other unknown that is held.
+        `Estimate.confidence_intervals`. NaN for an unknown that is held by a bound or a collapsed mode.
 
         See Also
         --------

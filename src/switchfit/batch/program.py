@@ -39,7 +39,7 @@ from switchfit.engine.native.engine import places_in_library
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.result import Fit, Kink, Termination, inverse_on, termination_of
+from switchfit.fit.result import Fit, Kink, Termination, free_kinks, inverse_on, list_kinks, termination_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Result, Status
 from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, Task, minimize_traced
@@ -273,9 +273,12 @@ class Ends:
     message : (R,) str
         Empty where the status is CONVERGED without an active constraint; the error of a fit that ended with one.
     free : (R,) int
-        Directions that constraints and kinks leave free; the covariance is of these.
+        Directions that constraints and kinks leave free.
+    kinks : (R, d, 2)
+        Derivatives of J to the left and right of an unknown that ended at a kink; 0 for others.
     covariance : (R, d, d)
-        ``Z (Z' H Z)^-1 Z'`` on the free directions Z, not yet scaled; NaN where it is not positive definite.
+        ``Z (Z' H Z)^-1 Z'`` on the free directions Z, later with those at kinks, not yet scaled; NaN where it is not
+        positive definite.
     """
 
     theta: FloatArray
@@ -288,7 +291,13 @@ class Ends:
     status: NDArray[np.str_]
     message: NDArray[np.str_]
     free: NDArray[np.int64]
+    kinks: FloatArray
     covariance: FloatArray
+
+    @property
+    def at_kink(self) -> NDArray[np.bool_]:
+        """Which unknowns ended at a kink: (R, d)."""
+        return self.kinks[:, :, 0] < self.kinks[:, :, 1]
 
 
 class Chunk(Ends):
@@ -300,12 +309,11 @@ class Chunk(Ends):
         found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
         R, d = outcome.theta.shape
         texts: list[NDArray[Any]] = [np.full(R, text, dtype=object) for text in (Status.CONVERGED.name, "")]
-        return cls(
-            **found, status=texts[0], message=texts[1], free=np.full(R, d), covariance=np.full((R, d, d), np.nan)
-        )
+        unknown, kinks = np.full((R, d, d), np.nan), np.zeros((R, d, 2))
+        return cls(**found, status=texts[0], message=texts[1], free=np.full(R, d), kinks=kinks, covariance=unknown)
 
-    def replace_fit(self, k: int, found: Result | Fit, message: str) -> None:
-        """Replace the k-th fit by another one; iterations and evaluations of both are added."""
+    def replace_fit(self, k: int, found: Result | Fit, kinks: Sequence[tuple[int, float, float]], message: str) -> None:
+        """Replace the k-th fit by another one, with its kinks; iterations and evaluations of both are added."""
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
             getattr(self, name)[k] = getattr(found, name)
         self.iterations[k] += found.iterations
@@ -313,6 +321,14 @@ class Chunk(Ends):
         self.status[k], self.message[k] = found.status.name, message
         self.free[k] = found.free_basis.shape[1]
         self.covariance[k] = inverse_on(found.free_basis, found.hessian)
+        self.kinks[k] = 0.0
+        for place, left, right in kinks:
+            self.kinks[k, place] = left, right
+
+    def free_kinks(self, k: int, scale: float) -> None:
+        """Let the unknowns at kinks of the k-th fit have variances; `scale`: that of its covariance."""
+        kinks = [(place, *self.kinks[k, place].tolist()) for place in np.flatnonzero(self.at_kink[k]).tolist()]
+        self.covariance[k] = free_kinks(self.covariance[k], self.hessian[k], kinks, scale)
 
     def set_error(self, k: int, error: BaseException) -> None:
         """Say that the k-th fit ended with an error."""
@@ -396,7 +412,7 @@ class Batch:
     def replace_fit(self, chunk: Chunk, k: int, again: Estimate) -> None:
         """Replace the k-th fit by an estimate, on meshes of its own."""
         ordinary = again.status is Status.CONVERGED and not again.active
-        chunk.replace_fit(k, again, "" if ordinary else again.message)
+        chunk.replace_fit(k, again, list_kinks(again), "" if ordinary else again.message)
         self.own[k] = again.evaluator_at_solution
 
     def evaluate(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
@@ -479,6 +495,8 @@ class Batch:
         hessians = np.where(either, np.eye(held.shape[1]), chunk.hessian[settled])
         chunk.covariance[settled] = np.linalg.inv(hessians) * ~either
         chunk.free[settled] -= held[settled].sum(axis=1)
+        sides = np.stack([outcome.left, outcome.gradient], axis=2)
+        chunk.kinks[:] = np.where((held & settled[:, None])[:, :, None], sides, 0.0)
         for k in np.flatnonzero(settled & held.any(axis=1)).tolist():
             chunk.status[k] = Status.CONVERGED_AT_KINK.name
             chunk.message[k] = str(_describe_kink(problem, outcome, k, limits.tolerance))
@@ -491,7 +509,7 @@ class Batch:
                 chunk.free[k] = 0
                 continue
             termination = termination_of(replace(found, iterations=before + found.iterations), problem)
-            chunk.replace_fit(k, found, str(termination))
+            chunk.replace_fit(k, found, found.kinks, str(termination))
         return chunk
 
 

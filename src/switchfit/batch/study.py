@@ -126,12 +126,12 @@ def _list_walks(
     thresholds = 0.5 * quantile**2 * scale
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.maximum(variances, 0.0) * scale[:, None])
-        free = variances > 0
+        free = (variances > 0) & ~chunk.at_kink[fits]
     ends = problem.ends_of_modes(theta)
     for row, (e, place) in enumerate(ways.list_transitions(problem)):
         tau, samples = theta[:, place], ways.stack_sample_times(problem, theta, e)
         collapsed = np.sum(ends[e] == tau[:, None], axis=1) > 1  # ties it to another time
-        held = (chunk.status[fits] == AT_KINK) & (variances[:, place] == 0)
+        held = (chunk.status[fits] == AT_KINK) & chunk.at_kink[fits, place]
         with np.errstate(invalid="ignore"):
             within = np.abs(samples - tau[:, None]) <= (quantile * errors[:, place])[:, None]
         few = np.sum(within, axis=1) <= MOST_SAMPLES
@@ -159,7 +159,7 @@ def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatAr
     return error <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 
 
-CHUNK_FORMAT = "fits 3"
+CHUNK_FORMAT = "fits 4"
 """Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""
 
 
@@ -235,9 +235,20 @@ class Study:
             self._redo_unresolved(chunk, runs, batch)
             if self.problem.constraint_names:
                 self._redo_doubted(chunk, runs, batch)
-            if not any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
-                pieces = trace_chunk(chunk, self.group_fits(runs), batch)
+        self._free_kinks(chunk, runs)
+        if self.is_finished and not any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
+            pieces = trace_chunk(chunk, self.group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
+
+    def _free_kinks(self, chunk: Chunk, runs: range) -> None:
+        """Let unknowns at kinks have variances, unless guards, terminal constraints or short modes may tie them."""
+        if self.problem.constraint_names or not chunk.at_kink.any():
+            return
+        found, known = self.describe_fits(chunk, runs), self.problem.is_sigma_known
+        freedom = found["samples"] + count_priors(self.problem) - chunk.free
+        scale = measure_variance(chunk.cost, freedom, known)
+        for k in np.flatnonzero(chunk.at_kink.any(axis=1) & (found["collapsed"] == 0)).tolist():
+            chunk.free_kinks(k, float(scale[k]))
 
     def list_starts(self, runs: range) -> FloatArray:
         """Return where some of the runs begin: (R, d)."""

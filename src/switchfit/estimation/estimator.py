@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, inverse_on, measure_quantile
+from switchfit.fit.result import Fit, invert, measure_quantile
 from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
@@ -242,7 +242,8 @@ class Estimate(Fit, Tabular, Displayed):
             matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
             residuals, and treats the model as linear. "sandwich" is ``n / (n - d) H^-1 B H^-1`` with the exact Hessian
             H and ``B = sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: with a robust loss it holds
-            for independent noise of any distribution, whether sigma is right or not.
+            for independent noise of any distribution, whether sigma is right or not. With any of them, unknowns at
+            kinks have variances as in `covariance`; those of the sandwich are rough, as each score is of one side.
 
         Raises
         ------
@@ -279,7 +280,7 @@ class Estimate(Fit, Tabular, Displayed):
                     "The Gauss-Newton matrix of this fit is not known: it needs a cost of Measurements alone, and the "
                     "problem. Use hessian='exact'."
                 )
-            return self.variance_scale * inverse_on(self.free_basis, self.gauss_newton)
+            return self.variance_scale * invert(self, self.gauss_newton, self.variance_scale)
         if self.problem is None or not self.has_sandwich:
             raise ValueError(
                 "The sandwich covariance needs the gradient of each sample: the problem, with a cost of Measurements "
@@ -288,7 +289,7 @@ class Estimate(Fit, Tabular, Displayed):
             )
         # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1, B = scores' scores
         scores = collect_sample_derivatives(self.problem, self.sensitivities).scores
-        spread = scores @ inverse_on(self.free_basis, self.hessian)
+        spread = scores @ invert(self, self.hessian, self.variance_scale)
         return np.asarray(self.samples / self.freedom * (spread.T @ spread))
 
     @property
@@ -360,16 +361,16 @@ class Estimate(Fit, Tabular, Displayed):
         within five standard errors, it is the range in which 2 (J − J_min) of its profile, followed piece by piece,
         stays below the squared quantile: slope and curvature of the cost jump at every sample time, so that this
         interval is not symmetric. An estimate that was loaded without its model has these profiles up to level 0.99;
-        one with more than 15 experiments, guards or terminal constraints has ``theta +- quantile x standard error``
-        only. NaN for an unknown that is held by a bound or a collapsed mode.
+        one with more than 15 experiments, guards, terminal constraints, or a model with thin layers has ``theta +-
+        quantile x standard error`` only. NaN for an unknown that is held by a bound or a collapsed mode.
 
         Parameters
         ----------
         level : float, between 0 and 1
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
         hessian : {"exact", "gauss-newton", "sandwich"}
-            As in `covariance_from`. With the last two, kinks are ignored, and with "sandwich" the quantile is that of
-            Student's t in any case.
+            As in `covariance_from`. With the last two, no profile is followed at kinks and among samples, and with
+            "sandwich" the quantile is that of Student's t in any case.
 
         See Also
         --------

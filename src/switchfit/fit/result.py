@@ -5,7 +5,7 @@ How a fit ended, as data from which the report writes its message.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
@@ -38,6 +38,8 @@ SMALL_WEIGHT = 0.1
 @dataclass(frozen=True)
 class Kink(Printed):
     """An unknown that ended where the derivative of the cost jumps through zero; print it for a short sentence.
+
+    Its standard error follows from both derivatives and the curvature, see `Fit.covariance`.
 
     Attributes
     ----------
@@ -487,11 +489,19 @@ class Fit(Termination):
 
         ``Z (Z' H Z)^-1 Z'``, times the residual variance if sigma is unknown. With priors it is the covariance of the
         posterior (Laplace's approximation). With a robust loss it is valid for noise with the loss as negative
-        log-likelihood. A sigma that is a parameter is an unknown like others. An unknown held by a bound, a
-        collapsed mode or a kink has variance 0 here. NaN if the cost has no noise model (anything but
-        `Measurements`) or there are too few samples, and for unknowns with a component in a direction along which
-        the Hessian is not positive; the others keep their variances.
+        log-likelihood. A sigma that is a parameter is an unknown like others. An unknown at a kink has the second
+        moment about theta of the density exp(-J), J having both slopes of the kink and the curvature beside it, and
+        the unknowns that follow it have larger variances (`free_kinks`). An unknown held by a bound or a collapsed
+        mode has variance 0 here; so has one at a kink if there are guards, terminal constraints or modes that are as
+        short as they may be. NaN if the cost has no noise model (anything but `Measurements`) or there are too few
+        samples, and for unknowns with a component in a direction along which the Hessian is not positive; the others
+        keep their variances.
         """
+        return self.variance_scale * invert(self, self.hessian, self.variance_scale)
+
+    @property
+    def held_covariance(self) -> FloatArray:
+        """`covariance` on the free directions alone: (d, d). Unknowns at kinks have variance 0."""
         return self.variance_scale * inverse_on(self.free_basis, self.hessian)
 
     @property
@@ -528,8 +538,8 @@ class Fit(Termination):
         """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
 
         For unknowns on a logarithmic scale, theta is multiplied and divided by exp(quantile x relative standard
-        error). NaN for an unknown that is held by a bound, a collapsed mode or a kink: the quadratic approximation has
-        no interval there. Use `profile`, or at a kink an `Estimate` with its model.
+        error). At a kink too: the standard error allows for both slopes there, and an `Estimate` with its model has an
+        interval that is not symmetric. NaN for an unknown that is held by a bound or a collapsed mode: use `profile`.
 
         Parameters
         ----------
@@ -623,12 +633,13 @@ def disagreement(fit: Fit) -> Disagreement | None:
     """Compare the two covariances of a fit; None if one of them is unknown.
 
     The ratios of the two variances over all linear combinations of the unknowns lie between the smallest and the
-    largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix.
+    largest eigenvalue of ``A v = lambda H v`` on the free directions, A being the Gauss-Newton matrix. Unknowns at
+    kinks are held: their variances are mostly those of the slopes, which both matrices share.
     """
     Z, A = fit.free_basis, fit.gauss_newton
     if A is None or fit.sigma_known is None or Z.shape[1] == 0:
         return None
-    both = fit.covariance, fit.variance_scale * inverse_on(Z, A)
+    both = fit.held_covariance, fit.variance_scale * inverse_on(Z, A)
     if not all(np.isfinite(covariance).all() for covariance in both):
         return None
     errors = np.sqrt([np.diag(covariance) for covariance in both])
@@ -676,6 +687,108 @@ def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     inverse[unknown] = np.nan
     inverse[:, unknown] = np.nan
     return inverse
+
+
+def invert(fit: Fit, matrix: FloatArray, scale: float) -> FloatArray:
+    """Return the inverse of a matrix that stands for the Hessian of a fit, unknowns at kinks being free: (d, d).
+
+    Parameters
+    ----------
+    fit : Fit
+        Whose directions and kinks are taken. Kinks stay held if a guard, a terminal constraint or the shortest duration
+        of a mode may tie them to other unknowns.
+    matrix : (d, d)
+    scale : float
+        By what the inverse will be multiplied to become a covariance.
+    """
+    tied = bool(fit.constraints) or any(constraint.position is not None for constraint in fit.active)
+    return free_kinks(inverse_on(fit.free_basis, matrix), matrix, [] if tied else list_kinks(fit), scale)
+
+
+def list_kinks(fit: Fit) -> list[tuple[int, float, float]]:
+    """Return where in theta each kink is, and the derivatives of J to its left and right, as `Result.kinks`."""
+    return [(fit.theta_names.index(kink.unknown), kink.left, kink.right) for kink in fit.kinks]
+
+
+def free_kinks(
+    inverse: FloatArray, hessian: FloatArray, kinks: Sequence[tuple[int, float, float]], scale: float
+) -> FloatArray:
+    """Return the inverse of a Hessian, as of `inverse_on`, with the unknowns at kinks free as well: (d, d).
+
+    The K unknowns at kinks are those that `inverse`, C, holds. If they move by x, the others follow by -C H_.K x, and
+    with the slopes g of J at the kinks
+
+        J = J0 + sum_k g_k(x_k) |x_k| + x' S x / 2,     S = H_KK - H_K. C H_.K.                                    (1)
+
+    The density exp(-J / scale) of one kinked x has the second moment v scale (`measure_kink_variance`): the normal one
+    with the curvature 1 / v has it too. With 1 / v in place of the diagonal of S, V is the inverse of S, and
+
+        inverse = C + F V F',     F = E_K - C H_.K,                                                                  (2)
+
+    the columns of F being how all unknowns follow. A smooth J, g = 0, has 1 / v = S_kk: (2) is then the inverse of H.
+
+    Parameters
+    ----------
+    inverse : (d, d)
+        Not scaled; what is NaN stays NaN, and does not follow.
+    hessian : (d, d)
+    kinks : sequence of (int, float, float)
+        Where in theta each of them is, and the derivatives of J to its left and right.
+    scale : float
+        By what the inverse will be multiplied to become a covariance.
+    """
+    if not kinks or not (np.isfinite(hessian).all() and np.isfinite(scale)):
+        return inverse
+    places = [place for place, _, _ in kinks]
+    follow = np.eye(len(hessian))[:, places] - np.nan_to_num(inverse) @ hessian[:, places]  # F
+    S = hessian[places] @ follow  # (1)
+    # In units of sqrt(scale), J / scale has the curvature S and the slopes g / sqrt(scale).
+    with np.errstate(divide="ignore"):  # residuals of 0
+        slopes = np.array([(-left, right) for _, left, right in kinks]) / np.sqrt(scale)
+    variances = measure_kink_variance(slopes, np.diag(S))
+    # V = D (1 + D S D - diag(D S D))^-1 D, D^2 = diag(v): also where v = 0.
+    root = np.sqrt(variances)
+    coupled = root[:, None] * S * root
+    np.fill_diagonal(coupled, 1.0)
+    if np.linalg.eigvalsh(coupled)[0] > UNDETERMINED:
+        V = root[:, None] * np.linalg.inv(coupled) * root
+    else:  # J is no minimum along all kinks together: each of them as if the others were held
+        V = np.diag(variances)
+    return np.asarray(inverse + follow @ V @ follow.T)  # (2)
+
+
+STEEP = 100.0
+"""Slope at a kink, times the standard deviation of the parabola beside it, from which on the curvature is left out: it
+changes the variance by less than 1e-3, and further out integrals with it lose all digits."""
+
+
+def measure_kink_variance(slopes: FloatArray, curvatures: FloatArray) -> FloatArray:
+    """Return the second moment about 0 of the density exp(-g |x| - s x^2 / 2), g on each side another: (K,).
+
+    With u = g / sqrt(s), the integrals of 1, x and x^2 times the density of one side, x > 0, are
+
+        Z = sqrt(pi / 2 s) erfcx(u / sqrt(2)),     M1 = (1 - g Z) / s,     M2 = (Z - g M1) / s,                      (1)
+
+    M1 and M2 by parts, from s x exp(-J) = -d exp(-J) / dx - g exp(-J). Without curvature Z = 1 / g and M2 = 2 / g^3.
+    The result is (M2 + M2) / (Z + Z) of both sides. It is 0, the unknown stays held, where there is no slope and no
+    curvature, and where J falls again before it has risen by 1/2: g x + s x^2 / 2 has its maximum -g^2 / 2 s.
+
+    Parameters
+    ----------
+    slopes : (K, 2)
+        g, of both sides; below 0 is rounding.
+    curvatures : (K,)
+    """
+    g, s = np.maximum(slopes, 0.0), curvatures[:, None]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u = g / np.sqrt(np.where(s > 0.0, s, 0.0))
+        Z = np.sqrt(np.pi / (2.0 * s)) * special.erfcx(u / np.sqrt(2.0))
+        M2 = (Z - g * (1.0 - g * Z) / s) / s  # (1)
+        steep = ~(u < STEEP)
+        Z, M2 = np.where(steep, 1.0 / g, Z), np.where(steep, 2.0 / g**3, M2)
+        variances = M2.sum(axis=1) / Z.sum(axis=1)
+    falls = (g**2 < -s).any(axis=1)
+    return np.where(np.isfinite(variances) & ~falls, variances, 0.0)
 
 
 def moves_by_itself(basis: FloatArray) -> NDArray[np.bool_]:

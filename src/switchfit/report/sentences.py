@@ -167,7 +167,7 @@ _ENDINGS: dict[Status | str, str] = {
     "above the tolerance {tolerance:.1e}, but the decrease still predicted is below the error of the cost, or would "
     "move no unknown by a quarter of its standard error. Ask for a larger tolerance.",
     Status.CONVERGED_AT_KINK: "Converged at a kink of the cost: {kinks}. The one-sided derivatives have opposite "
-    "signs, so this is a minimiser although no gradient vanishes there; covariances do not apply to such an unknown.",
+    "signs, so this is a minimiser although no gradient vanishes there.",
     Status.MAX_ITERATIONS: "Stopped after {iterations}{earlier} with optimality {optimality:.1e} above the tolerance "
     "{tolerance:.1e}. Raise max_iterations, use hessian='exact', or start closer.",
     Status.LINE_SEARCH_FAILED: "The line search found no decrease of the cost along a descent direction (optimality "

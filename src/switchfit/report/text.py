@@ -250,7 +250,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     known = bool(np.isfinite(errors).any())
     corrected = known and not np.array_equal(naive, errors, equal_nan=True)
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
-    dated, rows = formats.list_dated(fit), []
+    kinks, dated, rows = [kink.unknown for kink in fit.kinks], formats.list_dated(fit), []
     for i in shown:
         name, run = fit.theta_names[i], dated[i]
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
@@ -260,7 +260,10 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
             value, relative = format_time(fit.theta[i], run, errors[i]), ""
         low, high = (format_end(end, wide[i], run) for end in wide[i])
         sides = np.sort(np.abs(wide[i] - fit.theta[i]))
-        sided = i in joins and sides[0] > 0 and (not errors[i] > 0 or sides[1] > ONE_SIDED * sides[0])
+        # At a kink a profile may be narrower than the standard error says.
+        usual = fit.quantile(0.95) * errors[i] if name in kinks and errors[i] > 0 else sides[0]
+        apart = not errors[i] > 0 or max(sides[1], usual) > ONE_SIDED * min(sides[0], usual)
+        sided = i in joins and sides[0] > 0 and apart
         within = f"95 % in [{low}, {high}]" if high and (sided or name in fit.log_scaled) and not ends else ""
         prior = f"prior: {fit.priors[name]}" if name in fit.priors else ""
         note = ", ".join(filter(None, (counted, joins.get(i), prior, within, _mark_unknown(fit, name))))

@@ -338,11 +338,12 @@ def find_other_minima(fit: Estimate, *, in_times: bool = True) -> list[FloatArra
     if not evaluator.problem.is_sigma_known or not fit.status.is_strict_minimum:
         return []
     try:
-        hops = find_far_minima(evaluator, fit.theta, fit.cost, fit.standard_errors) if in_times else []
-        hops += look_near(evaluator, fit.theta, fit.cost, fit.standard_errors)
+        errors = np.sqrt(np.diag(fit.held_covariance))  # 0 at kinks, which hold their times
+        hops = find_far_minima(evaluator, fit.theta, fit.cost, errors) if in_times else []
+        hops += look_near(evaluator, fit.theta, fit.cost, errors)
         if hops or evaluator.problem.constraint_names:
             return hops
-        return look_beyond_corners(evaluator, fit.theta, fit.cost, fit.covariance)
+        return look_beyond_corners(evaluator, fit.theta, fit.cost, fit.held_covariance)
     except (KeyboardInterrupt, NotIntegrableError, OutOfTimeError):  # the fit stays
         return []
 

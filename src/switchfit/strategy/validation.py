@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, inverse_on
+from switchfit.fit.result import Fit, invert
 from switchfit.fit.trajectory import Comparison, Trajectory, compare
 from switchfit.problem.data import FloatArray, Measurements, count_from
 from switchfit.problem.dates import Dates
@@ -254,7 +254,7 @@ def whiten_residuals(
     if refit is not None:
         # The exact Hessian, as of any fit: a transition time at which the vector field does not jump has no first
         # derivative, and would have no error.
-        exact = inverse_on(refit.free_basis, refit.hessian) * noise**2
+        exact = invert(refit, refit.hessian, noise**2) * noise**2
         if np.isfinite(exact).all():
             alone = np.zeros((d, d))
             alone[np.ix_(where, where)] = exact

@@ -476,7 +476,7 @@ def replace_intervals(
     Parameters
     ----------
     intervals : (..., d, 2)
-        From one parabola each; NaN at a kink.
+        From one standard error each.
     pieces : (..., T, 2, P, 5)
         To both sides, NaN after the last.
     places : (T,) int
