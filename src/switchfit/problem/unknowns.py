@@ -31,7 +31,7 @@ from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import join_names
 from switchfit.runtime.presentation import Printed
 
-ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound"]
+ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound", "known jump"]
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,9 @@ class Constraint(Printed):
 
     Attributes
     ----------
-    kind : {"collapsed", "minimum duration", "lower bound", "upper bound"}
-        "collapsed" is a minimum duration of 0: when it is active, the mode has zero duration.
+    kind : {"collapsed", "minimum duration", "lower bound", "upper bound", "known jump"}
+        "collapsed" is a minimum duration of 0: when it is active, the mode has zero duration. "known jump" is the bound
+        of a transition time at the time of a `Jump`, on whose other side its guess does not lie.
     value : float
         The minimum duration in the time unit of the run, or the bound in the unit of the unknown.
     unknown : str

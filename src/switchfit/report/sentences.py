@@ -103,6 +103,8 @@ def capitalise(text: str) -> str:
 @format_text.register(Constraint)
 def write_constraint(constraint: Constraint) -> str:
     """Return which constraint is active."""
+    if constraint.kind == "known jump":
+        return f"{constraint.unknown} at the known jump at {constraint.value:g}"
     if constraint.position is None:
         return f"{constraint.unknown} at its {constraint.kind} {constraint.value:g}"
     state = "has collapsed to nothing" if constraint.kind == "collapsed" else "is at its minimum duration"
@@ -615,6 +617,7 @@ _REASONS: dict[str, Sentence] = {
     "acts elsewhere": "only modes or transitions that do not occur read {first names}",
     "without effect": "the cost does not depend on {first names}",
     "at bounds": "{first names} at a bound",
+    "at known jumps": "held by known jumps, which no transition passes: {times at jumps}",
     "vanishing": "{first names} tends to 0",
     "integration error": "the integration error of {first names} is {error:.1e}, relative",
     "many fits": _describe_many,
@@ -645,6 +648,7 @@ _STEPS = {
     "leave the mode out": "leave the mode out of mode_sequence",
     "lower min_duration": "lower min_duration or leave the mode out",
     "linear scale": "use a linear scale with lower=0",
+    "other side": "put the guess of {names} on the other side of that jump",
     "move the bound": "move the bound if it is not a physical one",
     "fix or add data": "fix one of them or add data",
     "remove or use": "remove {names} from parameters or use in the model",
@@ -688,6 +692,7 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "least": _name_least,
     "per cent": lambda issue: 100 * get_figure(issue, "share"),
     "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
+    "times at jumps": lambda issue: list_each(issue, "{} at {:.8g}", "at"),
     "where it failed": lambda issue: list_each(issue, "{} = {:.6g}", "at", first=2),
     "statuses": lambda issue: ", ".join(issue.subjects[:LISTED_NAMES]),
 }
