@@ -190,10 +190,11 @@ def make_switch_with_slope(guess, size):
 @pytest.mark.parametrize("guess", [1.0, 2.2, 2.8])
 def test_a_parameter_that_is_a_switch_and_smooth_as_well_is_named_in_the_verdict(guess, size):
     problem, line = make_switch_with_slope(guess, size)
-    found = sf.estimate(problem)
-    assert found.verdict.level != "good"
-    assert f"mode 'm' compares with t_on at test_moments.py:{line}" in str(found.verdict)
-    assert not any(step.strategy == "many starts" for step in found.steps)
+    best, found = sf.estimate(problem), sf.estimate(problem, strategy="local")
+    assert best.cost < 150.0  # 1924 where the line search failed first: searches go on from there
+    for each in (best, found):
+        assert each.verdict.level != "good"
+        assert f"mode 'm' compares with t_on at test_moments.py:{line}" in str(each.verdict)
     if found.status is sf.Status.LINE_SEARCH_FAILED:
         place = re.search(r"where the cost jumps, at t_on = (\S+); .*mode 'm' compares", str(found.verdict))
         assert float(place[1]) == pytest.approx(found.theta[0], abs=1e-3)
