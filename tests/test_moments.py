@@ -172,6 +172,16 @@ def test_no_function_is_accused_that_does_not_compare():
         sf.estimate(hidden_problem(mode))
 
 
+def test_the_corner_of_a_running_cost_that_keeps_a_fit_from_converging_is_named():
+    system = sf.HybridSystem({f"{a:+g}": lambda t, x, p, a=a: a * p["u"] - 0.5 * x for a in (1.0, -1.0)}, [0.0])
+    cost = sf.RunningCost(lambda t, x, p: jnp.abs(x[0] - 1.0) + 0.05 * p["u"] ** 2)
+    bounded = {"u": sf.Parameter(1.5, 0.1, 4.0)}
+    found = sf.estimate(models.one_run(system, cost, ("+1", "-1", "+1"), (2.0, 3.0), 6.0, bounded), strategy="local")
+    said = f"RunningCost 1 has a corner at test_moments.py:{cost.ell.__code__.co_firstlineno}"
+    assert said in str(found.verdict)
+    assert said in found.message
+
+
 def make_switch_with_slope(guess, size):
     """The derivative in t_on is right between the jumps, and leads to where one of them stands in the way."""
 

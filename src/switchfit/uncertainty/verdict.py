@@ -441,6 +441,9 @@ SEARCH_FAILED = {"switch": (), "wrong slope": ("check derivatives", "more starts
 DEFINE = "define it there"
 """What to do about an operation of a function that is not defined, or has no derivative, at a point."""
 
+WRITTEN_OTHERWISE = {"undefined": DEFINE, "cost corner": "cost as a state"}
+"""What to do about a function that kept a fit from converging, by the kind of the reason."""
+
 SWITCH = "transition time"
 """What to do about an unknown with which a function compares, the first of the subjects of this advice."""
 
@@ -490,8 +493,8 @@ def _find_ending(fit: Fit) -> Iterator[Finding]:
     figures = {"optimality": fit.optimality, "tolerance": fit.tolerance, "iterations": float(fit.iterations)}
     subjects: tuple[str, ...] = (fit.status.name,)
     steps = ENDED.get(fit.status, ("more starts",))
-    if fit.reason is not None and fit.reason.kind == "undefined":
-        yield Finding("bad", fit.reason, (DEFINE,))
+    if fit.reason is not None and fit.reason.kind in WRITTEN_OTHERWISE:
+        yield Finding("bad", fit.reason, (WRITTEN_OTHERWISE[fit.reason.kind],))
         steps = ()
     elif fit.status is Status.LINE_SEARCH_FAILED and fit.reason is not None:
         subjects = (*subjects, fit.reason.kind, *fit.reason.subjects)
