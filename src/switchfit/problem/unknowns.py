@@ -140,6 +140,7 @@ class Variables(NamedTuple):
         """Whether the variables equal theta."""
         return not self.log.any() and bool(np.all(self.size == 1.0))
 
+    @np.errstate(over="ignore")  # a step too far on a logarithmic scale is refused, as J is not finite there
     def outward(self, z: Any, xp: Any = np) -> Any:
         """Return theta at z: (d,)."""
         return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
