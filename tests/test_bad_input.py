@@ -128,7 +128,7 @@ test_wrong_values = refused_with(
     (lambda: system(reset_maps={("grow", "fall"): grow}), ["reset_maps names the unknown mode 'fall'; the modes"]),
     (lambda: problem(of=system(initial_state=lambda p: p["k"][None], state_names=("x", "y"))), ["of the 1 states"]),
     # Data
-    (lambda: samples([0.0, 0.0], [1.0, 2.0]), ["must increase strictly; got 0.0 followed by 0.0"]),
+    (lambda: samples([0.0, 0.0], [1.0, 2.0]), ["got 0.0 followed by 0.0 at index 1. Samples of the same time go"]),
     (lambda: samples([0.0, 1.0], [1.0]), ["values of shape (K,) or (K, q); got (2,) and (1,)"]),
     (lambda: samples([], np.empty((0, 0))), ["Measurements needs 1 sample(s) or more; got 0"]),
     (lambda: samples([], np.empty((0, 2)), sigma=np.empty((0, 2))), ["sigma must be", "shape (2,)"]),
