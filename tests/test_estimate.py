@@ -86,6 +86,8 @@ def test_a_bound_that_is_reached_is_named():
     assert found.gradient[1] < -1.0
     assert found.optimality < 1e-7
     assert (found.standard_errors > 0.0).tolist() == [True, False, True]
+    known = sf.estimate(capacitor(voltage(TIMES), k=sf.Parameter([1.6, 3.0], lower=[1.6, 0.0], upper=[1.6, 5.0])))
+    assert "at bounds" not in [reason.kind for reason in known.verdict.reasons]
 
 
 def test_a_minimum_duration_that_is_reached_is_named():

@@ -217,9 +217,10 @@ def _find_short_modes(fit: Fit) -> Iterator[Issue]:
 
 
 def _find_bounds(fit: Fit) -> Iterator[Issue]:
-    """Find unknowns that bounds hold which the user gave."""
+    """Find unknowns that bounds hold which the user gave; equal bounds are a value that is known."""
+    known = {*fit.idle, *np.array(fit.theta_names)[fit.lower == fit.upper].tolist()}
     for constraint in fit.active:
-        if constraint.kind in ("lower bound", "upper bound") and constraint.unknown not in fit.idle:
+        if constraint.kind in ("lower bound", "upper bound") and constraint.unknown not in known:
             yield Issue(constraint.kind, (constraint.unknown,), {"value": constraint.value})
 
 
