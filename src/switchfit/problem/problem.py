@@ -535,7 +535,7 @@ class Problem:
         Raises
         ------
         ValueError
-            Where the shape or the order of transition times is wrong.
+            Where the shape is wrong, or the order of transition times and known jumps.
 
         See Also
         --------
@@ -573,6 +573,13 @@ class Problem:
                 high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.end)[::-1])[::-1]
                 ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
                 checked[where[where >= 0]] = ordered[where >= 0]
+            for jump, n in zip(experiment.jump_times.tolist(), experiment.passed_by_jumps.tolist(), strict=True):
+                if knots[n] > jump + ROUNDING * experiment.clock or knots[n + 1] < jump - ROUNDING * experiment.clock:
+                    raise ValueError(
+                        f"The transition times in {what} must stay on that side of each known jump on which their "
+                        f"guesses are; got {shorten(times)}, on another side of the jump at {jump:g}. Give the "
+                        "Experiment transition_times on that side."
+                    )
             seen = self.late_times(checked, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.earliest_end):
                 raise ValueError(
