@@ -254,15 +254,15 @@ def straight(target=1.0, min_duration=0.0, **bounds):
     ("settings", "end", "active"),
     [
         ({}, 1.0, []),
-        ({"target": 7.0}, 4.0, ["tf at its upper bound 4"]),
-        ({"lower": 1.5}, 1.5, ["tf at its lower bound 1.5"]),
-        ({"min_duration": 1.25}, 1.25, ["mode 1 ('goes') is at its minimum duration"]),
+        ({"target": 7.0}, 4.0, [("tf at its upper bound 4", 6.0)]),
+        ({"lower": 1.5}, 1.5, [("tf at its lower bound 1.5", 1.0)]),
+        ({"min_duration": 1.25}, 1.25, [("mode 1 ('goes') is at its minimum duration", 0.5)]),
     ],
 )
 def test_bounds_and_minimum_duration_hold_tf(settings, end, active):
     fit = sf.estimate(straight(**settings))
     assert fit.theta == pytest.approx([end], abs=1e-12 if active else 1e-8)
-    assert [str(constraint) for constraint in fit.active] == active
+    assert [(str(constraint), pytest.approx(constraint.multiplier)) for constraint in fit.active] == active
 
 
 def test_a_last_mode_that_vanishes_is_reported_as_collapsed():

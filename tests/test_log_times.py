@@ -69,6 +69,7 @@ def test_derivatives_of_the_change_of_variables_are_those_of_autodiff():
     _, along, curvature = differentiate(lambda z: cost(variables.outward(z, jnp)), z)
     g, H = variables.derivatives_inward(theta, gradient, hessian)
     np.testing.assert_allclose(variables.outward(z), theta, rtol=1e-14)
+    assert np.isinf(variables.outward(z + 1e3)[log]).all()  # a step too far, without a warning
     np.testing.assert_allclose(g, along, rtol=1e-12)
     np.testing.assert_allclose(H, curvature, rtol=1e-12)
     back = variables.derivatives_outward(theta, g, H)
@@ -90,6 +91,7 @@ def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
     expected = variables.derivatives_inward(theta, here.gradient, here.hessian.dense())
     np.testing.assert_allclose(found.gradient, expected[0])
     np.testing.assert_allclose(found.hessian.dense(), expected[1], rtol=1e-12)
+    assert not _to_variables(variables, np.full(3, 1e200), here, None).hessian.finite  # too far, without a warning
 
 
 @pytest.mark.parametrize(("guess", "t0"), [((0.03, 4.0), 0.0), ((10.0, 300.0), 0.0), ((10.0, 300.0), 7.0)])

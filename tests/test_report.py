@@ -216,6 +216,7 @@ FITS: dict[str, Fit] = {
         steps=(Step("local", np.inf, 0, 0.1), Step("beam along the log", 28.0, 300, 2.0))
     ),
     "at the upper bound": made(**bound("upper bound")),
+    "at a known jump": made(**bound("known jump")),
     "a mode collapsed": made(**mode_held("collapsed", 0.0)),
     "a mode at its minimum duration": made(**mode_held("minimum duration", 0.5, run="run1")),
     "at a kink": made(kinks=KINKS[:1], free_basis=np.eye(3)[:, 1:], cost=28.5),

@@ -372,12 +372,13 @@ def describe_ends(
         explained = np.where(variation == 0, squares <= 0, 1 - squares / variation)
         near = AT_END * np.abs(theta)
         held = (theta <= unknowns.lower + near) | (theta >= unknowns.upper - near)
+        held &= ~unknowns.is_time & (unknowns.lower < unknowns.upper)  # equal bounds are a value that is known
         collapsed = sum(map(partial(_count_collapsed, problem), problem.experiments, problem.ends_of_modes(theta)))
     return {
         "samples": np.full(len(cost), count_samples(problem)),
         "explained": np.where(np.isnan(variation) | np.isnan(cost), np.nan, explained),
         "collapsed": np.asarray(collapsed, dtype=np.int64),
-        "at_bounds": np.sum(held & ~unknowns.is_time, axis=1),
+        "at_bounds": np.sum(held, axis=1),
     }
 
 

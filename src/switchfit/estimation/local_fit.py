@@ -25,7 +25,7 @@ from switchfit.optimize.matrix import Dense, null_space
 from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.sqp import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray
-from switchfit.problem.inspection import find_comparisons
+from switchfit.problem.inspection import find_comparisons, find_cost_corner
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.validation import as_choice, as_count, as_positive, join_names, shorten
 from switchfit.runtime.errors import Issue, NotIntegrableError
@@ -275,6 +275,9 @@ def _describe_ending(evaluator: Evaluator, result: Result, earlier: int, error: 
     """Return how a fit ended, with an integration error; `earlier`: the number of iterations on coarser meshes."""
     problem = evaluator.problem
     ended = termination_of(result, problem, earlier)
+    is_stuck = ended.status is Status.MAX_ITERATIONS or (ended.reason is not None and ended.reason.kind == "kink")
+    if is_stuck and (corner := find_cost_corner(problem)):
+        return replace(ended, reason=Issue("cost corner", (corner,)))
     if ended.reason is None:
         # Steps across a jump of a function are not accurate, however short, or its derivatives lack the jump.
         for i, comparison in find_comparisons(problem).items():

@@ -265,6 +265,7 @@ def _compute_reach(problem: Problem) -> FloatArray:
     return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
 
 
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # a point whose derivatives are not finite is refused
 def _to_variables(variables: Variables, theta: FloatArray, here: Any, multipliers: FloatArray | None) -> Any:
     """Convert an evaluation at theta, of constraints too if there are multipliers, to the optimizer's variables."""
     D, E = variables.slopes(theta)

@@ -556,7 +556,7 @@ class Measurements:
     times : (K,) array_like
         Increasing sample times in the experiment's time unit, or dates, which the experiment converts to it: text in
         ISO 8601, datetime, datetime64, columns of pandas, polars or xarray, `Log.dates`, or what `from_epoch` returns.
-        They may be irregular.
+        They may be irregular. What was measured again at the same time goes into a second `Measurements`.
     values : (K,) or (K, q) array_like
         Samples; NaN marks a missing one. Tables of pandas, polars and xarray, and a `Log`, bring their names and units.
         For an `OnlineEstimator` there may be none yet: ``np.empty((0, q))``.
@@ -758,8 +758,10 @@ def _check_samples(
     if wrong.any():
         k = int(np.argmax(wrong))
         shown = times if dates is None else dates
+        is_repeated = what == "Measurements" and times[k] == times[k + 1]
+        advice = " Samples of the same time go into a second Measurements of the experiment." if is_repeated else ""
         raise ValueError(
-            f"{what} times must increase strictly; got {shown[k]} followed by {shown[k + 1]} at index {k + 1}."
+            f"{what} times must increase strictly; got {shown[k]} followed by {shown[k + 1]} at index {k + 1}.{advice}"
         )
     times.flags.writeable = False
     values.flags.writeable = False

@@ -119,7 +119,8 @@ class Experiment:
         ``(t0, tf)``; an entry may be a `Parameter` with bounds, or fixed. Its unit, where given, must be `time_unit`.
         With ``scale="log"``, which all free times of an experiment then have, a free tf among them, the optimiser works
         in log(tau - t0): for times that may lie in other decades than their guess.
-        Left out, `estimate` looks for them all over the horizon; the guess is evenly spaced.
+        Left out, `estimate` looks for them all over the horizon; the guess is evenly spaced. With `jumps` each stays
+        between the two that enclose its guess.
     t0 : float or date, optional
         Start of the horizon, in the experiment's time unit. Left out, the first time of the data: the first sample of
         the `Measurements` (less a delay that is a number) and the beginning of the reference signals, whichever is

@@ -169,11 +169,7 @@ def use_float64() -> Any:
     return jax.enable_x64(True)
 
 
-UNTRACEABLE = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
+UNTRACEABLE = (jax.errors.ConcretizationTypeError, jax.errors.TracerIntegerConversionError)
 """Exceptions of JAX when Python code needs the value of a traced number."""
 
 
@@ -447,9 +443,14 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
         known = zip("pu", (given for given in arguments if isinstance(given, dict)), strict=False)
         there = "; ".join(f"{holder} has {join_names(given)}" for holder, given in known)
         raise ValueError(f"{what} reads {error}, which is not there: {there}.") from error
+    except jax.errors.TracerArrayConversionError as error:
+        raise ValueError(
+            f"{what} calls a NumPy function on t, x or p, or indexes a NumPy array with them, which JAX traces "
+            "and NumPy cannot take. Write it with jax.numpy, as jnp.array([...]) or jnp.sin(...)."
+        ) from error
     except UNTRACEABLE as error:
         raise ValueError(
-            f"{what} branches on the value of t, x or p (an `if`, a `while`, float() or numpy function), which JAX "
+            f"{what} branches on the value of t, x or p (an `if`, a `while`, float() or math function), which JAX "
             "cannot differentiate. Write it with jax.numpy; if the dynamics change there, make it a mode with a "
             "transition time."
         ) from error

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.problem.corners import find_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.jaxprs import Walk, evaluate, find_line, find_public_name
@@ -157,6 +158,22 @@ def _find_places(problem: Problem, bends: bool = False) -> dict[int, str]:
                 found.setdefault(run.parameter_map.get(parameter, parameter), f"{role} {what}")
     spans = problem.unknowns.parameters.items()
     return {i: found[name] for name, span in spans if name in found for i in range(span.start, span.stop)}
+
+
+@keep_with_problem
+def find_cost_corner(problem: Problem) -> str:
+    """Return which running cost has a corner of the state, such as "RunningCost 1 has a corner at model.py:12"; empty
+    if none has.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    for structure in problem.structures:
+        for k, ell in enumerate(structure.running, start=1):
+            if lines := find_corners(ell).lines:
+                return f"RunningCost {k} has a corner{lines[0] and f' at {lines[0]}'}"
+    return ""
 
 
 @lru_cache(maxsize=1024)

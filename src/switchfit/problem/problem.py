@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial, wraps
+from functools import cached_property, wraps
 from itertools import pairwise, repeat
 from typing import Any, Literal, TypeVar
 
@@ -20,7 +20,7 @@ from switchfit.problem.experiment import Experiment, drop_jumps, insert_jumps, n
 from switchfit.problem.parameter import Parameter, as_parameter, require_time_unit, unit_suffix
 from switchfit.problem.structure import Sources, Structure, choose_common_lengths, trace_structure
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.unknowns import Constraint, Unknowns, list_unknowns
+from switchfit.problem.unknowns import Constraint, ConstraintKind, Unknowns, list_unknowns
 from switchfit.problem.validation import (
     as_array,
     as_choice,
@@ -363,8 +363,14 @@ class Problem:
     def constraints(self) -> LinearConstraints:
         """The order and durations of modes, then all lower and all upper bounds, infinite ones included."""
         unknowns = self.unknowns
-        lower = map(partial(Constraint, "lower bound"), unknowns.lower.tolist(), unknowns.names)
-        upper = map(partial(Constraint, "upper bound"), unknowns.upper.tolist(), unknowns.names)
+        runs = zip(self.experiments, unknowns.times, strict=True)
+        jumps = {(i, t) for run, times in runs for i in times.tolist() for t in run.jump_times.tolist() if t > run.t0}
+
+        def name_bounds(kind: ConstraintKind, values: FloatArray) -> list[Constraint]:
+            each = enumerate(zip(values.tolist(), unknowns.names, strict=True))
+            return [Constraint("known jump" if (i, v) in jumps else kind, v, name) for i, (v, name) in each]
+
+        lower, upper = name_bounds("lower bound", unknowns.lower), name_bounds("upper bound", unknowns.upper)
         names = (*unknowns.rows, *lower, *upper)
         return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, names)
 
@@ -529,7 +535,7 @@ class Problem:
         Raises
         ------
         ValueError
-            Where the shape or the order of transition times is wrong.
+            Where the shape is wrong, or the order of transition times and known jumps.
 
         See Also
         --------
@@ -567,6 +573,13 @@ class Problem:
                 high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.end)[::-1])[::-1]
                 ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
                 checked[where[where >= 0]] = ordered[where >= 0]
+            for jump, n in zip(experiment.jump_times.tolist(), experiment.passed_by_jumps.tolist(), strict=True):
+                if knots[n] > jump + ROUNDING * experiment.clock or knots[n + 1] < jump - ROUNDING * experiment.clock:
+                    raise ValueError(
+                        f"The transition times in {what} must stay on that side of each known jump on which their "
+                        f"guesses are; got {shorten(times)}, on another side of the jump at {jump:g}. Give the "
+                        "Experiment transition_times on that side."
+                    )
             seen = self.late_times(checked, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.earliest_end):
                 raise ValueError(

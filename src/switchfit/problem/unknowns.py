@@ -31,7 +31,7 @@ from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import join_names
 from switchfit.runtime.presentation import Printed
 
-ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound"]
+ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound", "known jump"]
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,9 @@ class Constraint(Printed):
 
     Attributes
     ----------
-    kind : {"collapsed", "minimum duration", "lower bound", "upper bound"}
-        "collapsed" is a minimum duration of 0: when it is active, the mode has zero duration.
+    kind : {"collapsed", "minimum duration", "lower bound", "upper bound", "known jump"}
+        "collapsed" is a minimum duration of 0: when it is active, the mode has zero duration. "known jump" is the bound
+        of a transition time at the time of a `Jump`, on whose other side its guess does not lie.
     value : float
         The minimum duration in the time unit of the run, or the bound in the unit of the unknown.
     unknown : str
@@ -139,6 +140,7 @@ class Variables(NamedTuple):
         """Whether the variables equal theta."""
         return not self.log.any() and bool(np.all(self.size == 1.0))
 
+    @np.errstate(over="ignore")  # a step too far on a logarithmic scale is refused, as J is not finite there
     def outward(self, z: Any, xp: Any = np) -> Any:
         """Return theta at z: (d,)."""
         return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)

@@ -19,7 +19,7 @@ from switchfit.problem.unknowns import Constraint
 from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import format_count, format_text, join_first
 from switchfit.uncertainty.residuals import NO_RESIDUALS, UNLIKELY
-from switchfit.uncertainty.verdict import LEVELS, NEARLY_ALL, Verdict
+from switchfit.uncertainty.verdict import LEVELS, NEARLY_ALL, WRITTEN_OTHERWISE, Verdict
 
 ALLOWED = "Standard errors allow for the correlation of the residuals."
 """Below a table whose standard errors are corrected."""
@@ -103,6 +103,8 @@ def capitalise(text: str) -> str:
 @format_text.register(Constraint)
 def write_constraint(constraint: Constraint) -> str:
     """Return which constraint is active."""
+    if constraint.kind == "known jump":
+        return f"{constraint.unknown} at the known jump at {constraint.value:g}"
     if constraint.position is None:
         return f"{constraint.unknown} at its {constraint.kind} {constraint.value:g}"
     state = "has collapsed to nothing" if constraint.kind == "collapsed" else "is at its minimum duration"
@@ -126,7 +128,7 @@ def write_termination(ended: Termination) -> str:
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
     template = _ENDINGS["only unread" if only_unread else ended.status]
-    if "{reason}" not in template and ended.reason is not None and ended.reason.kind == "undefined":
+    if "{reason}" not in template and ended.reason is not None and ended.reason.kind in WRITTEN_OTHERWISE:
         template += "{reason}"
     return template.format(**vars(ended) | _describe_ending(ended)) + active
 
@@ -355,6 +357,8 @@ _ISSUES: dict[str, Sentence] = {
     "switch": "{jump}{1}, and derivatives do not include such a switch. If {0} is a time, make it a transition time; "
     "if it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or fix it.",
     "undefined": "{undefined}. {definition}.",
+    "cost corner": "{0}, and steps end at corners of modes alone: make the cost a state of the modes, with a "
+    "TerminalCost of that state.",
     "kink": "The derivatives are right, but there is a kink close by, near {places}: along that direction the slope "
     "jumps from {before:.3g} to {after:.3g}. Start elsewhere, or fix what is at the kink there.{delay}",
     "not finite": "A little farther on, at {places}, the cost or its derivatives are not finite: a function of the "
@@ -595,6 +599,7 @@ _REASONS: dict[str, Sentence] = {
     "at kinks": "{first names} at a kink of the cost",
     "not converged": _write_ending,
     "undefined": write_undefined,
+    "cost corner": "{0}, at which steps do not end",
     "switch": "{1}, which derivatives do not include",
     "unexplained": "{explanation of the worst}",
     "little explained": "{explanation of the worst}",
@@ -615,6 +620,7 @@ _REASONS: dict[str, Sentence] = {
     "acts elsewhere": "only modes or transitions that do not occur read {first names}",
     "without effect": "the cost does not depend on {first names}",
     "at bounds": "{first names} at a bound",
+    "at known jumps": "held by known jumps, which no transition passes: {times at jumps}",
     "vanishing": "{first names} tends to 0",
     "integration error": "the integration error of {first names} is {error:.1e}, relative",
     "many fits": _describe_many,
@@ -645,10 +651,12 @@ _STEPS = {
     "leave the mode out": "leave the mode out of mode_sequence",
     "lower min_duration": "lower min_duration or leave the mode out",
     "linear scale": "use a linear scale with lower=0",
+    "other side": "put the guess of {names} on the other side of that jump",
     "move the bound": "move the bound if it is not a physical one",
     "fix or add data": "fix one of them or add data",
     "remove or use": "remove {names} from parameters or use in the model",
     "fix or let it act": "fix {names}, or fit a log with other modes",
+    "cost as a state": "make the cost a state of the modes, with a TerminalCost of that state",
     "transition time": "make {} a transition time if it is one, or use a smooth function",
     "larger tolerance": "ask for a larger tolerance",
     "fix alone": "fix {names}, or measure something else",
@@ -688,6 +696,7 @@ _WORDS: Mapping[str, Callable[[Issue], Any]] = {
     "least": _name_least,
     "per cent": lambda issue: 100 * get_figure(issue, "share"),
     "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
+    "times at jumps": lambda issue: list_each(issue, "{} at {:.8g}", "at"),
     "where it failed": lambda issue: list_each(issue, "{} = {:.6g}", "at", first=2),
     "statuses": lambda issue: ", ".join(issue.subjects[:LISTED_NAMES]),
 }

@@ -89,14 +89,15 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
 
 
 def _is_model_at_fault(problem: Problem, fit: Estimate) -> bool:
-    """Return whether what ended a fit is how a function is written, from wherever the fit begins.
+    """Return whether what is doubted of a fit is how a function is written alone, from wherever the fit begins.
 
-    Derivatives leave a switch out; and where there are none in the initial state, other starts have as few.
+    Derivatives leave a switch out, also at the best end, and where there are none in the initial state, other starts
+    have as few.
     """
     if fit.reason is None:
         return False
     if fit.reason.kind == "switch":
-        return True
+        return not is_doubted(fit)
     is_known = fit.reason.kind == "undefined" and fit.reason.figures["valued"] == 1.0
     begins = [run.t0 for run in problem.experiments]
     return fit.status is Status.NONFINITE_START and is_known and fit.reason.figures.get("t", begins[0]) in begins

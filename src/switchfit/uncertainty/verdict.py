@@ -190,6 +190,7 @@ def find_issues(fit: Fit) -> Iterator[Issue]:
     """
     yield from _find_short_modes(fit)
     yield from _find_bounds(fit)
+    yield from _find_jumps(fit)
     is_time = dict(zip(fit.theta_names, fit.is_time.tolist(), strict=True))
     for kind, wanted in (("idle times", True), ("idle parameters", False)):
         if names := tuple(name for name in fit.idle if is_time[name] is wanted):
@@ -216,10 +217,19 @@ def _find_short_modes(fit: Fit) -> Iterator[Issue]:
 
 
 def _find_bounds(fit: Fit) -> Iterator[Issue]:
-    """Find unknowns that bounds hold which the user gave."""
+    """Find unknowns that bounds hold which the user gave; equal bounds are a value that is known."""
+    known = {*fit.idle, *np.array(fit.theta_names)[fit.lower == fit.upper].tolist()}
     for constraint in fit.active:
-        if constraint.position is None and constraint.unknown not in fit.idle:
+        if constraint.kind in ("lower bound", "upper bound") and constraint.unknown not in known:
             yield Issue(constraint.kind, (constraint.unknown,), {"value": constraint.value})
+
+
+def _find_jumps(fit: Fit) -> Iterator[Issue]:
+    """Find transition times that are held by jumps at known times."""
+    held = [each for each in fit.active if each.kind == "known jump" and each.unknown not in fit.idle]
+    if held:
+        places = tuple(each.value for each in held)
+        yield Issue("at known jumps", tuple(each.unknown for each in held), {"at": places})
 
 
 def _find_kinks(fit: Fit) -> Iterator[Issue]:
@@ -335,7 +345,8 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
         If left out, the checks that do not need the model are made.
     """
     quality = measure_quality(fit) if fit.status.successful and np.isfinite(fit.cost) else None
-    found = [finding for doubt in find_doubts(_list_numbers(fit, quality)) for finding in _explain(fit, quality, doubt)]
+    found = [Finding("doubtful", issue, (OTHER_SIDE,)) for issue in _find_jumps(fit)]  # which may be all that is wrong
+    found += [f for doubt in find_doubts(_list_numbers(fit, quality)) for f in _explain(fit, quality, doubt)]
     found += _find_cut_search(fit, quality)
     found += _find_others(fit, certify(fit, None) if certificate is None else certificate)
     answers = _answer(fit, quality, {f.reason.kind: f.reason for f in found})
@@ -431,10 +442,16 @@ SEARCH_FAILED = {"switch": (), "wrong slope": ("check derivatives", "more starts
 DEFINE = "define it there"
 """What to do about an operation of a function that is not defined, or has no derivative, at a point."""
 
+WRITTEN_OTHERWISE = {"undefined": DEFINE, "cost corner": "cost as a state"}
+"""What to do about a function that kept a fit from converging, by the kind of the reason."""
+
 SWITCH = "transition time"
 """What to do about an unknown with which a function compares, the first of the subjects of this advice."""
 
-OF_SUBJECTS = {DEFINE, FIX, SWITCH, *NO_EFFECT.values()}
+OTHER_SIDE = "other side"
+"""What to do about transition times that are held by jumps at known times, the subjects of this advice."""
+
+OF_SUBJECTS = {DEFINE, FIX, SWITCH, OTHER_SIDE, *NO_EFFECT.values()}
 """Advice that is about the subjects of its reason."""
 
 
@@ -477,8 +494,8 @@ def _find_ending(fit: Fit) -> Iterator[Finding]:
     figures = {"optimality": fit.optimality, "tolerance": fit.tolerance, "iterations": float(fit.iterations)}
     subjects: tuple[str, ...] = (fit.status.name,)
     steps = ENDED.get(fit.status, ("more starts",))
-    if fit.reason is not None and fit.reason.kind == "undefined":
-        yield Finding("bad", fit.reason, (DEFINE,))
+    if fit.reason is not None and fit.reason.kind in WRITTEN_OTHERWISE:
+        yield Finding("bad", fit.reason, (WRITTEN_OTHERWISE[fit.reason.kind],))
         steps = ()
     elif fit.status is Status.LINE_SEARCH_FAILED and fit.reason is not None:
         subjects = (*subjects, fit.reason.kind, *fit.reason.subjects)
@@ -550,7 +567,8 @@ def _answer(fit: Fit, quality: Quality | None, against: dict[str, Issue]) -> tup
 def _describe_fit(fit: Fit, quality: Quality | None) -> dict[str, float]:
     """Return the figures of the sentences about a fit."""
     tried, better, agreeing = map(float, fit.starts or (0, 0, 0))
-    figures = {"tried": tried, "better": better, "agreeing": agreeing, "agrees": float(has_looked(fit))}
+    agrees = has_looked(fit) and not any(_find_jumps(fit))  # no search looks beyond a known jump
+    figures = {"tried": tried, "better": better, "agreeing": agreeing, "agrees": float(agrees)}
     if quality is None or not quality.channels:
         return figures | {"optimality": fit.optimality}
     worst = quality.worst[0]

@@ -374,7 +374,7 @@ def _eliminate_inside(
     slope, column = g + _multiply(H, step), H[each, own.place]
     change = column * own.side[:, None] + _multiply(H, follow)
     after = theta + step
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # what hardly changes has all room
         room = np.where(follow > 0, own.upper - after, after - own.lower) / np.abs(follow)
         room = np.where(free, room, -slope / change)
     meets = np.fmin.reduce(room, axis=1, where=own.free & (room > 0), initial=np.inf)

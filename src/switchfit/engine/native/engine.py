@@ -232,7 +232,9 @@ class NativeExperiment:
             # The backward sweep has lam . c in it like a cost: g is that of the Lagrangian, and that of J is g - A'
             # lam.
             c, A = self._named["constraints"][where], self._spread(self._jacobian[where])
-            return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A, self._read_errors())
+            with np.errstate(invalid="ignore", over="ignore"):  # a point that is not finite is refused
+                gradient = g - multipliers.dot(A)
+            return Evaluation(self._J.item(0), gradient, H, c, A, self._read_errors())
 
     def find_constraints(self, tau: FloatArray, p: FloatArray, side: float) -> DenseEvaluation:
         """Return J and the constraints with their derivatives; those of J are of no meaning."""
@@ -256,7 +258,8 @@ class NativeExperiment:
             is_known = (largest > 0.0) & np.isfinite(largest)
             # Fixed at the first point: errors of later ones are compared with the same sizes.
             self._size_of_states = np.where(is_known, largest, np.finfo(float).max)  # a state that stays 0 has no error
-        return (max((self._named["errors"] / self._size_of_states).tolist()),)
+        with np.errstate(over="ignore"):  # an infinite error is too large
+            return (max((self._named["errors"] / self._size_of_states).tolist()),)
 
     def _spread(self, values: FloatArray) -> FloatArray:
         """Return a copy of derivatives along the last axis, in the experiment's times and parameters.
