@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluator_of, measure_variation
-from switchfit.fit.result import Step
+from switchfit.fit.result import Step, count_priors, count_samples
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
@@ -133,9 +133,13 @@ def is_explained(problem: Problem, cost: float, least: float = UNLIKELY) -> bool
         return cost <= (1 - NEARLY_ALL) * float(measure_variation(problem).sum())
     if not (problem.is_sigma_known and problem.is_least_squares):
         return False
-    count = sum(item.count for item in problem.measurements)
-    freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
+    freedom = _count_freedom(problem)
     return freedom > 0 and bool(compare_with_sigma(2 * cost, freedom)[0] >= least)
+
+
+def _count_freedom(problem: Problem) -> int:
+    """Return the degrees of freedom, with all unknowns free, without a simulation."""
+    return count_samples(problem) + count_priors(problem) - len(problem.theta_names)
 
 
 def is_shallow(problem: Problem, fit: Estimate) -> bool:
@@ -147,10 +151,11 @@ def is_shallow(problem: Problem, fit: Estimate) -> bool:
     problem : Problem
     fit : Estimate
     """
-    if not (problem.is_sigma_known and problem.is_least_squares):
+    freedom = _count_freedom(problem)
+    if not (problem.is_sigma_known and problem.is_least_squares and freedom > 0):
         return False
     # J is accepted up to this above its mean, freedom / 2, and the lowest may be two standard deviations below it.
-    hidden = 0.5 * CLEARLY_OFF * fit.freedom + 2 * np.sqrt(0.5 * fit.freedom)
+    hidden = 0.5 * CLEARLY_OFF * freedom + 2 * np.sqrt(0.5 * freedom)
     for e, run in enumerate(problem.experiments):
         places = problem.unknowns.times[e]
         modes = np.diff(run.ends_of_modes(np.where(places >= 0, fit.theta[places], run.initial_times)))

@@ -283,7 +283,7 @@ def _list_intervals(
 ) -> Iterator[tuple[int, float, float]]:
     """Yield the place of a time in theta, and the ends of an interval near by in which it may be."""
     ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
-    for i, place in enumerate(where.tolist()):
+    for i, place in enumerate(where.tolist()[: len(ends) - 2]):  # without a free tf
         k = int(np.searchsorted(nodes, theta[place], "right")) - 1
         for j in range(max(k - FURTHEST, 0), min(k + FURTHEST, len(nodes) - 2) + 1):
             low, high = nodes[j], nodes[j + 1]
