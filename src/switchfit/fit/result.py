@@ -499,9 +499,11 @@ class Fit(Termination):
         """
         return self.variance_scale * invert(self, self.hessian, self.variance_scale)
 
-    @property
+    @cached_property
     def held_covariance(self) -> FloatArray:
         """`covariance` on the free directions alone: (d, d). Unknowns at kinks have variance 0."""
+        if not self.kinks:
+            return self.covariance
         return self.variance_scale * inverse_on(self.free_basis, self.hessian)
 
     @property
