@@ -210,9 +210,8 @@ def _list_hops(
         return
     unknowns, whole = evaluator.problem.unknowns, evaluator(theta)
     free = free & (unknowns.lower < theta) & (theta < unknowns.upper)
-    is_one = len(intervals) == 1 and not unknowns.priors.any
     for e, listed in enumerate(intervals):
-        here = _evaluate_run(evaluator, e, theta) if listed and not is_one else whole
+        here = _evaluate_run(evaluator, e, theta) if listed else whole
         for place, low, high in listed:
             model = partial(_find_lowest, evaluator, e, whole, here, theta, free, matrices, place, low, high)
             middle = theta.copy()
