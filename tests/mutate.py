@@ -250,7 +250,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "the exact Hessian alone": swap(HOPS, '= ("exact", "gauss-newton")', '= ("exact",)'),
         "one model of an interval": swap(HOPS, "RIGHT = 8, 4, 0.2", "RIGHT = 8, 1, 0.2"),
         "none beside a minimum": swap(CHOICE, "hops += look_near(", "_ = look_near("),
-        "chi-square hides nothing": swap(CHOICE, "DEEP = 20.0", "DEEP = 0.0"),
+        "chi-square hides nothing": swap(CHOICE, "DEEP = 10.0", "DEEP = 0.0"),
         "re-insertion has the last word": swap(CHOICE, "return len(steps) > 2 and", "return len(steps) > 1 and"),
     },
     "beam": {
