@@ -229,11 +229,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "parameters that do not act are free": swap(FITTER, "lower[held] = upper[held] = theta[held]", "pass"),
         "guarded times count": swap(MODE_POOL, 'if name == "cost" else fitted.free_switches', "if name else 0"),
         "a switch counts once in mBIC": swap("modes/criterion.py", 'each = 2 if name == "mbic" else 1', "each = 1"),
-        "what follows a pulse": swap(
-            "modes/schedule.py",
-            "names[j if closes else j + 1 :]",
-            "names[j + 1 :]",
-        ),
+        "what follows a pulse": swap("modes/schedule.py", "names[j if closes else j + 1 :]", "names[j + 1 :]"),
         "reset maps of another sequence": swap(
             "engine/native/engine.py",
             "self._named[name][:] = which",
@@ -261,9 +257,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "no column for tau": swap(HYPOTHESES, "+ sign * graph.loads(", "+ 0.0 * sign * graph.loads("),
         "column one slot off": swap(HYPOTHESES, "Column.SLOT) + 1", "Column.SLOT) + 2"),
         "a birth before the sample at its time": swap(
-            HYPOTHESES,
-            'self.invoke("at_node", table, record, here + 1)',
-            'self.invoke("at_node", table, record, here)',
+            HYPOTHESES, 'self.invoke("at_node", table, record, here + 1)', 'self.invoke("at_node", table, record, here)'
         ),
         "the highest scores of a place are kept": swap(
             HYPOTHESES, "leave(score >= self._load_score", "leave(score <= self._load_score"
