@@ -254,7 +254,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "dropped F_p": swap(
             KERNELS, "forcing = [self._along_p(graph, f_p) for", "forcing = [self._along_p(graph, 0.0 * f_p) for"
         ),
-        "no column for tau": swap(HYPOTHESES, "+ sign * graph.loads(", "+ 0.0 * sign * graph.loads("),
         "column one slot off": swap(HYPOTHESES, "Column.SLOT) + 1", "Column.SLOT) + 2"),
         "a birth before the sample at its time": swap(
             HYPOTHESES, 'self.invoke("at_node", table, record, here + 1)', 'self.invoke("at_node", table, record, here)'
@@ -359,7 +358,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "priors and other runs left out": swap(CRITERION, "self.information - sum(found))", "0 * self.information)"),
         "guarded times stay where they are": swap(EVALUATOR, "Z[guarded] = -np.linalg", "Z[guarded] = -0 * np.linalg"),
         "weights of samples left out": swap(CRITERION, "taken, C, w, C)", "taken, C, w**0, C)"),
-        "samples that are not taken count": swap(CRITERION, "taken, C, w, C)", "taken**0, C, w, C)"),
         "information of sigma once": swap(CRITERION, "+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum"),
         "gradient of one side": swap(CRITERION, ".mean(0)", "[0]"),
         "limits of inputs ignored": swap(CRITERION, "bounds=[(0.0, 1.0)]", "bounds=[(-1.0, 2.0)]"),

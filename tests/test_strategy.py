@@ -70,7 +70,6 @@ LOCAL, LOWER, SAME = Step("local", 40.0, 9, 0.1), Step("a search", 30.0, 9, 0.1)
         (0.004, (LOCAL, LOWER), True),  # white, but larger than sigma
         (None, (), False),  # a minimum near by may leave as little
         (None, (LOCAL, SAME), True),
-        (None, (LOCAL, LOWER), True),
     ],
 )
 def test_a_search_that_looked_once_is_enough(sigma, steps, enough):
@@ -243,13 +242,16 @@ def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build
     assert budget < clock[0] - local < budget + 2.0 * local
 
 
-def test_a_budget_of_time_ends_the_search():
+def test_a_budget_of_time_ends_the_search(monkeypatch):
     found = sf.estimate(thermostat(FAR), time_budget=1e-6)
     assert [step.strategy for step in found.steps] == ["local"]
     with pytest.raises(ValueError, match="time_budget must be positive"):
         sf.estimate(thermostat(FAR), time_budget=0.0)
     with pytest.raises(ValueError, match="strategy must be 'local', 'auto' or 'thorough'; got 'magic'"):
         sf.estimate(thermostat(FAR), strategy="magic")
+    monkeypatch.setattr(choice, "is_doubted", lambda fit: True)
+    found = [sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=0.01), time_budget=budget) for budget in (None, 0.2)]
+    assert [len(fit.steps) for fit in found] == [2, 3], "the beam finds nothing lower; seconds that are given are used"
 
 
 def test_ctrl_c_in_a_short_fit_ends_the_search(monkeypatch):
