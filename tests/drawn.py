@@ -38,7 +38,7 @@ NAMES = {
     "discretization": "mesh moments implicit random_systems stiffness protocol",
     "engine": "corners mesh stiffness following protocol native",
     "engine/native": "native protocol random_systems beam implicit operations functions",
-    "estimation": "saved_problem estimate save mesh following bad_input",
+    "estimation": "saved_problem estimate save mesh following bad_input moments",
     "experiment_design": "design",
     "fit": "estimate jumps following finiteness starts strategy guards verdict log_times",
     "io": "io saved_problem init tables_out files many_logs",

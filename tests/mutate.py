@@ -199,9 +199,6 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "constraints are measured anew": swap(
             STATE, "np.where(lengths > GROWN, lengths, 1.0)", "np.ones(len(lengths))"
         ),
-        "a violation that stays the same for a while is no end": swap(
-            STEP, "return equalities.predict(normal) > FALL * point.violation", "return True"
-        ),
         "the constraints in the Hessian of the Lagrangian": swap(STATE, "self.multipliers / units)", "0.0 * units)"),
         "bounds of the normal step": swap(QP, "if cube.holds(shortest):", "if True:"),
         "dependent rows": swap(QP, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),

@@ -175,7 +175,10 @@ def test_no_function_is_accused_that_does_not_compare():
 def test_the_corner_of_a_running_cost_that_keeps_a_fit_from_converging_is_named():
     system = sf.HybridSystem({f"{a:+g}": lambda t, x, p, a=a: a * p["u"] - 0.5 * x for a in (1.0, -1.0)}, [0.0])
     cost = sf.RunningCost(lambda t, x, p: jnp.abs(x[0] - 1.0) + 0.05 * p["u"] ** 2)
-    found = sf.estimate(models.one_run(system, cost, ("+1", "-1", "+1"), (2.0, 3.0), 6.0, {"u": 1.5}), strategy="local")
+    passed = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + 1e-3 * jnp.abs(x[0] + 9.0) + 0.05 * p["u"] ** 2)
+    given = {"sequence": ("+1", "-1", "+1"), "times": (2.0, 3.0), "tf": 6.0, "parameters": {"u": 1.5}}
+    assert sf.estimate(models.one_run(system, passed, **given)).reason is None
+    found = sf.estimate(models.one_run(system, cost, **given), strategy="local")
     assert f"RunningCost 1 has a corner at test_moments.py:{cost.ell.__code__.co_firstlineno}" in str(found.verdict)
 
 

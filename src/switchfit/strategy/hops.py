@@ -219,6 +219,7 @@ def _list_hops(
             yield *model(middle), model
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a model whose numbers are not finite has no minimum
 def _find_lowest(
     evaluator: Evaluator,
     e: int,
