@@ -30,7 +30,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.jaxprs import Walk, evaluate, find_line, find_public_name
 from switchfit.problem.problem import Problem, keep_with_problem
-from switchfit.problem.structure import Structure, pad_length, trace_structure
+from switchfit.problem.structure import Structure, trace_structure
 
 
 class Unread(NamedTuple):
@@ -298,7 +298,7 @@ def find_undefined(
     """
     if arguments:  # the last point once more and again: runs of similar length share a compiled check
         count = len(arguments[0])
-        repeated = np.minimum(np.arange(pad_length(count)), count - 1)
+        repeated = np.minimum(np.arange(1 << (count - 1).bit_length()), count - 1)
         arguments = [argument[repeated] for argument in arguments]
     with use_float64():
         given = [jnp.asarray(argument, dtype=jnp.float64) for argument in arguments]
