@@ -320,17 +320,17 @@ def estimate(
                 raise
             failure = error
         others: list[FloatArray] = []
-        is_over, is_settled = strategy == "local", False
+        is_over, only_others = strategy == "local", False
         if best is not None and strategy == "auto":
             only_few = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # were asked for
             is_over = hessian != "auto" or only_few
             if not is_over and is_enough(problem, best):
                 others = find_other_minima(best)
-                is_settled = not is_shallow(problem, best) or bool(explain_no_beam(problem))
-                is_over = is_settled and not others
+                only_others = not is_shallow(problem, best) or bool(explain_no_beam(problem))
+                is_over = only_others and not others
         if best is not None and is_over:
             return best
-        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, others, is_settled)
+        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, others, only_others)
         search.run(callback, budget, compiled)
         if failure is not None and search.best is None:
             raise failure
@@ -393,7 +393,7 @@ class Search:
     began: float
     line: Line
     others: Sequence[FloatArray] = ()
-    is_settled: bool = False
+    only_others: bool = False
     starts: Starts | None = None
     has_budget: bool = False
     running: ClassVar[int] = 0
@@ -412,7 +412,7 @@ class Search:
         Search.running += 1
         self.has_budget = budget is not None
         try:
-            strategies = [] if self.is_settled else self._list_strategies()  # compiles
+            strategies = [] if self.only_others else self._list_strategies()  # compiles
             took = self.steps[0].seconds - compiled
             most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * took)
             with limit_time(most if budget is None else budget - (time.perf_counter() - self.began), callback):
