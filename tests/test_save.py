@@ -156,8 +156,8 @@ def test_a_file_in_the_repository_prints_the_same_report_as_ever():
         (b"", "not valid JSON"),
         (b"[" * 100_000, "not valid JSON"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 10"),
-        (b'{"format": "switchfit fit", "version": 10}', "is damaged: its content is not what was written"),
+        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 11"),
+        (b'{"format": "switchfit fit", "version": 11}', "is damaged: its content is not what was written"),
     ],
 )
 def test_what_is_no_saved_fit(text, message, tmp_path):

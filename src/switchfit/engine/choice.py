@@ -163,6 +163,7 @@ class SplitEngine:
         """Return J alone."""
         return self._solve(tau, p, 1.0)[1].cost
 
+    @np.errstate(over="ignore", invalid="ignore")  # far from the data numbers may overflow
     def derivatives(
         self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Evaluate | None = None
     ) -> DenseEvaluation:

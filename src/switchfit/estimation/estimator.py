@@ -952,7 +952,7 @@ def make_relative(path: str | Path, folder: str | Path) -> str:
 
 
 FORMAT = "switchfit fit"
-VERSION = 10
+VERSION = 11
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:

@@ -252,6 +252,9 @@ class Step:
     ended: str = ""
 
 
+Rival = tuple[str, float, float]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Termination):
     """Result of an estimation; d unknowns in the order of `theta_names`.
@@ -342,6 +345,8 @@ class Fit(Termination):
     starts : (tried, better, agreeing) or None
         Numbers of other starts that were fitted, that ended lower than this fit, and that ended at its J; None without
         other starts.
+    rivals : tuple of (unknown, value, rise)
+        Transition times of other minima that the data do not tell from this one, and by how much J is higher there.
     steps : tuple of Step
         The strategies that were tried, in order; empty if the first fit was enough.
     initial_cost : float
@@ -383,6 +388,7 @@ class Fit(Termination):
     engine: Engine | None = None
     integration_error_of: str = "J"
     starts: tuple[int, int, int] | None = None
+    rivals: tuple[Rival, ...] = ()
     steps: tuple[Step, ...] = ()
     initial_cost: float = np.nan
 

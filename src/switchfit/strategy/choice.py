@@ -8,9 +8,10 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -19,15 +20,24 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluator_of, measure_variation
-from switchfit.fit.result import Step, count_priors, count_samples
+from switchfit.fit.result import Rival, Step, count_priors, count_samples
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_callable, as_choice, as_instance, as_positive
+from switchfit.runtime.cache import measure_work
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
-from switchfit.strategy.hops import can_reinsert, find_far_minima, look_beyond_corners, look_near, reinsert_modes
+from switchfit.strategy.hops import (
+    WORTH,
+    can_reinsert,
+    find_far_minima,
+    is_lower,
+    look_beyond_corners,
+    look_near,
+    reinsert_modes,
+)
 from switchfit.strategy.known_order import explain_no_beam, find_times
 from switchfit.strategy.starts import (
     End,
@@ -44,6 +54,7 @@ from switchfit.strategy.starts import (
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.residuals import CLEARLY_OFF, UNLIKELY, compare_with_sigma
 from switchfit.uncertainty.verdict import NEARLY_ALL, find_without_effect
+from switchfit.uncertainty.walks import compute_threshold
 
 MORE_STARTS = "next: more starts"
 """Step that a verdict advises where the fit may be better elsewhere."""
@@ -189,8 +200,12 @@ with it, 100 ms with a few starts behind it, and 1 s with many."""
 FEW_STARTS = 12
 """Starts that look whether re-insertion has missed a minimum: one that is met from a fifth of them is missed by 7 %."""
 
-MOST_LEFT = 4
-"""Times that a search goes on to another minimum near by."""
+MOST_LEFT = 20
+"""Times that a search goes on to another minimum near by. A brake whose samples are exact has one in each interval
+between samples: on its way to the lowest a fit passed five."""
+
+RIVAL_LEVEL, RIVAL_ITERATIONS = 0.95, 20
+"""Confidence level at which the data do not tell two minima apart; and the most iterations of a fit of the other."""
 
 MORE = "more iterations"
 """Name of what is no search: a fit that has not converged goes on."""
@@ -311,7 +326,7 @@ def estimate(
 
         with suppress(NotIntegrableError):  # the fit says why
             evaluator_of(problem)
-        compiled = time.perf_counter() - began
+        prepared = measure_work()
         best, failure = None, None
         try:
             best = fit(start, "fit")
@@ -319,40 +334,68 @@ def estimate(
             if strategy == "local":
                 raise
             failure = error
+        most = np.inf if strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * (measure_work() - prepared))
+
+        def limit_searches() -> AbstractContextManager[None]:
+            """Return the limit of time of searches that begin now: what is left of the budget; without one, no time in
+            which programs are compiled counts, so that no verdict depends on what is compiled already.
+            """
+            if budget is None:
+                return limit_time(most, callback, measure_work)
+            return limit_time(budget - (time.perf_counter() - began), callback)
+
         others: list[FloatArray] = []
+        rivals: tuple[Rival, ...] = ()
         is_over, only_others = strategy == "local", False
         if best is not None and strategy == "auto":
             only_few = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS  # were asked for
             is_over = hessian != "auto" or only_few
             if not is_over and is_enough(problem, best):
-                others = find_other_minima(best)
+                with limit_searches():
+                    others, rivals = find_other_minima(best)
                 only_others = not is_shallow(problem, best) or bool(explain_no_beam(problem))
                 is_over = only_others and not others
         if best is not None and is_over:
-            return best
-        search = Search(problem, best, problem.check_theta(start), strategy, fit, began, line, others, only_others)
-        search.run(callback, budget, compiled)
+            return replace(best, rivals=rivals) if rivals else best
+        begin = problem.check_theta(start)
+        search = Search(problem, best, begin, strategy, fit, began, line, others, rivals, only_others)
+        search.has_budget = budget is not None
+        search.run(limit_searches)
         if failure is not None and search.best is None:
             raise failure
         return search.finish()
 
 
-def find_other_minima(fit: Estimate, *, in_times: bool = True) -> list[FloatArray]:
+def find_other_minima(fit: Estimate) -> tuple[list[FloatArray], tuple[Rival, ...]]:
     """Return starts at other minima that may be lower than the end of a good fit, the best first: in a transition time,
-    or where the state meets corners in another way.
+    or where the state meets corners in another way; and the minima in a time that the data do not tell from it.
     """
-    evaluator = fit.evaluator_at_solution()
-    if not evaluator.problem.is_sigma_known or not fit.status.is_strict_minimum:
-        return []
+    evaluator, scale = fit.evaluator_at_solution(), fit.variance_scale
+    hops: list[FloatArray] = []
+    rivals: dict[str, Rival] = {}
+    if not (fit.status.is_strict_minimum and scale > 0.0):
+        return hops, ()
     try:
         errors = np.sqrt(np.diag(fit.held_covariance))  # 0 at kinks, which hold their times
-        hops = find_far_minima(evaluator, fit.theta, fit.cost, errors) if in_times else []
-        hops += look_near(evaluator, fit.theta, fit.cost, errors)
-        if hops or evaluator.problem.constraint_names:
-            return hops
-        return look_beyond_corners(evaluator, fit.theta, fit.cost, fit.held_covariance)
-    except (KeyboardInterrupt, NotIntegrableError, OutOfTimeError):  # the fit stays
-        return []
+        hops, close = find_far_minima(evaluator, fit.theta, fit.cost, errors, scale)
+        hops += look_near(evaluator, fit.theta, fit.cost - WORTH * scale, errors)
+        if not hops and not evaluator.problem.constraint_names:
+            hops = look_beyond_corners(evaluator, fit.theta, fit.cost - WORTH * scale, fit.held_covariance)
+        for place, point in [] if hops else close:
+            end = fit_briefly(evaluator.problem, point, RIVAL_ITERATIONS, evaluator)
+            if is_lower(end.cost, fit.cost):
+                hops.append(end.theta)
+            elif end.cost < fit.cost + compute_threshold(fit, RIVAL_LEVEL):
+                name, value = fit.theta_names[place], float(end.theta[place])
+                low, high = fit.confidence_intervals(RIVAL_LEVEL)[place]
+                if not low <= value <= high:
+                    rival = name, value, end.cost - fit.cost
+                    rivals[name] = min(rivals.get(name, rival), rival, key=itemgetter(2))
+    except (KeyboardInterrupt, OutOfTimeError):
+        pass
+    except Exception:  # the fit is not lost by what is met elsewhere
+        logger.info("the look at other minima has failed", exc_info=True)
+    return hops, tuple(rivals.values())
 
 
 def _write_to(
@@ -393,6 +436,7 @@ class Search:
     began: float
     line: Line
     others: Sequence[FloatArray] = ()
+    rivals: tuple[Rival, ...] = ()
     only_others: bool = False
     starts: Starts | None = None
     has_budget: bool = False
@@ -405,17 +449,14 @@ class Search:
         self.steps = [Step(name, self.lowest, self.evaluations, time.perf_counter() - self.began)]
         self.first_cost = np.nan if self.best is None else self.best.initial_cost
 
-    def run(self, callback: Callable[[IterationRecord], object] | None, budget: float | None, compiled: float) -> None:
-        """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far. Of what the
-        first fit has taken, the seconds in which programs were compiled do not count.
+    def run(self, limit_searches: Callable[[], AbstractContextManager[None]]) -> None:
+        """Try one strategy after the other until the verdict is good, or no time is left; Ctrl-C ends it with the best
+        so far.
         """
         Search.running += 1
-        self.has_budget = budget is not None
         try:
-            strategies = [] if self.only_others else self._list_strategies()  # compiles
-            took = self.steps[0].seconds - compiled
-            most = np.inf if self.strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * took)
-            with limit_time(most if budget is None else budget - (time.perf_counter() - self.began), callback):
+            strategies = [] if self.only_others else self._list_strategies()
+            with limit_searches():
                 for name, find in strategies:
                     if is_late() or not self._try(name, find):
                         break
@@ -452,6 +493,7 @@ class Search:
             initial_cost=self.first_cost,
             steps=tuple(self.steps),
             starts=starts,
+            rivals=self.rivals,
             evaluations=self.evaluations,
             seconds=time.perf_counter() - self.began,
         )
@@ -476,7 +518,7 @@ class Search:
         starts = self.others
         for _ in range(MOST_LEFT):
             if not starts and self.best is not None and is_enough(self.problem, self.best, self.steps):
-                starts = find_other_minima(self.best, in_times=False)
+                starts, self.rivals = find_other_minima(self.best)
             before = self.lowest
             for start in starts:
                 if not is_late() and self.lowest == before:

@@ -69,6 +69,9 @@ DIPS, MODELS, RIGHT = 8, 4, 0.2
 """Dips of J that are looked into, the lowest; models of each, one about the minimum of the last; and the part of what a
 minimum is above the cost below which the error of J there makes no difference."""
 
+CLOSE = 12.0
+"""By how much, in variances of the noise, a point beside another minimum may be above the cost for a fit from there."""
+
 SCAN_STEP = 1 / 40
 """Largest distance of two places, as a part of the horizon: others may be narrow. A scan from a kink begins with it."""
 
@@ -150,7 +153,7 @@ def choose_hops(
 
 
 def look_near(evaluator: Evaluator, theta: FloatArray, cost: float, errors: FloatArray) -> list[FloatArray]:
-    """Return starts in sample intervals beside a minimum where J may be lower by more than noise hides, the best first.
+    """Return starts in sample intervals beside a minimum where J may be lower than a cost, the best first.
 
     Parameters
     ----------
@@ -161,12 +164,14 @@ def look_near(evaluator: Evaluator, theta: FloatArray, cost: float, errors: Floa
     errors : (d,)
         Standard errors; 0 of unknowns that are held, as by a kink.
     """
-    return choose_hops(evaluator, theta, cost - WORTH, errors > 0.0, np.where(errors > 0.0, NEAR * errors, np.inf))
+    return choose_hops(evaluator, theta, cost, errors > 0.0, np.where(errors > 0.0, NEAR * errors, np.inf))
 
 
-def find_far_minima(evaluator: Evaluator, theta: FloatArray, cost: float, errors: FloatArray) -> list[FloatArray]:
+def find_far_minima(
+    evaluator: Evaluator, theta: FloatArray, cost: float, errors: FloatArray, scale: float
+) -> tuple[list[FloatArray], list[tuple[int, FloatArray]]]:
     """Return points beside other minima in a transition time at which J is lower than the cost at theta, the best
-    first.
+    first; and those at which it is not much higher, with the place of the time.
 
     Parameters
     ----------
@@ -176,22 +181,31 @@ def find_far_minima(evaluator: Evaluator, theta: FloatArray, cost: float, errors
     cost : float
     errors : (d,)
         Standard errors.
+    scale : float
+        Variance of the noise, 1 if sigma is known.
     """
-    problem, found = evaluator.problem, []
+    problem, found, close = evaluator.problem, [], []
     runs = range(len(problem.experiments))
     dips = sorted((cost, e, interval) for e in runs for cost, interval in _scan(evaluator, e, theta, errors))[:DIPS]
     intervals = [[interval for _, run, interval in dips if run == e] for e in runs]
-    for lowest, start, find_lowest in _list_hops(evaluator, theta, intervals, errors > 0.0, MATRICES):
+    places = [place for each in intervals for place, _, _ in each]
+    hops = _list_hops(evaluator, theta, intervals, errors > 0.0, MATRICES)
+    for place, (lowest, start, find_lowest) in zip(places, hops, strict=True):
+        least = np.inf
         for _ in range(MODELS):
             point = make_feasible(problem, start)
             there = evaluator.cost(point)
             if is_lower(there, cost):
                 found.append((there, point))
+            if there < least:
+                least, best = there, point
             # A model that is right and not lower than the cost has nothing to tell.
             if not there > cost or abs(there - lowest) < RIGHT * (lowest - cost):
                 break
             lowest, start = find_lowest(point)
-    return [point for _, point in sorted(found, key=lambda each: each[0])]
+        if cost < least < cost + CLOSE * scale:
+            close.append((place, best))
+    return [point for _, point in sorted(found, key=lambda each: each[0])], close
 
 
 def _list_hops(
@@ -316,6 +330,7 @@ def _scan(
             for j, t in enumerate(times.tolist()):
                 moved = theta.copy()
                 moved[place] = t
+                check_time()
                 costs[j] = evaluator.engines[e].cost(*problem.vectors(moved, e))
             falls = np.append(costs[1:] < costs[:-1], False)
             for j in np.flatnonzero(falls[:-1] & ~falls[1:]).tolist():
@@ -326,8 +341,8 @@ def _scan(
 def look_beyond_corners(
     evaluator: Evaluator, theta: FloatArray, cost: float, covariance: FloatArray
 ) -> list[FloatArray]:
-    """Return where quadratic models of J about points near by are lowest, the best first, if that is below the cost at
-    theta and the trajectory of the point takes another path through the corners of its modes.
+    """Return where quadratic models of J about points near by are lowest, the best first, if that is below a cost and
+    the trajectory of the point takes another path through the corners of its modes than that of theta.
 
     Parameters
     ----------
@@ -347,6 +362,7 @@ def look_beyond_corners(
             for distance in BEYOND:
                 point = theta + side * distance / errors[place] * covariance[:, place]
                 point = make_feasible(evaluator.problem, point)
+                check_time()
                 if not np.isfinite(evaluator.cost(point)):
                     break
                 if evaluator.paths == path:
@@ -356,7 +372,7 @@ def look_beyond_corners(
                     found = _minimize(there.gradient, there.hessian, errors > 0.0, int(place), -np.inf, np.inf)
                     if found is not None:
                         break
-                if found is not None and there.cost + found[0] < cost - WORTH:
+                if found is not None and there.cost + found[0] < cost:
                     models.append((there.cost + found[0], point + found[1]))
                 break
     return [start for _, start in sorted(models, key=lambda model: model[0])[:MOST]]

@@ -13,7 +13,6 @@ shortest. But nothing that takes longer than the best end is better than it.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,7 +44,7 @@ TOLERANCE = 1e-5
 """On the KKT residual of a short fit; the fit that ends a strategy has that of `estimate`."""
 
 
-_deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)
+_is_late: ContextVar[Callable[[], bool]] = ContextVar("is_late", default=bool)
 _callback: ContextVar[Callable[[IterationRecord], object] | None] = ContextVar("callback", default=None)
 
 
@@ -54,22 +53,27 @@ class OutOfTimeError(Exception):
 
 
 @contextmanager
-def limit_time(seconds: float, callback: Callable[[IterationRecord], object] | None = None) -> Iterator[None]:
-    """Let searches inside the context end after so many seconds, or with that around it, or where a callback, called
-    with each iteration of their fits, returns true.
+def limit_time(
+    seconds: float,
+    callback: Callable[[IterationRecord], object] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Iterator[None]:
+    """Let searches inside the context end after so many seconds of a clock, or with that around it, or where a
+    callback, called with each iteration of their fits, returns true.
     """
-    token = _deadline.set(min(_deadline.get(), time.perf_counter() + seconds))
+    end, around = clock() + seconds, _is_late.get()
+    token = _is_late.set(lambda: clock() > end or around())
     called = _callback.set(callback or _callback.get())
     try:
         yield
     finally:
-        _deadline.reset(token)
+        _is_late.reset(token)
         _callback.reset(called)
 
 
 def is_late() -> bool:
     """Return whether the time budget is spent."""
-    return time.perf_counter() > _deadline.get()
+    return _is_late.get()()
 
 
 def check_time() -> None:

@@ -451,7 +451,10 @@ SWITCH = "transition time"
 OTHER_SIDE = "other side"
 """What to do about transition times that are held by jumps at known times, the subjects of this advice."""
 
-OF_SUBJECTS = {DEFINE, FIX, SWITCH, OTHER_SIDE, *NO_EFFECT.values()}
+PROFILES = "look at profiles"
+"""What to do about transition times that may be elsewhere, the subjects of this advice."""
+
+OF_SUBJECTS = {DEFINE, FIX, SWITCH, OTHER_SIDE, PROFILES, *NO_EFFECT.values()}
 """Advice that is about the subjects of its reason."""
 
 
@@ -536,6 +539,9 @@ def _find_others(fit: Fit, certificate: Certificate) -> Iterator[Finding]:
         yield Finding("doubtful", fit.reason, (SWITCH,))
     if not fit.status.successful:
         return
+    if fit.rivals:
+        names, places, rises = zip(*fit.rivals, strict=True)
+        yield Finding("doubtful", Issue("rivals", names, {"at": places, "rise": rises}), (PROFILES,))
     for issue in find_without_effect(fit):
         yield Finding("doubtful", issue, (NO_EFFECT[issue.kind],))
     vanishing = np.isin(fit.theta_names, fit.log_scaled) & ~fit.is_time & (fit.standard_errors > VANISHING * fit.theta)

@@ -39,6 +39,7 @@ from switchfit.engine.native.templates import ELL, ELL_X, F_X, F, Order, Sizes
 from switchfit.engine.native.trace import Unsupported
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
+from switchfit.runtime.cache import stop_clock
 
 GIVEN = (
     *("nodes", "signals", "c", "p", "bounds", "first_cell", "modes", "resets"),
@@ -713,7 +714,7 @@ def compile_library(library: Structure, sizes: Sizes, orders: tuple[Order, ...],
 
     The log has the reason too.
     """
-    with _one_at_a_time:
+    with _one_at_a_time, stop_clock():
         return _program_of(library, sizes, orders, write)
 
 
