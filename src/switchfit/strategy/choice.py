@@ -341,8 +341,8 @@ def estimate(
             which programs are compiled counts, so that no verdict depends on what is compiled already.
             """
             if budget is None:
-                return limit_time(most, callback, measure_work)
-            return limit_time(budget - (time.perf_counter() - began), callback)
+                return limit_time(most, measure_work, callback)
+            return limit_time(budget - (time.perf_counter() - began), time.perf_counter, callback)
 
         others: list[FloatArray] = []
         rivals: tuple[Rival, ...] = ()

@@ -13,7 +13,6 @@ shortest. But nothing that takes longer than the best end is better than it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -54,9 +53,7 @@ class OutOfTimeError(Exception):
 
 @contextmanager
 def limit_time(
-    seconds: float,
-    callback: Callable[[IterationRecord], object] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
+    seconds: float, clock: Callable[[], float], callback: Callable[[IterationRecord], object] | None = None
 ) -> Iterator[None]:
     """Let searches inside the context end after so many seconds of a clock, or with that around it, or where a
     callback, called with each iteration of their fits, returns true.
