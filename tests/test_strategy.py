@@ -582,10 +582,9 @@ def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found(friction)
     assert not again.steps, "of two minima that are known the lower one is left as it is"
 
 
-@pytest.mark.parametrize(("seed", "sigma"), [(10, 0.04), (5, 0.06)])
-def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(seed, sigma):
-    """A mass on a spring is driven by 2 sin(2 t) until 5 s: 4.4 s, as far before its zero, looks nearly the same. The
-    first model of the interval in which J falls again lies above the fit, or has no minimum."""
+def pushed(sigma: float, seed: int) -> sf.Problem:
+    """Return the log of a mass on a spring that is driven by 2 sin(2 t) until 5 s: 4.4 s, as far before its zero, looks
+    nearly the same."""
 
     def mass(t, x, p, force=0.0):
         return jnp.stack([x[1], force - p["k"] * x[0] - 0.3 * x[1]])
@@ -596,10 +595,60 @@ def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(seed, s
     log = sf.Measurements(np.arange(0.1, 10.0, 0.1), np.zeros(99), sigma=sigma, observe=first_state)
     system = sf.HybridSystem({"driven": driven, "free": mass}, [0.0, 0.0])
     problem = one_run(system, log, ("driven", "free"), (4.42,), 10.0, {"k": 1.0, "a": 2.0})
-    problem = simulate_log(problem, [5.0, 1.0, 2.0], seed)
+    return simulate_log(problem, [5.0, 1.0, 2.0], seed)
+
+
+@pytest.mark.parametrize(("seed", "sigma"), [(10, 0.04), (5, 0.06)])
+def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(monkeypatch, seed, sigma):
+    """The first model of the interval in which J falls again lies above the fit, or has no minimum."""
+    problem = pushed(sigma, seed)
     near = fit_problem(problem, strategy="local", level="good")
     assert near.theta[0] < 4.5
     assert sf.estimate(problem).theta[0] == pytest.approx(5.0, abs=0.02)
+    assert not sf.estimate(problem, time_budget=1e-9).steps, "no time is left to look elsewhere"
+    (run,) = problem.experiments
+    unknown = replace(problem, experiments=replace(run, data=replace(run.data[0], sigma=None)))
+    starts, _ = choice.find_other_minima(sf.estimate(unknown, strategy="local"))
+    assert starts[0][0] == pytest.approx(5.0, abs=0.1)
+    monkeypatch.setattr(choice, "find_far_minima", lambda *given: 1 / 0)
+    assert sf.estimate(problem).theta[0] == near.theta[0], "the fit is not lost"
+
+
+def test_minima_that_the_data_do_not_tell_apart_are_named():
+    fit = fit_problem(pushed(0.1, seed=4), level="doubtful")
+    [(name, value, rise)] = fit.rivals
+    regions = sf.profile(fit, "tau_1").regions()
+    assert (name, len(regions)) == ("tau_1", 2)
+    assert regions[0][0] < value < regions[0][1] < fit.confidence_intervals()[0, 0]
+    other = sf.estimate(fit.problem, start=[value, 1.0, 2.0], strategy="local")
+    assert rise == pytest.approx(other.cost - fit.cost, abs=1e-3)
+    assert f"tau_1 may be {value:.6g} as well, where J is {rise:.2g} higher" in str(fit.verdict)
+
+
+def test_a_minimum_beside_a_fit_with_estimated_sigmas_is_found():
+    """A wheel brakes on a road that becomes wet at 0.9 s; 0.02 s earlier, with more noise, is a minimum, too."""
+
+    def roll(road):
+        def wheel(t, x, p):
+            slip = (x[0] - 0.3 * x[1]) / x[0]
+            force = 2.0 * 9.81 * p[road] * slip * p["s"] / (slip**2 + p["s"] ** 2)
+            return jnp.stack([-force - 0.01 * x[0], 90.0 * force - 500.0])
+
+        return wheel
+
+    wheel = sf.HybridSystem({road: roll(road) for road in ("dry", "wet")}, lambda p: jnp.stack([p["v"], p["v"] / 0.3]))
+    log = sf.Measurements(np.arange(0.02, 1.6, 0.02), np.zeros((79, 2)), sigma=[0.1, 0.5])
+    slips = {name: sf.Parameter(value, scale="log") for name, value in {"dry": 0.7, "wet": 0.7, "s": 0.07}.items()}
+    problem = one_run(wheel, log, ("dry", "wet"), (0.6,), 1.58, slips | {"v": 24.0})
+    truth = [0.9, 0.9, 0.5, 0.1, 25.0]
+    (run,) = simulate_log(problem, truth, seed=18).experiments
+    sigmas = {name: sf.Parameter(0.3, scale="log") for name in ("sigma_v", "sigma_w")}
+    run = replace(run, data=replace(run.data[0], sigma=list(sigmas)))
+    problem = replace(problem, experiments=run, parameters=problem.parameters | sigmas)
+    near, right = (sf.estimate(problem, start=[*start, 0.3, 0.3], strategy="local") for start in ([0.6, 0.7, 0.7, 0.07, 24.0], truth))
+    assert near.cost > right.cost + 5.0
+    fit = fit_problem(problem, level="good")
+    assert fit.cost < right.cost + 0.01
 
 
 def test_a_minimum_behind_a_kink_where_a_pendulum_turns_once_more_is_found():

@@ -379,6 +379,12 @@ class Problem:
         """Whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
         return not any(item.sigma_names or item.loss != "linear" for item in self.measurements)
 
+    @cached_property
+    def is_sigma(self) -> NDArray[np.bool_]:
+        """Which unknowns are the sigma of Measurements: (d,)."""
+        given = [(run, name) for run in self.experiments for item in run.measurements for name in item.sigma_names]
+        return np.isin(self.theta_names, [run.parameter_map.get(name, name) for run, name in given if name])
+
     @property
     def estimates_delays(self) -> bool:
         """Whether the delay of any Measurements is a parameter."""

@@ -200,9 +200,8 @@ with it, 100 ms with a few starts behind it, and 1 s with many."""
 FEW_STARTS = 12
 """Starts that look whether re-insertion has missed a minimum: one that is met from a fifth of them is missed by 7 %."""
 
-MOST_LEFT = 20
-"""Times that a search goes on to another minimum near by. A brake whose samples are exact has one in each interval
-between samples: on its way to the lowest a fit passed five."""
+MOST_LEFT = 4
+"""Times that a search goes on to another minimum near by."""
 
 RIVAL_LEVEL, RIVAL_ITERATIONS = 0.95, 20
 """Confidence level at which the data do not tell two minima apart; and the most iterations of a fit of the other."""

@@ -189,7 +189,7 @@ def find_far_minima(
     dips = sorted((cost, e, interval) for e in runs for cost, interval in _scan(evaluator, e, theta, errors))[:DIPS]
     intervals = [[interval for _, run, interval in dips if run == e] for e in runs]
     places = [place for each in intervals for place, _, _ in each]
-    hops = _list_hops(evaluator, theta, intervals, errors > 0.0, MATRICES)
+    hops = _list_hops(evaluator, theta, intervals, errors > 0.0)
     for place, (lowest, start, find_lowest) in zip(places, hops, strict=True):
         least = np.inf
         for _ in range(MODELS):
@@ -213,22 +213,22 @@ def _list_hops(
     theta: FloatArray,
     intervals: Sequence[list[tuple[int, float, float]]],
     free: NDArray[np.bool_],
-    matrices: Sequence[Matrix] = MATRICES[:1],
 ) -> Iterator[tuple[float, FloatArray, FindLowest]]:
     """Yield for each of some intervals of each run the lowest J of the quadratic model about its middle, theta there,
     and a function that returns both of the model about another point.
 
     The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
-    point, with the first of some matrices that leads to a minimum.
+    point, with the first of `MATRICES` that leads to a minimum. A sigma stays what it is: far from a minimum it would
+    make up for residuals that the other unknowns are to fit.
     """
     if not any(intervals):
         return
     unknowns, whole = evaluator.problem.unknowns, evaluator(theta)
-    free = free & (unknowns.lower < theta) & (theta < unknowns.upper)
+    free = free & (unknowns.lower < theta) & (theta < unknowns.upper) & ~evaluator.problem.is_sigma
     for e, listed in enumerate(intervals):
         here = _evaluate_run(evaluator, e, theta) if listed else whole
         for place, low, high in listed:
-            model = partial(_find_lowest, evaluator, e, whole, here, theta, free, matrices, place, low, high)
+            model = partial(_find_lowest, evaluator, e, whole, here, theta, free, place, low, high)
             middle = theta.copy()
             middle[place] = 0.5 * (low + high)
             yield *model(middle), model
@@ -242,7 +242,6 @@ def _find_lowest(
     here: Evaluation[FloatArray],
     theta: FloatArray,
     free: NDArray[np.bool_],
-    matrices: Sequence[Matrix],
     place: int,
     low: float,
     high: float,
@@ -254,7 +253,7 @@ def _find_lowest(
     check_time()
     own, mine = evaluator.problem.own_places[e]
     side, away = 1 if point[place] < high else -1, (theta - point)[mine]
-    for matrix in matrices:
+    for matrix in MATRICES:
         there = _evaluate_run(evaluator, e, point, side, matrix)
         if not np.isfinite(there.hessian).all():
             break
