@@ -1,7 +1,9 @@
 """From a poor guess to the right answer: each strategy by itself, and how `estimate` chooses among them."""
 
+import time
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from switchfit.engine.choice import SplitEngine
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Step
 from switchfit.optimize import Status
+from switchfit.runtime import cache
 from switchfit.strategy import beam, choice, starts
 from switchfit.strategy.beam import Proposal, Quadratic
 from switchfit.strategy.choice import is_enough
@@ -552,6 +555,12 @@ def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypa
     local = found.steps[0].seconds
     assert 20 * local < clock[0] - local < 22 * local
     assert found.steps[-1].ended == "time"
+
+
+def test_the_clock_of_searches_stands_still_while_programs_are_compiled():
+    before = cache.measure_work() - time.perf_counter()
+    jax.jit(lambda x: jnp.sin(x) + 1.0)(0.0)
+    assert cache.measure_work() - time.perf_counter() < before
 
 
 def test_a_beam_of_which_no_hypothesis_is_left_proposes_nothing():
