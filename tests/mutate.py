@@ -56,7 +56,7 @@ TESTS = {
     "online": [["tests/test_online.py"]],
     "design": [["tests/test_design.py"]],
     "kinks": [["tests/test_uncertainty.py", "-k", "kink"]],
-    "other minima": [["tests/test_strategy.py", "-k", "minimum"]],
+    "other minima": [["tests/test_strategy.py", "-k", "minimum or minima or budget"]],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part that were thought of, one after the other until something does."""
@@ -244,6 +244,10 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "one model of an interval": swap(HOPS, "RIGHT = 8, 4, 0.2", "RIGHT = 8, 1, 0.2"),
         "none beside a minimum": swap(CHOICE, "hops += look_near(", "_ = look_near("),
         "chi-square hides nothing": swap(CHOICE, "DEEP = 10.0", "DEEP = 0.0"),
+        "a sigma makes up for what others are to fit": swap(HOPS, " & ~evaluator.problem.is_sigma", ""),
+        "rivals inside of the interval": swap(CHOICE, "if not low <= value <= high", "if low <= value <= high"),
+        "only a known sigma": swap(CHOICE, "strict_minimum and scale > 0.0", "strict_minimum and fit.sigma_known"),
+        "compilation counts": swap(CHOICE, "limit_time(most, measure_work,", "limit_time(most, time.perf_counter,"),
         "re-insertion has the last word": swap(CHOICE, "return len(steps) > 2 and", "return len(steps) > 1 and"),
     },
     "beam": {
