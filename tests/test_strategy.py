@@ -654,7 +654,10 @@ def test_a_minimum_beside_a_fit_with_estimated_sigmas_is_found():
     sigmas = {name: sf.Parameter(0.3, scale="log") for name in ("sigma_v", "sigma_w")}
     run = replace(run, data=replace(run.data[0], sigma=list(sigmas)))
     problem = replace(problem, experiments=run, parameters=problem.parameters | sigmas)
-    near, right = (sf.estimate(problem, start=[*start, 0.3, 0.3], strategy="local") for start in ([0.6, 0.7, 0.7, 0.07, 24.0], truth))
+    near, right = (
+        sf.estimate(problem, start=[*start, 0.3, 0.3], strategy="local")
+        for start in ([0.6, 0.7, 0.7, 0.07, 24.0], truth)
+    )
     assert near.cost > right.cost + 5.0
     fit = fit_problem(problem, level="good")
     assert fit.cost < right.cost + 0.01
@@ -802,7 +805,8 @@ def test_times_at_which_what_is_measured_jumps_are_found(limit, seed, held, unit
         beyond = np.where(np.array(fit.theta_names) == kink.unknown, 2.0 * round(kink.value, 6) - fit.theta, fit.theta)
         assert sf.evaluate(fit.problem, beyond).cost > fit.cost + 100.0
     if not limit:
-        np.testing.assert_allclose(fit.confidence_intervals()[1], [10.0, 10.1], atol=1e-6)
+        # The middle part of a density that slopes a little between the samples.
+        np.testing.assert_allclose(fit.confidence_intervals()[1], [10.0025, 10.0975], atol=4e-3)
     if not limit and len(held) < 2:  # a profile may end where another time is held
         np.testing.assert_allclose(fit.profile("tau_2").interval(), [10.0, 10.1], atol=1e-6)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from models import STILL, VEHICLE_TRUTH, curve, drive, one_run, positions
+from models import STILL, VEHICLE_TRUTH, curve, drive, one_run, positions, simulate_log
 from scipy.integrate import quad
 from test_report import comparison_of, made, trajectory_of, warnings_of
 from test_report import write_report as report
@@ -104,6 +104,24 @@ def test_what_follows_unknowns_at_kinks_is_as_uncertain(scale, left, right):
         stiffer[place, place] += scale / measure_moment(left / scale, place * right / scale, s / scale) - s
     found = free_kinks(inverse, H, [(place, -left, place * right) for place in held], scale)
     np.testing.assert_allclose(found, np.linalg.inv(stiffer), rtol=1e-9)
+
+
+@pytest.mark.parametrize("level", [0.6, 0.95])
+def test_the_interval_of_a_time_at_which_what_is_measured_jumps_is_that_of_its_density(level):
+    """J jumps at each sample; all other unknowns are known, so that its density can be summed."""
+    modes = dict.fromkeys(("before", "after"), lambda t, x, p: -0.05 * x)
+    system = sf.HybridSystem(modes, [10.0], {("before", "after"): lambda t, x, p: x + 1.5})
+    t, grid = np.arange(0.5, 40.0), np.linspace(0.0, 40.0, 400_001)
+    log = sf.Measurements(t, np.zeros(40), sigma=1.0)
+    problem = simulate_log(one_run(system, log, tuple(modes), (16.0,), 40.0), [16.2], seed=0)
+    y, costs = problem.measurements[0].values[:, 0], np.zeros_like(grid)
+    for time, value in zip(t, y, strict=True):
+        seen = 10.0 * np.exp(-0.05 * time) + np.where(grid < time, 1.5 * np.exp(-0.05 * (time - grid)), 0.0)
+        costs += 0.5 * (value - seen) ** 2
+    density = np.exp(costs.min() - costs)
+    expected = np.interp([0.5 - 0.5 * level, 0.5 + 0.5 * level], np.cumsum(density) / density.sum(), grid)
+    found = sf.estimate(problem).confidence_intervals(level)[0]
+    np.testing.assert_allclose(found, expected, atol=0.02)
 
 
 def test_no_covariance_of_another_kind():

@@ -63,7 +63,13 @@ from switchfit.uncertainty.prediction import (
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, diagnose, measure_widening
 from switchfit.uncertainty.verdict import Verdict, judge
-from switchfit.uncertainty.walks import HIGHEST_LEVEL, compute_threshold, replace_intervals, trace_profiles
+from switchfit.uncertainty.walks import (
+    HIGHEST_LEVEL,
+    compute_threshold,
+    replace_intervals,
+    replace_where_cost_jumps,
+    trace_profiles,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -360,7 +366,9 @@ class Estimate(Fit, Tabular, Displayed):
         and divided by exp(quantile x relative standard error). For a transition time at a kink, or with a sample time
         within five standard errors, it is the range in which 2 (J − J_min) of its profile, followed piece by piece,
         stays below the squared quantile: slope and curvature of the cost jump at every sample time, so that this
-        interval is not symmetric. An estimate that was loaded without its model has these profiles up to level 0.99;
+        interval is not symmetric. Where what is measured jumps at a transition, J itself jumps at samples, and the
+        interval is the middle part of the density exp(-J) of the profile: chi-square does not hold (Hansen 2000).
+        An estimate that was loaded without its model has these profiles up to level 0.99;
         one with more than 15 experiments, guards, terminal constraints, or a model with thin layers has ``theta +-
         quantile x standard error`` only. NaN for an unknown that is held by a bound or a collapsed mode.
 
@@ -391,7 +399,8 @@ class Estimate(Fit, Tabular, Displayed):
             quantile = measure_quantile(level, max(self.freedom, 1), self.sigma_known and hessian != "sandwich")
             return self.build_intervals(quantile * np.sqrt(np.diag(self.covariance_from(hessian))))
         pieces, places = self._trace_profiles(level)
-        return replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))
+        found = replace_intervals(intervals, pieces, places, np.array(compute_threshold(self, level)))
+        return replace_where_cost_jumps(found, pieces, places, self, level)
 
     def _trace_profiles(self, level: float = HIGHEST_LEVEL) -> tuple[FloatArray, NDArray[np.intp]]:
         """Return the profiles of transition times with samples near; without the model those that were saved."""
