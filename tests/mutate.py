@@ -55,7 +55,7 @@ TESTS = {
     ],
     "online": [["tests/test_online.py"]],
     "design": [["tests/test_design.py"]],
-    "kinks": [["tests/test_uncertainty.py", "-k", "kink"]],
+    "kinks": [["tests/test_uncertainty.py", "-k", "kink or density"]],
     "other minima": [["tests/test_strategy.py", "-k", "minimum or minima or budget"]],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
@@ -235,6 +235,9 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
     },
     "kinks": {
         "what follows a kink": swap("fit/result.py", "+ follow @ V @ follow.T", "+ 0.0 * follow @ V @ follow.T"),
+        "half of J in the density": swap(
+            "uncertainty/walks.py", "np.exp(-np.concatenate(", "np.exp(-0.5 * np.concatenate("
+        ),
         "second moment": swap("fit/result.py", "(Z - g * (1.0 - g * Z) / s) / s", "(Z + g * (1.0 - g * Z) / s) / s"),
     },
     "other minima": {
