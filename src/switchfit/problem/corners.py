@@ -65,10 +65,6 @@ BEYOND = 1e-8
 """Smallest |g| at which a field is evaluated beyond a corner."""
 
 
-MOST_SLIDING = 2
-"""Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
-
-
 class _Entries(NamedTuple):
     """An array of objects, each of which is an array of shape ()."""
 
@@ -363,6 +359,10 @@ class Corners:
 
         return self._derive(("rates_at", corner), sides, evaluate)
 
+    def onto(self, sides: Sides, corner: int) -> Function:
+        """Return the point of a corner that is the nearest to the given one, to first order: (n,)."""
+        return self._derive(("onto", corner), sides, lambda *given: self._move(sides, corner, 0.0, given))
+
     def beyond(self, sides: Sides, corner: int) -> Function:
         """Return the field of a branch, (n,), at a point beyond one of its corners that is near to the given one."""
 
@@ -580,12 +580,12 @@ def _settle(sides: Sides) -> Sides:
 
 
 def _solve(A: list[list[Any]], b: list[Any]) -> list[Any]:
-    """Solve one or two linear equations."""
-    if len(b) == 1:
-        return [b[0] / A[0][0]]
-    (a, c), (d, e) = A
-    whole = a * e - c * d
-    return [(b[0] * e - c * b[1]) / whole, (a * b[1] - d * b[0]) / whole]
+    """Solve linear equations by elimination, without pivoting: A_kk < 0 where corner k attracts from both sides."""
+    (pivot, *right), *rest = A
+    parts = [row[0] / pivot for row in rest]
+    inner = [[a - part * c for a, c in zip(row[1:], right, strict=True)] for row, part in zip(rest, parts, strict=True)]
+    others = _solve(inner, [each - part * b[0] for each, part in zip(b[1:], parts, strict=True)]) if rest else []
+    return [(b[0] - sum(c * s for c, s in zip(right, others, strict=True))) / pivot, *others]
 
 
 @lru_cache(maxsize=256)
