@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Arguments
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.native.trace import Unsupported, trace_scalars
-from switchfit.problem.corners import MOST_SLIDING, Corners, Sides, find_corners
+from switchfit.problem.corners import Corners, Sides, find_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.structure import Structure
@@ -38,6 +38,10 @@ programs take ten seconds to compile above the first number, which holds unless 
 
 FEW_CORNERS = 2
 """Largest number of corners of a mode for which the ends of a branch are compiled with it, passed or not."""
+
+MOST_SLIDING, MOST_STEEP = 6, 2
+"""Largest number of corners along which a trajectory slides at a time, and of steep ones among them. Each adds a field
+to the branch: programs of six bodies that rest compile in 40 s, and as many steep corners would take minutes."""
 
 MOST_FOUND = 500
 """Largest number of steps in a branch without machine code; then it is compiled."""
@@ -436,7 +440,9 @@ class Course:
         of_end, slides = self.list_ends(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
-        steep = np.array([self._is_steep(k) for k in of_end])
+        # Beside a steep corner a trajectory is slow, but not on the other side, where tanks are empty up to errors.
+        margins = dict(self.corners.margins)
+        steep = np.array([(k, self.sides[k] or 1) in margins or (k, self.sides[k] or -1) in margins for k in of_end])
         limits = np.minimum(-np.where(steep, PASSED_STEEP, PASSED) * np.where(slides, 1.0, scale), self._beyond)
         # Negative at the end of the step, or possibly in between: only these are looked at on the cubic.
         suspects = (dips | (values[1:] < limits)).any(axis=1)
@@ -514,16 +520,25 @@ class Course:
         """
         for _ in range(2 * len(sides) + 2):
             # Sides from the signs of g; where g is zero up to rounding, from its rates on both sides. One decision may
-            # change the field, and with it another: repeated until nothing changes.
+            # change the field, and with it another: each is made with those before it, until nothing changes.
             g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
-            near = AT_CORNER * self._scale + 2.0 * drift
-            after = tuple(
-                self._decide(sides, k, t, x, inside) if abs(g[k]) <= near[k] else (1 if g[k] > 0 else -1)
-                for k in range(len(sides))
-            )
-            if after == sides:
+            is_near, before, at = np.abs(g) <= AT_CORNER * self._scale + 2.0 * drift, sides, x
+            # Tanks that run empty at the same time are at rest: what errors of their levels let flow between them is
+            # not there at the corners themselves.
+            for k in filter(self._is_steep, np.flatnonzero(is_near).tolist()):
+                at = self.evaluate(self.corners.onto(sides, k), t, at, inside)
+            for k in range(len(sides)):
+                side = self._decide(sides, k, t, at, inside) if is_near[k] else 1 if g[k] > 0 else -1
+                sides = (*sides[:k], side, *sides[k + 1 :])
+            if sides == before:
                 break
-            sides = after
+        steep = [self._is_steep(k) for k, side in enumerate(sides) if side == 0]
+        for most, count in ((MOST_SLIDING, len(steep)), (MOST_STEEP, sum(steep))):
+            if count > most:
+                raise NotIntegrableError(
+                    f"mode {self._structure.mode_names[self._mode]!r} slides along more than {most} corners of the "
+                    f"state at a time ({self._list_lines()}) at t = {t:.6g}: make rest a mode of its own."
+                )
         return sides
 
     def _decide(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> int:
@@ -547,11 +562,6 @@ class Course:
         for is_up, is_down in ((up > still, down < -still), (abs(up) <= still, abs(down) <= still)):
             if is_up or is_down:
                 return (sides[k] or 1) if is_up and is_down else 1 if is_up else -1
-        if sum(side == 0 for side in (*sides[:k], *sides[k + 1 :])) == MOST_SLIDING:
-            raise NotIntegrableError(
-                f"mode {self._structure.mode_names[self._mode]!r} slides along more than {MOST_SLIDING} corners of the "
-                f"state at a time ({self._list_lines()}) at t = {t:.6g}: make rest a mode of its own."
-            )
         return 0
 
 

@@ -64,9 +64,6 @@ MOST_KNOTS = 16
 BEYOND = 1e-8
 """Smallest |g| at which a field is evaluated beyond a corner."""
 
-MOST_SLIDING = 2
-"""Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
-
 
 class _Entries(NamedTuple):
     """An array of objects, each of which is an array of shape ()."""
@@ -345,7 +342,8 @@ class Corners:
 
     def surfaces(self, sides: Sides) -> Function:
         """Return the functions g of all corners, (count,), with these sides."""
-        return self._derive("surfaces", sides, lambda *given: jnp.stack(self._evaluate(_settle(sides), given)[1]))
+        sides = _settle(sides)
+        return self._derive("surfaces", sides, lambda *given: jnp.stack(self._evaluate(sides, given)[1]))
 
     def rates(self, sides: Sides) -> Function:
         """Return dg/dt of all corners along a branch, (count,)."""
@@ -361,12 +359,16 @@ class Corners:
 
         return self._derive(("rates_at", corner), sides, evaluate)
 
+    def onto(self, sides: Sides, corner: int) -> Function:
+        """Return the point of a corner that is the nearest to the given one, to first order: (n,)."""
+        return self._derive(("onto", corner), sides, lambda *given: self._move(sides, corner, 0.0, given))
+
     def beyond(self, sides: Sides, corner: int) -> Function:
         """Return the field of a branch, (n,), at a point beyond one of its corners that is near to the given one."""
 
         def evaluate(t: Array, x: Array, *others: Array) -> Array:
             given = [t, x, *others]
-            g = self._evaluate(_settle(sides), given)[1][corner]
+            g = self.surfaces(sides).evaluate(given)[corner]
             there = self._move(sides, corner, -sides[corner] * (abs(g) + BEYOND), given)
             return self._field(sides, [t, there, *others])[0]
 
@@ -426,7 +428,7 @@ class Corners:
         """Return the sliding corners; f_0 with side -1 at all of them, and f_k with side +1 at one of them alone."""
         sliding, base = [k for k, side in enumerate(sides) if side == 0], _settle(sides)
         every = base, *((*base[:k], 1, *base[k + 1 :]) for k in sliding)
-        return sliding, [self._guard(each, given) for each in every]
+        return sliding, [self._guard(each).evaluate(given) for each in every]
 
     def returns(self, sides: Sides) -> Function:
         """Return what is left of a small displacement from a branch that slides once the trajectory is back: (n, n).
@@ -436,26 +438,29 @@ class Corners:
 
         def evaluate(t: Array, x: Array, *others: Array) -> Array:
             sliding, (f, *fields) = self._slide(sides, [t, x, *others])
-            g_x = jax.jacfwd(lambda x: jnp.stack(self._evaluate(_settle(sides), [t, x, *others])[1]))(x)
+            g_x = jax.jacfwd(lambda x: self.surfaces(sides).evaluate([t, x, *others]))(x)
             A = [[g_x[i] @ (field - f) for field in fields] for i in sliding]
             c = _solve(A, [g_x[i] for i in sliding])
             return jnp.eye(len(x)) - sum(jnp.outer(field - f, each) for field, each in zip(fields, c, strict=True))
 
         return self._derive("returns", sides, evaluate)
 
-    def _guard(self, sides: Sides, given: Sequence[Any]) -> Array:
-        """Return f (n,) with these sides, at steep corners not nearer than their margins."""
-        t, x, *others = given
-        for (k, side), margin in self.margins:
-            if sides[k] == side:
-                is_near = side * self._evaluate(sides, [t, x, *others])[1][k] < margin
-                x = jnp.where(is_near, self._move(sides, k, side * margin, [t, x, *others]), x)
-        return self._evaluate(sides, [t, x, *others])[0]
+    def _guard(self, sides: Sides) -> Function:
+        """Return the mode with these sides, at steep corners no nearer than their margins: traced once for all uses."""
+
+        def evaluate(t: Array, x: Array, *others: Array) -> Array:
+            for (k, side), margin in self.margins:
+                if sides[k] == side:
+                    is_near = side * self.surfaces(sides).evaluate([t, x, *others])[k] < margin
+                    x = jnp.where(is_near, self._move(sides, k, side * margin, [t, x, *others]), x)
+            return self._evaluate(sides, [t, x, *others])[0]
+
+        return self._derive("guard", sides, evaluate)
 
     def _move(self, sides: Sides, corner: int, target: Any, given: Sequence[Any]) -> Array:
         """Return the state nearest to x at which g of a corner is the target, to first order in g: (n,)."""
         t, x, *others = given
-        g, gradient = jax.value_and_grad(lambda x: self._evaluate(_settle(sides), [t, x, *others])[1][corner])(x)
+        g, gradient = jax.value_and_grad(lambda x: self.surfaces(sides).evaluate([t, x, *others])[corner])(x)
         square = jnp.sum(gradient**2)
         return x - (g - target) * gradient / jnp.where(square > 0, square, 1.0)
 
@@ -467,11 +472,11 @@ class Corners:
             u, *others = others
             moving, rates = [*moving, u], [*rates, jnp.stack([u[1], jnp.zeros_like(u[1])])]
         # The derivative of g along (1, f, du/dt): one forward pass.
-        surfaces = lambda *moving: jnp.stack(self._evaluate(_settle(sides), [*moving, *others])[1])  # noqa: E731
+        surfaces = lambda *moving: self.surfaces(sides).evaluate([*moving, *others])  # noqa: E731
         return jax.jvp(surfaces, moving, rates)[1]
 
     def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
-        g = self._evaluate(_settle(sides), given)[1]
+        g = self.surfaces(sides).evaluate(given)
         s = iter(self._field(sides, given)[1])
         # Of a corner with a side: side g, positive inside. Of a sliding one: s and 1 - s, the limits of the convex
         # combination.
@@ -575,12 +580,12 @@ def _settle(sides: Sides) -> Sides:
 
 
 def _solve(A: list[list[Any]], b: list[Any]) -> list[Any]:
-    """Solve one or two linear equations."""
-    if len(b) == 1:
-        return [b[0] / A[0][0]]
-    (a, c), (d, e) = A
-    whole = a * e - c * d
-    return [(b[0] * e - c * b[1]) / whole, (a * b[1] - d * b[0]) / whole]
+    """Solve linear equations by elimination, without pivoting: A_kk < 0 where corner k attracts from both sides."""
+    (pivot, *right), *rest = A
+    parts = [row[0] / pivot for row in rest]
+    inner = [[a - part * c for a, c in zip(row[1:], right, strict=True)] for row, part in zip(rest, parts, strict=True)]
+    others = _solve(inner, [each - part * b[0] for each, part in zip(b[1:], parts, strict=True)]) if rest else []
+    return [(b[0] - sum(c * s for c, s in zip(right, others, strict=True))) / pivot, *others]
 
 
 @lru_cache(maxsize=256)
