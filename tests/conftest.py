@@ -14,6 +14,7 @@ import switchfit as sf
 from switchfit.batch import program as batch_program
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
+from switchfit.models import heater_problem
 from switchfit.uncertainty import certificate
 
 # Tracing allocates so much that the default of 700 has the collector at work for a sixth of the time of such tests.
@@ -159,6 +160,12 @@ def browser(tmp_path_factory):
     opened = Browser(tmp_path_factory.mktemp("chromium"))
     yield opened
     opened.close()
+
+
+@pytest.fixture(scope="module")
+def heater():
+    """The fit of the built-in problem of a heater that is switched off."""
+    return sf.estimate(heater_problem(), strategy="local")
 
 
 MOST_MAPPINGS = 55_000

@@ -239,16 +239,11 @@ def ball(times: Any, *, e: float = 0.8, system: sf.HybridSystem | None = None) -
 # Guards, reset maps, samples, a running cost, terminal constraints, all depending on t, x, p
 
 
-def _first(t, x, p):
-    return jnp.stack([x[1] * jnp.cos(t), -p["a"] * x[0] + 0.3 * x[1] ** 2])
-
-
-def _second(t, x, p):
-    return jnp.stack([p["b"] * x[1] ** 2 - x[0], jnp.sin(x[0]) * p["a"] - 0.2 * x[1]])
-
-
 CONSTRAINED = sf.HybridSystem(
-    {"first": _first, "second": _second},
+    {
+        "first": lambda t, x, p: jnp.stack([x[1] * jnp.cos(t), -p["a"] * x[0] + 0.3 * x[1] ** 2]),
+        "second": lambda t, x, p: jnp.stack([p["b"] * x[1] ** 2 - x[0], jnp.sin(x[0]) * p["a"] - 0.2 * x[1]]),
+    },
     lambda p: jnp.stack([1.0 + 0.1 * p["a"] ** 2, p["b"]]),
     reset_maps={("first", "second"): lambda t, x, p: jnp.stack([x[0] * p["a"], x[1] + 0.1 * x[0] ** 2 * t])},
     guards={

@@ -43,6 +43,13 @@ def minimize(
     return result
 
 
+def draw_matrix(rng, values, decades=3):
+    """A symmetric matrix with these eigenvalues, rows and columns rescaled over as many decades each way; the scale."""
+    Q, _ = np.linalg.qr(rng.normal(size=(len(values), len(values))))
+    B, scale = (Q * values) @ Q.T, 10.0 ** rng.uniform(-decades, decades, len(values))
+    return scale[:, None] * (0.5 * (B + B.T)) * scale, scale
+
+
 def solve_qp(gradient, matrix, normals, offsets):
     """Return the step d and the multipliers of the lowest ``gᵀd + ½ dᵀBd`` with ``C d >= c``."""
     k, d = normals.shape

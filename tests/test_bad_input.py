@@ -192,6 +192,7 @@ test_wrong_values = refused_with(
     (lambda: problem(experiment(inputs=sf.Input([0.0], [1.0]))), ["is called as f(t, x, p, u), but takes the arg"]),
     (lambda: problem(of=system(reset_maps={PAIR: two})), ["reset map ('grow', 'shrink')", "R(t, x, p) must "]),
     (lambda: starting_at(lambda p: p["k"]), ["initial_state(p) must return an array of shape (n,); got shape ()"]),
+    (lambda: with_data(samples(observe=lambda t, x, p: x[1])), ["observe reads index 1 of", "size 1", "are 0 to 0"]),
     (lambda: with_data(samples(observe=two)), ["observe: h(t, x, p)", "shape (1,); got shape (2,)"]),
     (lambda: with_data(sf.RunningCost(two)), ["RunningCost: ell(t, x, p)", "shape (); got shape (2,)"]),
     (lambda: with_data(sf.TerminalCost(grow)), ["TerminalCost is called as phi(x, p), but takes the arguments (t"]),
@@ -276,9 +277,6 @@ def test_an_index_that_is_out_of_range_is_an_error(mode, message):
     """JAX reads the nearest entry instead: x[2] of two states would be the last one, without a word."""
     with pytest.raises(ValueError, match=rf"mode 'm' {message} \(test_bad_input\.py:\d+\): its indices are 0 to \d"):
         problem_of_two_states(mode)
-
-    with pytest.raises(ValueError, match=r"observe reads index 1 of an array of size 1 .*: its indices are 0 to 0"):
-        with_data(samples(observe=lambda t, x, p: x[1]))
 
 
 @pytest.mark.parametrize(

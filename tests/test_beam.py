@@ -23,16 +23,11 @@ from switchfit.strategy.library import Rules, select_lowest
 # A system with everything that a beam can follow
 
 
-def swing(t, x, p, u):
-    return jnp.stack([x[1], -p["k"] * jnp.sin(x[0]) - 0.3 * x[1] + u])
-
-
-def drift(t, x, p, u):
-    return jnp.stack([p["v"] - 0.2 * x[0] ** 2, jnp.cos(t) - p["k"] * x[1]])
-
-
-def brake(t, x, p, u):
-    return jnp.stack([x[1] * 0.5, -p["v"] * x[1] + 0.1 * x[0] + 0.2 * u])
+MODES = {
+    "swing": lambda t, x, p, u: jnp.stack([x[1], -p["k"] * jnp.sin(x[0]) - 0.3 * x[1] + u]),
+    "drift": lambda t, x, p, u: jnp.stack([p["v"] - 0.2 * x[0] ** 2, jnp.cos(t) - p["k"] * x[1]]),
+    "brake": lambda t, x, p, u: jnp.stack([x[1] * 0.5, -p["v"] * x[1] + 0.1 * x[0] + 0.2 * u]),
+}
 
 
 def bounce(t, x, p):
@@ -61,7 +56,7 @@ def everything(running=True, solver="auto", **more):
     at_the_end = sf.TerminalCost(lambda x, p: p["k"] * x[1] ** 2)
     given = {"data": [slow, fast, noisy, at_transitions, at_the_end, *along_the_way]} | more
     bounces = {("swing", "drift"): bounce, ("drift", "brake"): bounce}
-    system = sf.HybridSystem({"swing": swing, "drift": drift, "brake": brake}, [sf.Parameter(0.5), 0.2], bounces)
+    system = sf.HybridSystem(MODES, [sf.Parameter(0.5), 0.2], bounces)
     inputs = sf.Input([0.0, 1.0, 2.2, 4.0], [0.1, 0.5, -0.3, 0.0], kind="hold")
     run = sf.Experiment(mode_sequence=SEQUENCE, transition_times=TIMES, t0=0.0, tf=4.0, inputs=inputs, **given)
     parameters = {"k": sf.Parameter(1.3, lower=0.2), "v": 0.6, "s": sf.Parameter(0.4, lower=0.01)}

@@ -149,16 +149,16 @@ def with_reference():
     return sf.estimate(sf.Problem(STILL, sf.Experiment(signal, ("still",), (), 0.1, 4.0), {"m": 0.0}))
 
 
-REFUSED = {
-    "resample must be one of residuals, wild, blocks, runs; got 'pairs'": made(resample="pairs"),
-    "block is the length of blocks: give it with resample='blocks'": made(block=3),
-    "block must lie between 1 and the 40 samples there are; got 41": made(resample="blocks", block=41),
-    "resample='runs' needs two experiments or more": made(resample="runs"),
-    r"bootstrap needs the result of sf.estimate; got Problem": lambda: sf.bootstrap(mean_of(skewed()).problem),
-    "a bootstrap begins at a minimum": lambda: sf.bootstrap(sf.estimate(mean_of(skewed()).problem, max_iterations=0)),
-    "resamples Measurements; this problem has a ReferenceSignal": lambda: sf.bootstrap(with_reference()),
-    "level must lie between 0 and 1; got 0": lambda: made(runs=10)().intervals(0),
-}
+test_what_is_refused = refused(
+    (made(resample="pairs"), "resample must be one of residuals, wild, blocks, runs; got 'pairs'"),
+    (made(block=3), "block is the length of blocks: give it with resample='blocks'"),
+    (made(resample="blocks", block=41), "block must lie between 1 and the 40 samples there are; got 41"),
+    (made(resample="runs"), "resample='runs' needs two experiments or more"),
+    (lambda: sf.bootstrap(mean_of(skewed()).problem), r"bootstrap needs the result of sf.estimate; got Problem"),
+    (lambda: sf.bootstrap(sf.estimate(mean_of(skewed()).problem, max_iterations=0)), "a bootstrap begins at a minimum"),
+    (lambda: sf.bootstrap(with_reference()), "resamples Measurements; this problem has a ReferenceSignal"),
+    (lambda: made(runs=10)().intervals(0), "level must lie between 0 and 1; got 0"),
+)
 
 
 NO_LEAST_SQUARES = {
@@ -176,6 +176,3 @@ def test_only_least_squares_are_resampled(what):
     fit = sf.estimate(curve(level, TIMES, skewed(), parameters, tf=4.0, **settings))
     with pytest.raises(ValueError, match=rf"least squares alone.* {what}.*sf\.monte_carlo"):
         sf.bootstrap(fit, 5)
-
-
-test_what_is_refused = refused(*((call, said) for said, call in REFUSED.items()))

@@ -45,10 +45,11 @@ room = sf.HybridSystem(modes={"on": on, "off": off}, initial_state=[0.0], state_
 """
 
 
-def log_of(switch, heating=0.5):
+def log_of(switch, heating=0.5, step=0.5, noise=0.0, seed=0):
     """A room that is heated until it is switched off."""
-    times = np.arange(0.25, 6.0, 0.5)
+    times = np.arange(0.25, 6.0, step)
     values = temperature(times, switch, heating, 0.05, start=0.0)
+    values += noise * np.random.default_rng(seed).normal(size=len(times))
     return "t;T\ns;K\n" + "".join(f"{t:g};{v!r}\n" for t, v in zip(times, values.tolist(), strict=True))
 
 

@@ -68,10 +68,8 @@ def exact():
 
 @cache
 def problem():
-    def mode(i):
-        return lambda t, x, p: matrices(p["a"], p["b"], p["c"])[i] @ x
-
-    system = sf.HybridSystem({f"mode {i}": mode(i) for i in range(3)}, lambda p: state_at_start(p["a"], p["b"], p["c"]))
+    modes = {f"mode {i}": lambda t, x, p, i=i: matrices(p["a"], p["b"], p["c"])[i] @ x for i in range(3)}
+    system = sf.HybridSystem(modes, lambda p: state_at_start(p["a"], p["b"], p["c"]))
     samples = sf.Measurements(SAMPLES, VALUES, observe=lambda t, x, p: H @ x, sigma=SIGMA)
     run = sf.Experiment([sf.RunningCost(lambda t, x, p: x @ Q @ x), samples], tuple(system.modes), THETA[:2], T0, TF)
     made = sf.Problem(system, run, dict(zip("abc", THETA[2:].tolist(), strict=True)), rtol=1e-13, atol=1e-15)

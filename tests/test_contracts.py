@@ -35,12 +35,9 @@ def counted(t, x, p):
     return jnp.array([x[1], -p["k"] * x[0]])
 
 
-def damped(t, x, p):
-    return counted(t, x, p) - p["damping"] * x
-
-
 TOLERANCES = {"rtol": 1e-9, "atol": 1e-11}
-OSCILLATOR = sf.HybridSystem({"free": counted, "damped": damped}, [1.0, 0.0])
+DAMPED = {"damped": lambda t, x, p: counted(t, x, p) - p["damping"] * x}
+OSCILLATOR = sf.HybridSystem({"free": counted} | DAMPED, [1.0, 0.0])
 
 
 def oscillator(tau=1.1, k=2.0, damping=0.3, samples=9, seed=0, start=None):

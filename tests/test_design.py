@@ -122,12 +122,9 @@ def test_a_sigma_that_is_a_parameter_and_a_robust_loss():
 
 def test_guarded_times_are_no_unknowns_of_their_own():
     """The covariance is that of the parameters, and of guarded times as functions of them."""
-
-    def fall(t, x, p):
-        return jnp.stack([x[1], -p["g"] + 0.0 * x[0]])
-
+    fall = {"air": lambda t, x, p: jnp.stack([x[1], -p["g"] + 0.0 * x[0]])}
     bounce = {("air", "air"): lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])}
-    system = sf.HybridSystem({"air": fall}, [1.0, 0.0], bounce, guards={("air", "air"): lambda t, x, p: x[0]})
+    system = sf.HybridSystem(fall, [1.0, 0.0], bounce, guards={("air", "air"): lambda t, x, p: x[0]})
     data = planned(np.linspace(0.1, 1.5, 15), observe=first_state, sigma=0.01)
     problem = sf.Problem(system, sf.Experiment(data, ("air", "air"), (0.5,), 0.0, 1.5), {"g": 9.8, "e": 0.8})
     plan = sf.design(problem)
@@ -396,18 +393,18 @@ def test_wrong_limits(limits):
         sf.design(lag(np.ones(4)), free={"u": limits})
 
 
-def test_problems_that_cannot_be_designed():
-    one = lag([1.0])
-    cost = replace(one, experiments=replace(one.experiments[0], data=sf.RunningCost(lambda t, x, p: x[0] ** 2)))
-    corner = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + p["b"] * u}, [1.0])
-    for problem, free, error, message in (
-        (3, None, TypeError, r"problem must be an sf\.Problem"),
-        (line(sigma=None), None, ValueError, "design needs sigma, the standard deviation of the noise, for the data"),
-        (cost, None, ValueError, "design needs Measurements, for the data of run1"),
-        (replace(one, system=corner), {"u": (0.0, 1.0)}, ValueError, "free cannot be used where"),
-    ):
-        with pytest.raises(error, match=message):
-            sf.design(problem, free=free)
+ONE = lag([1.0])
+COST = replace(ONE.experiments[0], data=sf.RunningCost(lambda t, x, p: x[0] ** 2))
+CORNER = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + p["b"] * u}, [1.0])
+
+
+test_problems_that_cannot_be_designed = refused(
+    (lambda: sf.design(3), TypeError, r"problem must be an sf\.Problem"),
+    (lambda: sf.design(line(sigma=None)), "design needs sigma, the standard deviation of the noise, for the data"),
+    (lambda: sf.design(replace(ONE, experiments=COST)), "design needs Measurements, for the data of run1"),
+    (lambda: sf.design(replace(ONE, system=CORNER), free={"u": (0.0, 1.0)}), "free cannot be used where"),
+    error=ValueError,
+)
 
 
 # --- `switchfit design`, and [design] in problem files ----------------------------------------------------------------

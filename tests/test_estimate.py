@@ -25,15 +25,8 @@ from switchfit.runtime.errors import Issue
 # A capacitor that is charged through one resistor and discharged through another one
 
 
-def charge(t, x, p):
-    return p["k"][0] * (1.0 - x)
-
-
-def discharge(t, x, p):
-    return -p["k"][1] * x
-
-
-CAPACITOR = sf.HybridSystem({"charge": charge, "discharge": discharge}, [0.0], state_names=("voltage",))
+MODES = {"charge": lambda t, x, p: p["k"][0] * (1.0 - x), "discharge": lambda t, x, p: -p["k"][1] * x}
+CAPACITOR = sf.HybridSystem(MODES, [0.0], state_names=("voltage",))
 TIMES = np.linspace(0.05, 2.0, 40)
 TRUTH = np.array([0.63, 2.0, 1.0])
 GUESS = np.array([0.8, 1.5, 0.7])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from test_io import LOG, PROBLEM, ROOM
+from test_io import folder as files  # noqa: F401  # a fixture
 from typer.testing import CliRunner
 
 import switchfit as sf
@@ -106,12 +106,9 @@ def outcome(*arguments: str) -> str:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    (tmp_path / "problem.toml").write_text(PROBLEM)
-    (tmp_path / "room.py").write_text(ROOM)
-    (tmp_path / "log.csv").write_text(LOG)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def folder(files, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(files)
+    return files
 
 
 COMMANDS = (

@@ -143,17 +143,14 @@ def test_constraints_that_cannot_be_met_are_named():
 HIGH = ball_system(guards={("air", "air"): lambda t, x, p: x[0] - 60.0})
 BELOW = ball_system(guards={("air", "air"): lambda t, x, p: x[0] < 0.0})
 FIXED = guarded_ball((sf.Parameter(3.2, fixed=True),))
-WRONG = {
-    "No transition times near .* put tau_1 on their": lambda: sf.evaluate_on_guards(ball((3.0,), system=HIGH)),
-    "This problem has no guards": lambda: sf.evaluate_on_guards(ball((3.0,))),
-    "A transition with a guard cannot have a fixed time": lambda: sf.evaluate_on_guards(FIXED),
-    r"hessian must be ('auto' or 'exact'|one of)": lambda: sf.estimate(tank(), hessian="none"),
-    "guards names the unknown mode 'c'; the modes are air": lambda: ball_system(guards={("air", "c"): abs}),
-    r"guard \('air', 'air'\) must be a function g\(t, x, p\)": lambda: ball_system(guards={("air", "air"): 3.0}),
-    r"guard \('air', 'air'\): .* not a comparison": lambda: sf.estimate(ball((3.0,), system=BELOW)),
-    r"TerminalConstraint must be a function psi\(x, p\); got 3": lambda: sf.TerminalConstraint(3),
-    r"must return a number or \(m,\) of them; got \(2, 2\)": lambda: constrain(lambda x, p: jnp.ones((2, 2)) * x[0]),
-}
-
-
-test_what_is_wrong_is_said = refused(*((call, said) for said, call in WRONG.items()))
+test_what_is_wrong_is_said = refused(
+    (lambda: sf.evaluate_on_guards(ball((3.0,), system=HIGH)), "No transition times near .* put tau_1 on their"),
+    (lambda: sf.evaluate_on_guards(ball((3.0,))), "This problem has no guards"),
+    (lambda: sf.evaluate_on_guards(FIXED), "A transition with a guard cannot have a fixed time"),
+    (lambda: sf.estimate(tank(), hessian="none"), r"hessian must be ('auto' or 'exact'|one of)"),
+    (lambda: ball_system(guards={("air", "c"): abs}), "guards names the unknown mode 'c'; the modes are air"),
+    (lambda: ball_system(guards={("air", "air"): 3.0}), r"guard \('air', 'air'\) must be a function g\(t, x, p\)"),
+    (lambda: sf.estimate(ball((3.0,), system=BELOW)), r"guard \('air', 'air'\): .* not a comparison"),
+    (lambda: sf.TerminalConstraint(3), r"TerminalConstraint must be a function psi\(x, p\); got 3"),
+    (lambda: constrain(lambda x, p: jnp.ones((2, 2)) * x[0]), r"must return a number or \(m,\) of them; got \(2, 2\)"),
+)

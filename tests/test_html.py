@@ -80,11 +80,6 @@ def toss_page(tmp_path_factory):
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def heater():
-    return sf.estimate(heater_problem())
-
-
 def hostile_problem():
     """Names of everything that a user names, made to do harm; positions x and y among the names."""
     system = sf.HybridSystem(

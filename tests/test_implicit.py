@@ -138,6 +138,12 @@ def test_stages_one_at_a_time(monkeypatch):
     """As where functions would become too long."""
     monkeypatch.setattr(kernels, "SHORT", 0)
     drop_programs()
+    this = case("mixed")
+    arguments = this.arguments()
+    native = native_experiment(this.structure, arguments, np.unique(np.asarray(arguments.nodes)), Order.HESSIAN)
+    found = native(*AT, 1)
+    assert_same((found.cost, found.gradient, found.hessian), this.discrete(arguments, *AT))
+    drop_programs()
 
 
 def last_of_chain(n, times, q):
@@ -163,12 +169,6 @@ def test_many_states_have_the_derivatives_of_their_closed_form(n):
     assert found.cost == pytest.approx(0.5 * x @ x, rel=1e-8)
     assert_close(found.gradient, x @ first, 1e-7)
     assert_close(found.hessian, first.T @ first + np.einsum("k,kij->ij", x, second), 1e-6)
-    this = case("mixed")
-    arguments = this.arguments()
-    native = native_experiment(this.structure, arguments, np.unique(np.asarray(arguments.nodes)), Order.HESSIAN)
-    found = native(*AT, 1)
-    assert_same((found.cost, found.gradient, found.hessian), this.discrete(arguments, *AT))
-    drop_programs()
 
 
 def test_inside_a_program_of_jax():

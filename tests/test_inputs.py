@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from models import refused
+from models import one_run, refused
 
 import switchfit as sf
 
@@ -35,8 +35,7 @@ BY_NAME, BY_POSITION = system_of("left", "right"), system_of(0, 1)
 def problem_of(system, values, kind="linear", engine="auto"):
     log = sf.Measurements(TIMES[1:-1], VALUES[1:-1], sigma=0.1)
     inputs = sf.Input(SAMPLES, values, kind=kind)
-    run = sf.Experiment(log, ("pull", "slip"), (1.234,), 0.0, 3.0, inputs=inputs)
-    return sf.Problem(system, run, {"k": 1.1}, engine=engine)
+    return one_run(system, log, ("pull", "slip"), (1.234,), 3.0, {"k": 1.1}, inputs=inputs, engine=engine)
 
 
 def both(**settings):

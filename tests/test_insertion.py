@@ -38,20 +38,14 @@ KINDS = {
 
 def driven(data):
     """Modes with an input that jumps at its knots, which are rows' starts."""
-
-    def pushed(t, x, p, u):
-        return jnp.array([x[1] + u, -p["k"] * x[0] * u])
-
-    def free(t, x, p, u):
-        return jnp.array([x[1], -p["g"] * x[1] + u**2 * x[0]])
-
-    def still(t, x, p, u):
-        return jnp.array([-u * x[1], 0.3 * t])
-
-    system = sf.HybridSystem({"pushed": pushed, "free": free, "still": still}, [0.4, 0.1])
+    modes = {
+        "pushed": lambda t, x, p, u: jnp.array([x[1] + u, -p["k"] * x[0] * u]),
+        "free": lambda t, x, p, u: jnp.array([x[1], -p["g"] * x[1] + u**2 * x[0]]),
+        "still": lambda t, x, p, u: jnp.array([-u * x[1], 0.3 * t]),
+    }
     inputs = sf.Input([0.0, 0.5, 1.0, 2.0, 3.0], [1.0, -2.0, 0.7, 1.9, 0.4], kind="hold")
     run = sf.Experiment(data, ("pushed", "free", "pushed"), (1.1, 2.3), 0.0, 3.0, inputs=inputs)
-    return sf.Problem(system, run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
+    return sf.Problem(sf.HybridSystem(modes, [0.4, 0.1]), run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
 
 
 def dosed():

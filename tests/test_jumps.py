@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from models import decay as eliminate
-from models import refused
+from models import one_run, refused
 from scipy.optimize import least_squares
 
 import switchfit as sf
@@ -57,8 +57,7 @@ UNDEFINED = sf.Jump(1.0, lambda t, x, p: x / 0.0)
 
 
 def make_problem(values, jumps=ALL, **options):
-    run = sf.Experiment(make_log(values), ["eliminate"], [], t0=0.0, time_unit="h", jumps=jumps)
-    return sf.Problem(BODY, run, GUESS, **options)
+    return one_run(BODY, make_log(values), ["eliminate"], [], None, GUESS, time_unit="h", jumps=jumps, **options)
 
 
 @pytest.fixture(scope="module")
@@ -98,18 +97,13 @@ def test_fit_ends_where_least_squares_of_the_closed_form_ends(fit, values):
 # --- with transitions -------------------------------------------------------------------------------------------------
 
 
-def speed_up(t, x, p):
-    return -3 * p["k"] * x
-
-
-CHANGING = sf.HybridSystem({"slow": eliminate, "fast": speed_up}, [0.0])
+CHANGING = sf.HybridSystem({"slow": eliminate, "fast": lambda t, x, p: -3 * p["k"] * x}, [0.0])
 
 
 def make_changing(values, guess=10.5, system=CHANGING, **options):
     """Elimination becomes three times as fast at an unknown time."""
     log = sf.Measurements(TIMES, values, sigma=0.05)
-    run = sf.Experiment(log, ["slow", "fast"], [guess], t0=0.0, time_unit="h", jumps=[ALL])
-    return sf.Problem(system, run, GUESS, **options)
+    return one_run(system, log, ["slow", "fast"], [guess], None, GUESS, time_unit="h", jumps=[ALL], **options)
 
 
 def simulate_changing(tau):
@@ -200,8 +194,7 @@ def test_with_a_free_final_time():
     system = sf.HybridSystem({"run": lambda t, x, p: -x}, [1.0])
     data = [sf.RunningCost(lambda t, x, p: 1.0), sf.TerminalConstraint(lambda x, p: x[0] - 1.0)]
     refill = sf.Jump([0.0, 1.0], lambda t, x, p: x + 2.0)
-    run = sf.Experiment(data, ["run"], [], t0=0.0, tf=sf.Parameter(1.5, upper=6.0), jumps=[refill])
-    fit = sf.estimate(sf.Problem(system, run))
+    fit = sf.estimate(one_run(system, data, ["run"], [], sf.Parameter(1.5, upper=6.0), jumps=[refill]))
     assert fit.theta[0] == pytest.approx(1.0 + np.log(3 * np.exp(-1.0) + 2.0), rel=1e-6)
 
 

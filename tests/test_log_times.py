@@ -26,17 +26,13 @@ BEST = np.array([0.0301556479, 4.15919815, 20.0582402, 0.291234028, 0.0019720587
 """Where the fits of `relaxation` end, times since t0."""
 
 
-def decay_at(k):
-    return lambda t, x, p: -p["k"][k] * x
-
-
 def relaxation(guess, scale="log", t0=0.0, tf=None):
     """Three rates of decay, seen from a millisecond to a thousand seconds."""
     times = np.geomspace(1e-3, 1e3, 61)
     first, second = TRUTH
     spent = [np.minimum(times, first), np.clip(times - first, 0, second - first), np.clip(times - second, 0, None)]
     values = np.exp(-np.array(RATES) @ spent) + 0.01 * np.random.default_rng(1).normal(size=61)
-    system = sf.HybridSystem({name: decay_at(k) for k, name in enumerate("abc")}, [1.0])
+    system = sf.HybridSystem({name: lambda t, x, p, k=k: -p["k"][k] * x for k, name in enumerate("abc")}, [1.0])
     data = sf.Measurements(t0 + times, values, sigma=0.01)
     given = [sf.Parameter(t0 + g, scale=scale) if np.isscalar(g) else g for g in guess]
     run = sf.Experiment(data, ("a", "b", "c"), given, t0, tf or t0 + 1000.0)

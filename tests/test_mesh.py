@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from scipy.integrate import RK45, solve_ivp
+from scipy.integrate import solve_ivp
 
 import switchfit as sf
 from switchfit.discretization import rows
 from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, find_row_ending_cell, pad_length
-from switchfit.discretization.rows import ADAPTIVE, ADAPTIVE_ERROR, Tolerances
+from switchfit.discretization.rows import ADAPTIVE_ERROR, Tolerances
 from switchfit.engine import adaptive
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.native.engine import native_experiment
@@ -202,8 +202,3 @@ def test_equal_parts_of_a_cell_as_short_as_rounding_are_one(parts, nodes):
     ends = {a + (b - a) * k / parts for a, b in pairwise(nodes) for k in range(parts)}
     np.testing.assert_array_equal(mesh.times, sorted({*ends, nodes[-1]}))
     assert mesh.cells == len(mesh.times) - 1
-
-
-def test_coefficients_of_dormand_and_prince_are_those_of_scipy():
-    own, scipys = (ADAPTIVE.a, ADAPTIVE.b, ADAPTIVE.c, ADAPTIVE_ERROR), (RK45.A, RK45.B, RK45.C, RK45.E)
-    jax.tree.map(np.testing.assert_array_equal, own, scipys)

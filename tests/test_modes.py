@@ -427,23 +427,20 @@ test_wrong_settings_are_refused = refused(
 )
 
 
-def test_problems_that_cannot_be_searched_are_refused():
-    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("rise", "fall"), (1.0,), 0.0, 2.0)
-    bounded = replace(make_run(), mode_sequence=("rise", "fall"), transition_times=(sf.Parameter(3.0, lower=1.0),))
-    for run, message in (
-        (cost, r"is no likelihood\. Give switch_cost"),
-        (bounded, "transition time 1 of run1 is fixed, or has bounds"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            sf.find_modes(sf.Problem(SYSTEM, run, FREE))
+BOUNDED = {"mode_sequence": ("rise", "fall"), "transition_times": (sf.Parameter(3.0, lower=1.0),)}
+
+
+test_problems_that_cannot_be_searched_are_refused = refused(
+    ({"data": sf.RunningCost(lambda t, x, p: x[0] ** 2)}, r"is no likelihood\. Give switch_cost"),
+    (BOUNDED, "transition time 1 of run1 is fixed, or has bounds"),
+    by=lambda changes: sf.find_modes(sf.Problem(SYSTEM, replace(make_run(), **changes), FREE)),
+    error=ValueError,
+)
 
 
 def test_a_hidden_switch_is_refused():
-    def late(t, x, p):
-        return jnp.where(t < p["rate"], jnp.ones(2), jnp.zeros(2))
-
-    system = sf.HybridSystem({"rise": rise, "late": late}, [0.2, 1.0])
-    problem = sf.Problem(system, replace(make_run(given=("late",))), FREE)
+    late = {"late": lambda t, x, p: jnp.where(t < p["rate"], jnp.ones(2), jnp.zeros(2))}
+    problem = make_problem(system=sf.HybridSystem({"rise": rise} | late, [0.2, 1.0]), given=("late",))
     with pytest.raises(ValueError, match=r"mode .late. compares with rate at test_modes.py"):
         sf.find_modes(problem, "late", max_switches=0)
 

@@ -143,11 +143,10 @@ def smooth(t, x, p):
     return -p["k"] * x + (p["t_on"] - 1.7) ** 4
 
 
-def idle(t, x, p):
-    return -p["k"] * x + 0.0 * p["t_on"]
+IDLE = (lambda t, x, p: -p["k"] * x + 0.0 * p["t_on"]), 1.7
 
 
-@pytest.mark.parametrize(("mode", "t_on"), [(smooth, 1.7), (idle, 1.7), (hiding, sf.Parameter(1.7, fixed=True))])
+@pytest.mark.parametrize(("mode", "t_on"), [(smooth, 1.7), IDLE, (hiding, sf.Parameter(1.7, fixed=True))])
 def test_a_derivative_that_is_zero_for_another_reason_is_no_hidden_switch(mode, t_on):
     """Nor is a switch that is fixed any of ours."""
     found = sf.estimate(hidden_problem(mode, t_on=t_on), strategy="local")

@@ -50,11 +50,6 @@ def car() -> sf.Estimate:
 
 
 @pytest.fixture(scope="module")
-def heater() -> sf.Estimate:
-    return sf.estimate(heater_problem())
-
-
-@pytest.fixture(scope="module")
 def starts() -> sf.Multistart:
     return sf.multistart(heater_problem(), 8)
 

@@ -22,11 +22,8 @@ def problem_of(mode=None, initial_state=(1.0,), data=None):
     return sf.Problem(system, sf.Experiment(data, ("on", "off"), (0.4,), 0.0, 1.0), {"a": 0.8})
 
 
-def scaled(t, x, p):
-    return K * x
-
-
 DRAG, HALF = jnp.array([0.5, 0.3]), jnp.array([0.3], jnp.bfloat16)
+SIGNAL = sf.ReferenceSignal.from_samples(TIMES, TIMES, observe=lambda t, x, p: K * x)
 ENDING = [sf.RunningCost(lambda t, x, p: x[0]), sf.TerminalConstraint(lambda x, p: x[0] - K)]
 WITH_LINE = r"a constant of mode 'on' \(test_precision.py:\d+\) must be in double precision: "
 
@@ -39,7 +36,7 @@ WITH_LINE = r"a constant of mode 'on' \(test_precision.py:\d+\) must be in doubl
         ({"mode": lambda t, x, p: jax.lax.fori_loop(0, 2, lambda k, y: y - DRAG[1] * x, x)}, "a constant of mode 'on'"),
         ({"initial_state": lambda p: jnp.ones(1) * K}, "a constant of initial_state"),
         ({"data": ENDING}, "a constant of TerminalConstraint"),
-        ({"data": sf.ReferenceSignal.from_samples(TIMES, TIMES, observe=scaled)}, "a constant of observe"),
+        ({"data": SIGNAL}, "a constant of observe"),
     ],
 )
 def test_a_constant_in_single_precision_is_refused_with_its_line(given, said):

@@ -200,14 +200,11 @@ def test_a_time_near_the_largest_float_is_reached_by_implicit_steps(fitted):
 
 
 def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known():
-    def driven(t, x, p, u):
-        return -p["k"] * x + u
-
     def fit(kind):
         inputs = sf.Input(np.arange(7.0), np.ones(7), kind=kind)
-        values = 2.5 * (1 - np.exp(-0.4 * TIMES))
-        run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("on",), (), 0.0, 6.0, inputs=inputs)
-        return sf.estimate(sf.Problem(sf.HybridSystem({"on": driven}, [0.0]), run, {"k": 0.3}))
+        system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * x + u}, [0.0])
+        data = sf.Measurements(TIMES, 2.5 * (1 - np.exp(-0.4 * TIMES)), sigma=SIGMA)
+        return sf.estimate(models.one_run(system, data, ("on",), (), 6.0, {"k": 0.3}, inputs=inputs))
 
     assert fit("hold").predict([9.0]).outputs[0, 0] == pytest.approx(2.5 * (1 - np.exp(-3.6)), rel=1e-6)
     with pytest.raises(ValueError, match="Input must be known"):

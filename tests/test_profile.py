@@ -166,11 +166,8 @@ def test_two_regions_of_one_profile():
 
 
 def test_a_lower_minimum_is_told():
-    def double_well(t, x, p):
-        return jnp.array([p["a"] ** 2, 0.1 * p["a"]])
-
     values = np.tile([1.0, -0.1], (len(TIMES), 1))
-    fit = observed(double_well, values, {"a": 0.9}, 0.6)
+    fit = observed(lambda t, x, p: jnp.array([p["a"] ** 2, 0.1 * p["a"]]), values, {"a": 0.9}, 0.6)
     assert fit.theta[0] > 0
     found = fit.profile("a")
     assert found.lower_cost[0] == pytest.approx(-1.0, abs=1e-2)

@@ -129,28 +129,18 @@ def test_a_notebook_shows_what_a_long_call_is_doing(monkeypatch, capfd):
 # A batch that is stopped
 
 
-class Endless:
-    """Work whose second chunk takes very long."""
+def test_a_batch_that_is_stopped_does_not_wait_for_the_chunk_under_way():
+    released = threading.Event()
 
-    size = 1
-
-    def __init__(self):
-        self.released = threading.Event()
-
-    def __call__(self, runs):
+    def work(runs):
         if runs.start:
-            self.released.wait(60.0)
+            released.wait(60.0)
         return {"run": np.array(runs)}
 
-    def fingerprint(self):
-        return "endless"
-
-
-def test_a_batch_that_is_stopped_does_not_wait_for_the_chunk_under_way():
-    work = Endless()
+    work.size, work.fingerprint = 1, lambda: "endless"
     began = time.monotonic()
     runs, _ = run_chunks(work, 2, progress=lambda done, total: True)
     waited = time.monotonic() - began
-    work.released.set()
+    released.set()
     assert runs.tolist() == [0]
     assert waited < 30.0, "as long as the chunk"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optimizer import solve_qp
+from optimizer import draw_matrix, solve_qp
 
 from switchfit.optimize import qp
 from switchfit.optimize.matrix import Dense, diagonal_scaling, null_space
@@ -12,15 +12,6 @@ from switchfit.optimize.qp import CholeskyFactor, Room, shift_to_positive, solve
 from switchfit.optimize.state import kkt_residual
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def random_matrix(rng, d, condition):
-    """Positive definite matrix of the given condition number, with rows and columns rescaled over six decades."""
-    Q, _ = np.linalg.qr(rng.normal(size=(d, d)))
-    B = (Q * np.logspace(0.0, -np.log10(condition), d)) @ Q.T
-    scale = 10.0 ** rng.uniform(-3, 3, d)
-    B = scale[:, None] * (0.5 * (B + B.T)) * scale
-    return B, scale
 
 
 def convexify(hessian, normals):
@@ -48,7 +39,7 @@ def assert_kkt(g, B, C, c, solution, rtol=1e-9):
 @given(SEEDS, st.integers(1, 12), st.integers(0, 20), st.floats(0, 10))
 def test_kkt_conditions_hold(seed, d, k, log_condition):
     rng = np.random.default_rng(seed)
-    B, scale = random_matrix(rng, d, 10.0**log_condition)
+    B, scale = draw_matrix(rng, np.logspace(0.0, -log_condition, d))
     g = scale * rng.normal(size=d) * 10.0 ** rng.uniform(-8, 8)
     C = rng.normal(size=(k, d)) * scale * 10.0 ** rng.uniform(-4, 4, (k, 1))
     if k > 2 and k % 2:  # one row again, a sum of two, and one without any entry
@@ -149,7 +140,7 @@ def test_bounds_and_rows_of_ill_conditioned_programmes(d, log_condition):
     rng = np.random.default_rng(d)
     pressed = 0
     for _ in range(200):
-        B, scale = random_matrix(rng, d, 10.0**log_condition)
+        B, scale = draw_matrix(rng, np.logspace(0.0, -log_condition, d))
         g = scale * rng.standard_normal(d)
         newton = -np.linalg.solve(B, g)
         rows = rng.standard_normal((1, d)) * scale

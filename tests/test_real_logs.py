@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import fit_problem
+from models import fit_problem, one_run
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
@@ -41,8 +41,7 @@ TRUTH = {"k": 2.1, "damping": 0.35}
 def clean(delay=0.0):
     """Outputs without noise at `TIMES`, (24, 2)."""
     blank = sf.Measurements(TIMES, np.zeros((24, 2)), observe=position, delay=delay, sigma=1.0)
-    run = sf.Experiment(blank, ("free", "damped"), (1.23,), 0.0, 3.3)
-    problem = sf.Problem(SYSTEM, run, TRUTH)
+    problem = one_run(SYSTEM, blank, ("free", "damped"), (1.23,), 3.3, TRUTH)
     return compare(evaluator_of(problem), problem.initial_theta)[1][0][0].fitted
 
 

@@ -162,11 +162,6 @@ def mode_held(kind, value, mode="slip", **where) -> dict:
     return {"active": (ActiveConstraint(kind, value, mode=mode, position=1, **where),)}
 
 
-def few_values() -> Comparison:
-    comparison = comparison_of(trajectory_of(), samples=3, sigma=None)
-    return replace(comparison, measured=comparison.fitted * [np.nan, 1.0])
-
-
 NOTHING = {
     "status": Status.NONFINITE_START, "cost": np.nan, "gradient": np.full(3, np.nan),
     "hessian": np.full((3, 3), np.nan), "optimality": np.nan, "history": (), "free_basis": np.zeros((3, 0)),
@@ -192,12 +187,9 @@ def many_unknowns() -> Fit:
     )  # fmt: skip
 
 
-def without_values() -> Comparison:
-    comparison = comparison_of(trajectory_of())
-    comparison.measured[:, 0] = np.nan
-    return comparison
-
-
+FEW, WITHOUT = comparison_of(trajectory_of(), samples=3, sigma=None), comparison_of(trajectory_of())
+FEW.measured[:] = FEW.fitted * [np.nan, 1.0]
+WITHOUT.measured[:, 0] = np.nan
 REFERENCE = comparison_of(trajectory_of(), kind="reference", sigma=None)
 STEPS = (Step("local", 120.0, 40, 0.5), Step("many starts", 28.0, 300, 2.0, "settled"))
 SEARCHED = {"steps": STEPS, "starts": (23, 0, 5), "initial_cost": 15087.7, "evaluations": 340}
@@ -209,7 +201,7 @@ FITS: dict[str, Fit] = {
     "sigma unknown": made(sigma_known=False, cost=0.28),
     "a reference signal": made(sigma_known=None, comparisons=((REFERENCE,),)),
     "no data": made(sigma_known=None, comparisons=((),)),
-    "a channel without a value": made(comparisons=((without_values(),),)),
+    "a channel without a value": made(comparisons=((WITHOUT,),)),
     "a search that settled": made(**SEARCHED),
     "a search that ran out of time": made(**SEARCHED | {"steps": (STEPS[0], replace(STEPS[1], ended="time"))}),
     "a first guess that cannot be integrated": made(
@@ -229,7 +221,7 @@ FITS: dict[str, Fit] = {
     "an unknown that is not determined": made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR),
     "called like a time": made(**HEATED, **correlated(1e-3), parameter_units={"tau_heat": ""}),
     "idle, and called like a time": made(**HEATED, idle=("tau_heat",), parameter_units={"tau_heat": ""}),
-    "too few values": made(sigma_known=False, comparisons=((few_values(),),)),
+    "too few values": made(sigma_known=False, comparisons=((FEW,),)),
     "nothing finite": made(**NOTHING),
     "an integration error": made(integration_error=3e-5),
     "no integration error": made(integration_error=np.nan),

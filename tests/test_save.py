@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from models import RAMP
 from numpy.typing import NDArray
-from test_report import comparison_of, made, several, trajectory_of
+from test_report import NOTHING, comparison_of, made, several, trajectory_of
 
 import switchfit as sf
 from switchfit.estimation.estimator import FORMAT, VERSION, Estimate, save_fit
@@ -63,15 +63,6 @@ def get_fit(estimate: Estimate) -> Fit:
     return Fit(**{f.name: getattr(estimate, f.name) for f in fields(Fit)})
 
 
-def without_numbers() -> Fit:
-    """What a start that is not finite leaves."""
-    nothing = np.full(3, np.nan)
-    return made(
-        status=Status.NONFINITE_START, cost=np.nan, gradient=nothing, hessian=np.outer(nothing, nothing),
-        optimality=np.nan, history=(), free_basis=np.zeros((3, 0)), integration_error=np.inf,
-    )  # fmt: skip
-
-
 def with_everything_odd() -> Fit:
     """Empty and scalar arrays, negative zeros, the smallest numbers, missing samples, unknown sigma, kinks."""
     trajectory = trajectory_of(("plain", "ünïcode", "a longer name"))
@@ -82,6 +73,7 @@ def with_everything_odd() -> Fit:
                     "none": np.zeros((2, 0, 3)), "one": np.array([0.1 + 0.2])},
         parameter_units={"scalar": "1", "matrix": "°C", "none": "", "one": "m"}, fixed=("scalar", "none"),
         trajectories=(trajectory,), comparisons=((comparison, empty),), transition_times=(np.array([-0.0, 7.0]),),
+        integration_error=np.inf,
         kinks=(Kink("tau_1", -0.0, -1.5, 2.5),), active=CERTIFICATE.active, flat_direction=(("mu", -0.7),),
         sigma_known=None, theta_units=("", "°C", "m/s²"),
         free_basis=np.zeros((3, 0)), status=Status.LINE_SEARCH_FAILED, violated=(("x at the end", np.nan),),
@@ -91,7 +83,7 @@ def with_everything_odd() -> Fit:
 
 @pytest.mark.parametrize(
     "fit",
-    [made(), made(sigma_known=False), several(3), without_numbers(), with_everything_odd(), made(comparisons=((),))],
+    [made(), made(sigma_known=False), several(3), made(**NOTHING), with_everything_odd(), made(comparisons=((),))],
     ids=["plain", "sigma unknown", "several", "no numbers", "odd", "no data"],
 )
 def test_loading_gives_the_same_fit(fit, tmp_path):

@@ -7,9 +7,7 @@ import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from models import temperature
 from test_cli import PROBLEM, ROOM, log_of, run
 
 import switchfit as sf
@@ -23,14 +21,6 @@ MODEL = ROOM.replace("0.05", "LOSS").replace("import", "from losses import LOSS\
 LOCAL = '\n[options]\nstrategy = "local"\n'
 
 
-def write_log(path, switch, heating=0.5, seed=0):
-    """A room that is heated until it is switched off, with noise of 0.1."""
-    times = np.arange(0.25, 6.0, 0.25)
-    values = temperature(times, switch, heating, 0.05, start=0.0)
-    values += 0.1 * np.random.default_rng(seed).normal(size=len(times))
-    np.savetxt(path, np.stack([times, values], axis=1), delimiter=",", header="t,T", comments="", fmt="%.17g")
-
-
 @pytest.fixture(scope="module")
 def saved_project(tmp_path_factory):
     """Two models fitted to one log, both saved; another log; one that the parameters do not hold for."""
@@ -38,9 +28,9 @@ def saved_project(tmp_path_factory):
     folder.mkdir()
     (folder / "room.py").write_text(MODEL)
     (folder / "losses.py").write_text("LOSS = 0.05\n")
-    write_log(folder / "log.csv", 3.2, seed=1)
-    write_log(folder / "other.csv", 2.4, seed=2)
-    write_log(folder / "weaker.csv", 3.0, heating=0.3, seed=3)
+    (folder / "log.csv").write_text(log_of(3.2, noise=0.1, seed=1, step=0.25))
+    (folder / "other.csv").write_text(log_of(2.4, noise=0.1, seed=2, step=0.25))
+    (folder / "weaker.csv").write_text(log_of(3.0, heating=0.3, noise=0.1, seed=3, step=0.25))
     (folder / "problem.toml").write_text(PROBLEM + LOCAL)
     never = PROBLEM.replace('["on", "off"]', '["on"]').replace("transition_times = [2.0]\n", "")
     (folder / "never.toml").write_text(never + LOCAL)

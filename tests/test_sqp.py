@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from optimizer import box, free, minimize, rows
+from optimizer import box, draw_matrix, free, minimize, rows
 
 from switchfit.optimize import Status
 from switchfit.optimize.state import kkt_residual
@@ -86,9 +86,7 @@ def assert_feasible(result, constraints):
 @given(SEEDS, st.integers(1, 10))
 def test_convex_quadratics_over_twelve_decades_take_one_newton_step(seed, d):
     rng = np.random.default_rng(seed)
-    Q = np.linalg.qr(rng.normal(size=(d, d)))[0]
-    scale = 10.0 ** rng.uniform(-6, 6, d)
-    H = scale[:, None] * ((Q * np.logspace(0, 3, d)) @ Q.T) * scale
+    H, scale = draw_matrix(rng, np.logspace(0, 3, d), 6)
     centre = rng.normal(size=d) / scale
     result = minimize(quadratic(H, centre), centre + rng.normal(size=d) / scale, constraints=free(d), tolerance=1e-6)
     assert result.status is Status.CONVERGED
@@ -612,11 +610,8 @@ def test_iterations_the_callback_and_ctrl_c_end_it():
 def test_a_regular_minimum_has_the_curvature_that_its_status_says(seed, d):
     """At an interior point with a definite programme no eigenvalue is looked at: they are positive all the same."""
     rng = np.random.default_rng(seed)
-    Q = np.linalg.qr(rng.normal(size=(d, d)))[0]
-    values = 10.0 ** rng.uniform(-13, 1, d)
-    scale = 10.0 ** rng.uniform(-3, 3, d)
-    H = scale[:, None] * ((Q * values) @ Q.T) * scale
-    result = minimize(quadratic(0.5 * (H + H.T), rng.normal(size=d)), rng.normal(size=d), constraints=free(d))
+    H, _ = draw_matrix(rng, 10.0 ** rng.uniform(-13, 1, d))
+    result = minimize(quadratic(H, rng.normal(size=d)), rng.normal(size=d), constraints=free(d))
     if result.status is Status.CONVERGED:
         assert result.smallest_eigenvalue > 1e-10
     if result.status is Status.SINGULAR:

@@ -36,11 +36,6 @@ def as_estimate(fit):
 
 
 @pytest.fixture(scope="module")
-def heater():
-    return sf.estimate(heater_problem(), strategy="local")
-
-
-@pytest.fixture(scope="module")
 def studies(heater):
     """One of each kind of fits."""
     problem = heater_problem()

@@ -201,11 +201,8 @@ def test_twenty_unknowns_over_eight_decades():
 def test_where_the_valley_bends_the_change_is_shortened():
     H = np.array([[1.0, 0.99], [0.99, 1.0]])
 
-    def bent(at):
-        return 0.5 * at @ H @ at + 10.0 * (at[0] - at[1]) ** 4
-
     about = Identifiability(("a", "b"), ("", ""), np.zeros(2, bool), 1.0, "1 % of J", "solution", 100.0)
-    found = analyse(about, H, np.eye(2), np.zeros(2), bent)
+    found = analyse(about, H, np.eye(2), np.zeros(2), lambda at: 0.5 * at @ H @ at + 10.0 * (at[0] - at[1]) ** 4)
     (direction,) = found.directions
     assert max(direction.rises) <= 2.0
     quadratic = 0.5 * direction.change @ H @ direction.change

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.text import Text
 from models import refused
 from test_cli import run as invoke
-from test_io import ROOM
+from test_io import PROBLEM, ROOM
 
 import switchfit as sf
 from switchfit.io.problem_file import load_problem
@@ -107,17 +107,8 @@ def test_messages_have_times_in_their_unit(call, message):
     assert not LONE_S.search(str(caught.value))
 
 
-FILE = """
-model = "room.py:room"
-parameters = { heating = 0.3, cooling = 0.05 }
-[[experiments]]
-mode_sequence = ["on", "off"]
-transition_times = [{ value = 30.0, unit = "min" }]
-t0 = 0.0
-tf = 120.0
-time_unit = "min"
-data = { file = "log.csv", time = "t", columns = ["T"], sigma = 0.1 }
-"""
+FILE, _, _ = PROBLEM.replace('name = "monday"', 'time_unit = "min"').partition("[options]")
+FILE = FILE.replace("5.0", '5.0, unit = "min"')
 
 UNIT = "{0} %"
 """A unit that does harm where texts are made of templates."""
@@ -235,7 +226,7 @@ test_what_is_a_time_or_one_number_for_all_runs_has_one_unit = refused(
 
 def test_one_column_of_times_has_one_unit_and_so_has_one_run(tmp_path):
     (tmp_path / "room.py").write_text(ROOM)
-    (tmp_path / "log.csv").write_text("t,T\n1,15\n100,16\n")
+    (tmp_path / "log.csv").write_text("t,T\n1,15\n5,16\n")
     path, out = tmp_path / "two.toml", tmp_path / "x.csv"
     path.write_text(FILE.replace('time_unit = "min"\n', ""))
     with pytest.raises(ValueError, match=r"experiments\[1\]: transition time 1 has the unit 'min', but"):

@@ -162,33 +162,28 @@ def test_residuals_are_tested_without_the_error_of_the_parameters_that_they_shar
     assert found.verdict.level == "good"
 
 
-def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay():
-    fit = sf.estimate(heater_problem())
+def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay(heater):
     times = np.linspace(0.25, 5.0, 20)
     y = approach(times, [1.4], (0.4, 0.4), (25.0, 0.0), start=0.0) + 0.2 * np.random.default_rng(4).normal(size=20)
-    found = fit.validate(sf.Measurements(times, y))
+    found = heater.validate(sf.Measurements(times, y))
     assert found.theta_names == ("tau_1", "k")
-    assert found.theta[1] == fit.theta[1]
+    assert found.theta[1] == heater.theta[1]
     assert abs(found.theta[0] - 1.4) < 4 * found.standard_errors[0]
     assert found.standard_errors[0] > found.refit.standard_errors[0]  # it contains the error of k
     np.testing.assert_array_equal(found.comparisons[0][0].sigma, 0.2)
-    same = fit.validate(sf.Experiment(sf.Measurements(times, y, sigma=0.2), ("on", "off"), (2.0,), 0.0, 5.0))
+    same = heater.validate(sf.Experiment(sf.Measurements(times, y, sigma=0.2), ("on", "off"), (2.0,), 0.0, 5.0))
     assert same.chi_square == pytest.approx(found.chi_square, rel=1e-6)
     (line,) = (line for line in str(found).splitlines() if line.startswith("  tau_1"))
     assert line.endswith("estimated from this run")
-    held = fit.validate(sf.Measurements(times, y), refit=())
-    assert held.theta[0] == fit.theta[0]
+    held = heater.validate(sf.Measurements(times, y), refit=())
+    assert held.theta[0] == heater.theta[0]
     assert (held.refit, held.freedom, held.verdict.level) == (None, 20, "bad")
-
-
-def calibrated(t, x, p):
-    return p["gain"][0] * x + p["gain"][1]
 
 
 def test_a_problem_brings_parameters_of_its_own():
     """Another scale and offset of the sensor, which the fit has not; they are refitted as a whole."""
     fit, y = fit_line(), values(TEST, 3, shift=0.5)
-    other = pose(run(TEST, y, observe=calibrated), gain=[1.0, 0.0])
+    other = pose(run(TEST, y, observe=lambda t, x, p: p["gain"][0] * x + p["gain"][1]), gain=[1.0, 0.0])
     found = fit.validate(other)
     np.testing.assert_allclose(found.theta[:2], fit.theta, rtol=1e-12)
     predicted = np.stack([design(TEST) @ by_hand()[0], np.ones(len(TEST))], axis=1)
@@ -301,15 +296,14 @@ def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_t
     assert found.refit.standard_errors[0] > 0.005
 
 
-def test_a_run_with_as_many_own_unknowns_as_values_tests_nothing():
-    fit = sf.estimate(heater_problem())
+def test_a_run_with_as_many_own_unknowns_as_values_tests_nothing(heater):
     one = sf.Measurements([4.0], [8.3], sigma=0.2)
-    found = fit.validate(sf.Experiment(one, ("on", "off"), (2.0,), 0.0, 6.0))
+    found = heater.validate(sf.Experiment(one, ("on", "off"), (2.0,), 0.0, 6.0))
     assert (found.freedom, found.explained) == (0, pytest.approx(1.0, abs=1e-6))
     assert found.verdict.level == "doubtful"
     assert "so that nothing is left to test" in str(found.verdict)
     assert {reason.kind for reason in found.verdict.reasons} == {"nothing left to test", "predicts"}
-    kept = fit.validate(sf.Experiment(one, ("on", "off"), (2.46,), 0.0, 6.0), refit=())
+    kept = heater.validate(sf.Experiment(one, ("on", "off"), (2.46,), 0.0, 6.0), refit=())
     assert (kept.freedom, kept.verdict.level) == (1, "good")
 
 

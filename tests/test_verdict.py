@@ -10,7 +10,6 @@ from models import STILL, curve, fishing, fit_problem, heated_room, linear, one_
 import switchfit as sf
 from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
-from switchfit.models import heater_problem
 from switchfit.report.sentences import format_share
 from switchfit.uncertainty.residuals import compare_with_sigma
 from switchfit.uncertainty.verdict import Numbers, find_doubts
@@ -259,15 +258,10 @@ def test_the_error_of_a_time_is_corrected_by_its_own_run():
 # --- integration, derivatives, starts ---------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def right() -> sf.Estimate:
-    return sf.estimate(heater_problem(), strategy="local")
-
-
-def test_other_starts_count(right):
-    assert kinds(replace(right, starts=(40, 0, 0))) == ["fits"]  # chi-square confirms it
-    assert "; the lowest J was found from 12 of 40 other starts; " in str(replace(right, starts=(40, 0, 12)).verdict)
-    worse = replace(right, starts=(40, 12, 3)).verdict
+def test_other_starts_count(heater):
+    assert kinds(replace(heater, starts=(40, 0, 0))) == ["fits"]  # chi-square confirms it
+    assert "; the lowest J was found from 12 of 40 other starts; " in str(replace(heater, starts=(40, 0, 12)).verdict)
+    worse = replace(heater, starts=(40, 12, 3)).verdict
     assert (worse.level, worse.reasons[0].kind) == ("bad", "other starts are better")
     assert str(worse).startswith("Bad: converged; 12 of 40 other starts are better; the model explains ")
 
@@ -281,7 +275,7 @@ def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
     assert steps(slight) == ["next: look at the residuals", "next: corrected errors"]
 
 
-def test_a_search_that_found_nothing_lower_is_named(right):
+def test_a_search_that_found_nothing_lower_is_named():
     """Who looked is said; a search that was cut short has not looked."""
     local, search = Step("local", 2.0, 10, 0.1), Step("beam", 2.0, 10, 0.1)
     fit = straight(LINE + WAVE, sigma=0.1)
@@ -297,10 +291,10 @@ def test_a_search_that_found_nothing_lower_is_named(right):
         assert ("next: more starts" in steps(found)) == (wrong != "the model")
 
 
-def test_a_search_that_was_cut_short_is_doubtful_unless_noise_of_a_known_size_is_left(right):
+def test_a_search_that_was_cut_short_is_doubtful_unless_noise_of_a_known_size_is_left(heater):
     """Nobody has looked everywhere; but chi-square alone says that there is nothing to look for."""
-    cut = (Step("local", right.cost, 5, 0.1), Step("many starts", right.cost, 50, 2.0, "time"))
-    assert replace(right, steps=cut).verdict.level == "good"
+    cut = (Step("local", heater.cost, 5, 0.1), Step("many starts", heater.cost, 50, 2.0, "time"))
+    assert replace(heater, steps=cut).verdict.level == "good"
     unknown = straight(LINE + noise(0.1), a=1.2)
     doubted = replace(unknown, steps=cut)
     assert (unknown.verdict.level, doubted.verdict.level) == ("good", "doubtful")
