@@ -294,7 +294,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "what changes nothing": swap(SPLIT, "(kinds >= 0) & ~is_idle, is_idle", "kinds >= 0, kinds > 1e9"),
         "what is touched": swap(SPLIT, "if touched.any():", "if False:"),
         "rounding at rest": swap("engine/adaptive.py", "coarse), p, smallest)", "coarse), p)"),
-        "sliding": swap(COURSE, "\n            )\n        return 0", "\n            )\n        return 1"),
+        "sliding": swap(COURSE, "else -1\n        return 0", "else -1\n        return 1"),
         "a jump of the input": swap(COURSE, "if after != self.sides:", "if False:"),
         "the end of sliding": swap(CORNERS, "[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]"),
         "motion of a corner in time": swap(CORNERS, "[jnp.ones_like(t), f]", "[jnp.zeros_like(t), f]"),
@@ -303,7 +303,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "an output beyond its corner": swap(STRUCTURE, "return choose_sides(trace(", "return (trace("),
         "left on the wrong side": swap(COURSE, "2.0 * np.minimum(self._last[0], 0.0)", "0.0 * self._last[0]"),
         "both corners in the convex combination": swap(
-            CORNERS, "(b[0] * e - c * b[1]) / whole", "(b[0] * e + c * b[1]) / whole"
+            CORNERS, "(b[0] - sum(c * s for c, s in zip", "(b[0] + sum(c * s for c, s in zip"
         ),
         "the other case of a selection": swap(
             CORNERS, "found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))"

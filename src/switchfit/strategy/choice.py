@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
+from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import evaluator_of, measure_variation
 from switchfit.fit.result import Rival, Step, count_priors, count_samples
 from switchfit.optimize import IterationRecord, Status
@@ -369,26 +370,31 @@ def find_other_minima(fit: Estimate) -> tuple[list[FloatArray], tuple[Rival, ...
     """Return starts at other minima that may be lower than the end of a good fit, the best first: in a transition time,
     or where the state meets corners in another way; and the minima in a time that the data do not tell from it.
     """
-    evaluator, scale = fit.evaluator_at_solution(), fit.variance_scale
+    evaluator, theta, scale = fit.evaluator_at_solution(), fit.theta, fit.variance_scale
     hops: list[FloatArray] = []
     rivals: dict[str, Rival] = {}
     if not (fit.status.is_strict_minimum and scale > 0.0):
         return hops, ()
     try:
-        errors = np.sqrt(np.diag(fit.held_covariance))  # 0 at kinks, which hold their times
-        hops, close = find_far_minima(evaluator, fit.theta, fit.cost, errors, scale)
-        hops += look_near(evaluator, fit.theta, fit.cost - WORTH * scale, errors)
+        first = evaluator_of(evaluator.problem)  # its meshes may be coarser: a look takes half the time
+        evaluator = first if Follower(first).suits(theta) else evaluator
+        cost, errors = (
+            evaluator.cost(theta),
+            np.sqrt(np.diag(fit.held_covariance)),
+        )  # 0 at kinks, which hold their times
+        hops, close = find_far_minima(evaluator, theta, cost, errors, scale)
+        hops += look_near(evaluator, theta, cost - WORTH * scale, errors)
         if not hops and not evaluator.problem.constraint_names:
-            hops = look_beyond_corners(evaluator, fit.theta, fit.cost - WORTH * scale, fit.held_covariance)
+            hops = look_beyond_corners(evaluator, theta, cost - WORTH * scale, fit.held_covariance)
         for place, point in [] if hops else close:
             end = fit_briefly(evaluator.problem, point, RIVAL_ITERATIONS, evaluator)
-            if is_lower(end.cost, fit.cost):
+            if is_lower(end.cost, cost):
                 hops.append(end.theta)
-            elif end.cost < fit.cost + compute_threshold(fit, RIVAL_LEVEL):
+            elif end.cost < cost + compute_threshold(fit, RIVAL_LEVEL):
                 name, value = fit.theta_names[place], float(end.theta[place])
                 low, high = fit.confidence_intervals(RIVAL_LEVEL)[place]
                 if not low <= value <= high:
-                    rival = name, value, end.cost - fit.cost
+                    rival = name, value, end.cost - cost
                     rivals[name] = min(rivals.get(name, rival), rival, key=itemgetter(2))
     except (KeyboardInterrupt, OutOfTimeError):
         pass
