@@ -123,6 +123,7 @@ def choose_hops(
     cost: float,
     free: NDArray[np.bool_] | None = None,
     reach: FloatArray | None = None,
+    matrices: Sequence[Matrix] = MATRICES[:1],
 ) -> list[FloatArray]:
     """Return starts in sample intervals near by where J may be lower than the cost at theta, the best first.
 
@@ -135,6 +136,8 @@ def choose_hops(
         Unknowns that may move; those at a bound do not.
     reach : (d,), optional
         Largest distance of an interval from a time; any if left out.
+    matrices : sequence of str, optional
+        The first that leads to a minimum is that of a model. Of all hops of a beam the exact one alone leads lower.
     """
     unknowns = evaluator.problem.unknowns
     far = np.full(len(theta), np.inf) if reach is None else reach
@@ -146,7 +149,8 @@ def choose_hops(
         ]
         for e, run in enumerate(evaluator.problem.experiments)
     ]
-    hops = _list_hops(evaluator, theta, intervals, np.ones(len(theta), bool) if free is None else free)
+    movable = np.ones(len(theta), bool) if free is None else free
+    hops = _list_hops(evaluator, theta, intervals, movable, matrices)
     near = sorted(hops, key=lambda hop: hop[0])[:MOST]
     again = [find_lowest(start) for lowest, start, find_lowest in near if lowest < cost + DOUBTED * abs(cost)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
@@ -164,7 +168,8 @@ def look_near(evaluator: Evaluator, theta: FloatArray, cost: float, errors: Floa
     errors : (d,)
         Standard errors; 0 of unknowns that are held, as by a kink.
     """
-    return choose_hops(evaluator, theta, cost, errors > 0.0, np.where(errors > 0.0, NEAR * errors, np.inf))
+    reach = np.where(errors > 0.0, NEAR * errors, np.inf)
+    return choose_hops(evaluator, theta, cost, errors > 0.0, reach, MATRICES)
 
 
 def find_far_minima(
@@ -189,7 +194,7 @@ def find_far_minima(
     dips = sorted((cost, e, interval) for e in runs for cost, interval in _scan(evaluator, e, theta, errors))[:DIPS]
     intervals = [[interval for _, run, interval in dips if run == e] for e in runs]
     places = [place for each in intervals for place, _, _ in each]
-    hops = _list_hops(evaluator, theta, intervals, errors > 0.0)
+    hops = _list_hops(evaluator, theta, intervals, errors > 0.0, MATRICES)
     for place, (lowest, start, find_lowest) in zip(places, hops, strict=True):
         least = np.inf
         for _ in range(MODELS):
@@ -213,13 +218,14 @@ def _list_hops(
     theta: FloatArray,
     intervals: Sequence[list[tuple[int, float, float]]],
     free: NDArray[np.bool_],
+    matrices: Sequence[Matrix],
 ) -> Iterator[tuple[float, FloatArray, FindLowest]]:
     """Yield for each of some intervals of each run the lowest J of the quadratic model about its middle, theta there,
     and a function that returns both of the model about another point.
 
     The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
-    point, with the first of `MATRICES` that leads to a minimum. A sigma stays what it is: far from a minimum it would
-    make up for residuals that the other unknowns are to fit.
+    point, with the first of some matrices that leads to a minimum. A sigma stays what it is: far from a minimum it
+    would make up for residuals that the other unknowns are to fit.
     """
     if not any(intervals):
         return
@@ -228,7 +234,7 @@ def _list_hops(
     for e, listed in enumerate(intervals):
         here = _evaluate_run(evaluator, e, theta) if listed else whole
         for place, low, high in listed:
-            model = partial(_find_lowest, evaluator, e, whole, here, theta, free, place, low, high)
+            model = partial(_find_lowest, evaluator, e, whole, here, theta, free, matrices, place, low, high)
             middle = theta.copy()
             middle[place] = 0.5 * (low + high)
             yield *model(middle), model
@@ -242,6 +248,7 @@ def _find_lowest(
     here: Evaluation[FloatArray],
     theta: FloatArray,
     free: NDArray[np.bool_],
+    matrices: Sequence[Matrix],
     place: int,
     low: float,
     high: float,
@@ -253,7 +260,7 @@ def _find_lowest(
     check_time()
     own, mine = evaluator.problem.own_places[e]
     side, away = 1 if point[place] < high else -1, (theta - point)[mine]
-    for matrix in MATRICES:
+    for matrix in matrices:
         there = _evaluate_run(evaluator, e, point, side, matrix)
         if not np.isfinite(there.hessian).all():
             break
