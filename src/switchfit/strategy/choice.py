@@ -378,10 +378,8 @@ def find_other_minima(fit: Estimate) -> tuple[list[FloatArray], tuple[Rival, ...
     try:
         first = evaluator_of(evaluator.problem)  # its meshes may be coarser: a look takes half the time
         evaluator = first if Follower(first).suits(theta) else evaluator
-        cost, errors = (
-            evaluator.cost(theta),
-            np.sqrt(np.diag(fit.held_covariance)),
-        )  # 0 at kinks, which hold their times
+        cost = evaluator.cost(theta)
+        errors = np.sqrt(np.diag(fit.held_covariance))  # 0 at kinks, which hold their times
         hops, close = find_far_minima(evaluator, theta, cost, errors, scale)
         hops += look_near(evaluator, theta, cost - WORTH * scale, errors)
         if not hops and not evaluator.problem.constraint_names:
