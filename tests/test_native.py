@@ -7,7 +7,6 @@ import logging
 import re
 import signal
 import threading
-import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -55,16 +54,6 @@ def test_threads_do_not_disturb_one_another():
         assert one.cost == other.cost
         np.testing.assert_array_equal(one.gradient, other.gradient)
         np.testing.assert_array_equal(one.hessian, other.hessian)
-
-
-def test_scratch_space_is_freed_with_the_last_of_its_users():
-    """Programs stay in a cache when their experiments are gone."""
-    program = llvm.Program(None, "")
-    memory = program.reserve(8)
-    assert program.reserve(4) is memory
-    assert len(program.reserve(9)) == 9
-    memory = weakref.ref(program.reserve(9))
-    assert memory() is None
 
 
 # The cache

@@ -410,10 +410,10 @@ class NativeExperiment:
         self._own_p[:], self._tau[:] = p, tau
         # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
         # call.
-        memory = self._program.reserve(self._size)
-        if self._memory is not memory:
-            self._memory = memory
-            self._divide(memory, self._lengths)
+        self._program.reserve(self._size)
+        if self._memory is not self._program.memory:
+            self._memory = self._program.memory
+            self._divide(self._memory, self._lengths)
             self._table[:] = [self._addresses[name] for name in self._pointers]
         self._find_first_cells(tau, side)
         self._find_late_cells(p)

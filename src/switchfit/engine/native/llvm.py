@@ -24,7 +24,6 @@ import re
 import struct
 import sys
 import threading
-import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -578,27 +577,22 @@ class Program:
     key : str
         Hash of the module, the same in every process.
     lock : held during a call, since ctypes releases the GIL
+    memory : array of doubles
+        Scratch space. Calls share it, one at a time, so that it stays in the CPU caches.
     modules : dict of order to Module
         Of whose text it is made; that with the highest derivatives is the last.
     """
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
-        self.lock, self._memory = threading.Lock(), weakref.ref(np.zeros(0))
+        self.lock, self.memory = threading.Lock(), np.zeros(0)
         self.modules: dict[Any, Module] = {}
         self._functions: dict[str, Any] = {}
 
-    def reserve(self, size: int) -> NDArray[np.float64]:
-        """Return scratch space of at least `size` doubles; its contents may be lost.
-
-        Calls share it, one at a time, so that it stays in the CPU caches. It is freed with the last of its users: a
-        cached program for a log of 6000 rows would keep 20 to 40 MB.
-        """
-        memory = self._memory()
-        if memory is None or len(memory) < size:
-            memory = np.zeros(size)
-            self._memory = weakref.ref(memory)
-        return memory
+    def reserve(self, size: int) -> None:
+        """Allocate at least `size` doubles; the contents may be lost."""
+        if len(self.memory) < size:
+            self.memory = np.zeros(size)
 
     def function(self, name: str, count: int) -> Any:
         """Return a Python callable for a void function of so many integers and addresses."""
