@@ -539,7 +539,9 @@ def replace_where_cost_jumps(
     for own, place in zip(pieces, places.tolist(), strict=True):
         sides = [side[~np.isnan(side[:, 0])] for side in own]
         if place in resets and any(_find_jumps(side).max() > LEAST_JUMP * scale for side in sides):
-            found[place] = _find_quantiles(sides, scale, level)
+            low, high = _find_quantiles(sides, scale, level)
+            # J may be lowest at the edge of what is likely, beside a sample: the estimate is never left out.
+            found[place] = min(low, fit.theta[place]), max(high, fit.theta[place])
     return found
 
 
